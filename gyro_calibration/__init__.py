@@ -1,0 +1,17 @@
+"""
+Calibrate a gyro, so that a robot knows its heading.
+
+Words. The *output* is what the gyro reports, the *rate* is the true rate about its input axis, the *heading* is the integral of the
+rate. They hang together by ``output = rate + errors(rate, output, temperature) + noise``, and each error is one *effect*.
+
+Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise positive (REP-103).
+
+Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist only at the rim (files, wires, the
+command line), where the name says so: ``gyro_dps``.
+
+Reading order: `log`, `effects`, `noise`, `model`, `motion`, `simulation`, `compensation`, `heading`, `self_calibration`; then
+`protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then `command_line`.
+
+"""
+
+__version__ = '0.1.0'
