@@ -1,0 +1,195 @@
+"""
+What stands between the true rate and the output of a gyro: the only place where an effect's formula stands.
+
+Simulation, calibration and compensation meet here. Every effect adds ``sum(columns(channels, *shapes) * values)`` to the output.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gyro_calibration.log import DEGREE, Array
+
+Number = Any  # a float, or an array of shape (n,): every formula here serves both
+
+
+@dataclass(frozen=True)
+class Channels:
+    """
+    What an effect may look at, of one instant (numbers) or of many (arrays of shape (n,)).
+
+    Attributes
+    ----------
+    rate : true rate, rad/s
+    output : output of the gyro, rad/s
+    temperature : degC
+
+    """
+
+    rate: Number
+    output: Number
+    temperature: Number
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A coefficient or a shape parameter: its name, unit, the value taken where none is given, and its bounds."""
+
+    name: str
+    unit: str
+    default: float | None = None
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """
+    One effect.
+
+    Attributes
+    ----------
+    name : as in the catalogue; files hold it
+    cause : one sentence for people
+    looks_at : the channels that it uses
+    coefficients : what multiplies the columns
+    columns : (channels, *shapes) -> one column a coefficient
+    shapes : what the columns depend on, other than the channels
+
+    """
+
+    name: str
+    cause: str
+    looks_at: frozenset[str]
+    coefficients: tuple[Parameter, ...]
+    columns: Callable[..., Sequence[Number]]
+    shapes: tuple[Parameter, ...] = ()
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Shapes, then coefficients: the order of a term's values."""
+        return self.shapes + self.coefficients
+
+
+def _bias(channels: Channels) -> Sequence[Number]:
+    return (np.ones_like(channels.rate),) if isinstance(channels.rate, np.ndarray) else (1.0,)
+
+
+BIAS = Effect(
+    'bias', 'The output is not zero at rest; it holds the Earth rate about the input axis.',
+    frozenset(), (Parameter('bias', 'rad/s'),), _bias)
+
+
+def _scale_factor_error(channels: Channels) -> Sequence[Number]:
+    return (channels.rate,)
+
+
+SCALE_FACTOR_ERROR = Effect(
+    'scale_factor_error', 'The output grows with the rate by another factor than the nominal one.',
+    frozenset({'rate'}), (Parameter('scale_factor_error', '1'),), _scale_factor_error)
+
+
+def _sine_response(channels: Channels, k: float) -> Sequence[Number]:
+    return (np.sin(k * channels.rate) / k - channels.rate,)
+
+
+SINE_RESPONSE = Effect(
+    'sine_response', 'An open-loop fibre-optic gyro answers with the sine of its Sagnac phase.',
+    frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),), _sine_response,
+    (Parameter('k', 's', bounds=(1e-6, 1e3)),))
+
+
+def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effect:
+    """
+    Return the error polynomial over output and temperature of Ojeda, Chung and Borenstein (2000), eq. 9 to 13.
+
+    The paper's error is a function of the output, so that one subtraction compensates (eq. 13). The powers are those of the centred and
+    scaled output and temperature: raw powers have a condition number of 1e11. The coefficient ``t{j}w{i}`` belongs to power j of
+    temperature and i of output. The index of eq. 10 as printed collides; here every product of powers has a column of its own.
+
+    Parameters
+    ----------
+    rate_order, temperature_order : p and q of the paper, not negative
+
+    """
+    powers = [(j, i) for j in range(temperature_order + 1) for i in range(rate_order + 1)]
+
+    def columns(channels: Channels, output_centre: float, output_scale: float, temperature_centre: float,
+                temperature_scale: float) -> Sequence[Number]:
+        output = _powers((channels.output - output_centre) / output_scale, rate_order)
+        temperature = _powers((channels.temperature - temperature_centre) / temperature_scale, temperature_order)
+        return [temperature[j] * output[i] for j, i in powers]
+
+    return Effect(
+        'rate_temperature_polynomial', 'The scale factor is not linear, and bias and scale factor change with temperature.',
+        frozenset({'output', 'temperature'} if temperature_order else {'output'}),
+        tuple(Parameter(f't{j}w{i}', 'rad/s') for j, i in powers), columns,
+        (Parameter('output_centre', 'rad/s', 0.0), Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
+         Parameter('temperature_centre', 'degC', 0.0), Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))))
+
+
+def _powers(value: Number, order: int) -> list[Number]:
+    powers = [value * 0.0 + 1.0]
+    for _ in range(order):
+        powers.append(powers[-1] * value)
+    return powers
+
+
+CATALOGUE = {effect.name: effect for effect in (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE)}
+
+
+def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:
+    """
+    Read the matrix C of eq. 11 of Ojeda et al.
+
+    Parameters
+    ----------
+    matrix : shape (q + 1, p + 1), for deg/s and degC, highest powers first: ``error = [T² T 1] C [w³ w² w 1]'`` (eq. 12)
+
+    Returns
+    -------
+    the effect, and the values of its parameters in SI
+
+    Raises
+    ------
+    ValueError : not a matrix of finite numbers
+
+    """
+    try:
+        c = np.array(matrix, dtype=float)
+    except (TypeError, ValueError):
+        c = np.empty(0)
+    if c.ndim != 2 or not c.size or not np.isfinite(c).all():
+        raise ValueError('matrix_dps must be rows of finite numbers of one length, highest powers first, as eq. 11 of Ojeda et al.')
+    rows, columns = c.shape
+    in_si = c[::-1, ::-1] * DEGREE ** (1.0 - np.arange(columns))
+    return rate_temperature_polynomial(columns - 1, rows - 1), (0.0, 1.0, 0.0, 1.0, *in_si.ravel().tolist())
+
+
+def polynomial_to_matrix(effect: Effect, values: Sequence[float]) -> Array:
+    """
+    Write the matrix C of eq. 11 of Ojeda et al. out of a polynomial's values (the inverse of `polynomial_from_matrix`).
+
+    Returns
+    -------
+    array of shape (q + 1, p + 1), for deg/s and degC, highest powers first
+
+    """
+    output_centre, output_scale, temperature_centre, temperature_scale = values[:4]
+    rows = 1 + max(int(parameter.name[1:].split('w')[0]) for parameter in effect.coefficients)
+    c = np.reshape(values[4:], (rows, -1))
+    raw = _raw_powers(temperature_centre, temperature_scale, rows).T @ c @ _raw_powers(output_centre, output_scale, c.shape[1])
+    return (raw * DEGREE ** (np.arange(c.shape[1]) - 1.0))[::-1, ::-1]
+
+
+def _raw_powers(centre: float, scale: float, count: int) -> Array:
+    """Return the matrix whose row i holds the raw coefficients of ``((x - centre) / scale)**i``, lowest power first."""
+    rows = np.zeros((count, count))
+    for power in range(count):
+        polynomial = np.polynomial.Polynomial([-centre / scale, 1 / scale]) ** power
+        rows[power, :power + 1] = polynomial.coef
+    return rows

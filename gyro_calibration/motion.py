@@ -1,0 +1,133 @@
+"""A known motion about one axis: the profile of a calibration, or the drive of a simulated robot."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gyro_calibration.log import DEGREE, Array
+
+
+class MotionError(ValueError):
+    """A file is not a motion profile; the message names file and column."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    A motion, known at some times.
+
+    Between them the rate is linear where the rates are known, and the heading is linear where only headings are known.
+
+    Attributes
+    ----------
+    time : s, increasing, shape (n,), beginning at 0
+    heading : rad, continuous, shape (n,), beginning at 0
+    rate : rad/s, shape (n,); None where the motion was given by its heading
+
+    """
+
+    time: Array
+    heading: Array
+    rate: Array | None = None
+
+    @property
+    def duration(self) -> float:
+        """Return the length, s."""
+        return float(self.time[-1])
+
+    def heading_at(self, time: Array) -> Array:
+        """Return the heading, rad, at any times; before and after, the motion stands."""
+        time = np.clip(time, 0.0, self.duration)
+        if self.rate is None:
+            return np.interp(time, self.time, self.heading)
+        index = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0, len(self.time) - 2)
+        since = time - self.time[index]
+        slope = (np.diff(self.rate) / np.diff(self.time))[index]
+        return self.heading[index] + since * (self.rate[index] + 0.5 * slope * since)
+
+    def rate_at(self, time: Array) -> Array:
+        """Return the rate, rad/s, at any times; before and after it is 0."""
+        rate = np.gradient(self.heading, self.time) if self.rate is None else self.rate
+        return np.interp(time, self.time, rate, left=0.0, right=0.0)
+
+
+def from_rates(time: Array, rate: Array) -> Motion:
+    """Return the motion whose rate, rad/s, is linear between the given times, s."""
+    heading = np.concatenate([[0.0], np.cumsum(np.diff(time) * (rate[1:] + rate[:-1]) / 2.0)])
+    return Motion(np.asarray(time, float) - time[0], heading, np.asarray(rate, float))
+
+
+def from_headings(time: Array, heading: Array) -> Motion:
+    """Return the motion through the given headings, rad, at the given times, s."""
+    return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0])
+
+
+def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
+    """
+    Return a motion of constant rates.
+
+    Parameters
+    ----------
+    rates : (duration s, rate deg/s) of each stretch; the ramp to its rate is at its beginning
+    ramp : s
+
+    """
+    time, rate = [0.0], [0.0]
+    for duration, value in rates:
+        start = time[-1]
+        time += [start + ramp, start + duration]
+        rate += [value * DEGREE] * 2
+    return from_rates(np.array(time), np.array(rate))
+
+
+#: 20 s that part scale factor error from bias: both signs, two speeds, rest at both ends, and back to the first heading.
+CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (4, 30), (4, -30), (1, 0)])
+#: 160 s of a robot on its way through rooms, half of it standing or going straight.
+ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10), (6, 0), (5, 20), (8, 0), (5, -20),
+               (7, 0), (5, -20), (8, 0), (5, 20), (7, 0), (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])
+NAMED = {
+    'calibration': CALIBRATION,
+    'robot': ROBOT,
+    'rest': from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+}
+
+_WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE, 'reference_heading_rad': 1.0,
+          'rate_dps': DEGREE, 'rate_rad_s': 1.0, 'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
+
+
+def read_motion(path: str | Path) -> Motion:
+    """
+    Read a motion profile, a CSV file with time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s.
+
+    Raises
+    ------
+    MotionError : the file cannot be read, has other columns, a value that is no finite number, or times that do not increase
+
+    """
+    try:
+        lines = [line for line in Path(path).read_text(encoding='utf-8').splitlines() if line.strip() and not line.startswith('#')]
+        rows = list(csv.DictReader(lines))
+    except (OSError, UnicodeDecodeError) as error:
+        raise MotionError(f'{path}: cannot be read as a motion profile ({error}); wanted a CSV file with time_s and heading_deg') from error
+    found = [name for name in _WORDS if rows and name in rows[0]]
+    if not rows or 'time_s' not in rows[0] or len(found) != 1:
+        given = lines[0] if lines else 'nothing'
+        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s')
+    time, values = _column(path, rows, 'time_s'), _column(path, rows, found[0]) * _WORDS[found[0]]
+    if len(time) < 2 or (np.diff(time) <= 0).any():
+        raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
+    return from_rates(time, values) if 'rate' in found[0] else from_headings(time, values)
+
+
+def _column(path: str | Path, rows: list[dict[str, str]], name: str) -> Array:
+    try:
+        values = np.array([float(row[name]) for row in rows])
+    except (TypeError, ValueError):
+        values = np.array([np.nan])
+    if not np.isfinite(values).all():
+        raise MotionError(f'{path}: column {name} holds something that is not a finite number; mend or remove the row')
+    return values
