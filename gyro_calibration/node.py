@@ -1,0 +1,220 @@
+"""
+What the ROS nodes share: parameters, diagnostics, qualities of service, and how a node starts and ends.
+
+A node is a subclass of `rclpy.node.Node` that declares its table of `Parameter` records in its constructor, and joins threads of its
+own in `destroy_node`. Its ``main`` is ``return run(TheNode)``.
+
+"""
+
+import math
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+NOT_REPORTED = -1.0
+"""Element 0 of the covariance of a quantity that a message does not report (REP-145)."""
+
+UNMEASURED_VARIANCE = 1e6
+"""
+Variance of the rates about x and y, which a gyro with one axis does not measure, in (rad/s)².
+
+All zeros would say that the whole covariance is unknown, z included. A standard deviation of 1000 rad/s is beyond any robot, so a
+filter gives x and y no weight, and the matrix can still be inverted in double precision beside a variance of 1e-8 about z.
+
+"""
+
+SENSOR_QUALITY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+"""Best effort, as sensors are; 1000 deep, so that a subscriber that is busy for a second loses nothing at 1 kHz."""
+
+LATCHED_QUALITY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last state, also for those who come later."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter of a node; its type is the type of its default.
+
+    Attributes
+    ----------
+    name : str
+    default : bool, int, float, str or sequence of str
+    description : str
+        One sentence, without the unit.
+    unit : str
+        Empty where there is none.
+    range : tuple of two numbers, or None
+        Lowest and highest value, both allowed.
+    dynamic : bool
+        Whether it may be set while the node runs.
+
+    """
+
+    name: str
+    default: bool | int | float | str | Sequence[str]
+    description: str
+    unit: str = ''
+    range: tuple[float, float] | None = None
+    dynamic: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        """
+        Return what ``ros2 param describe`` shows.
+
+        """
+        text = f'{self.description} Unit: {self.unit}.' if self.unit else self.description
+        descriptor = ParameterDescriptor(description=text, read_only=not self.dynamic)
+        if self.range and isinstance(self.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(self.range[0]), to_value=float(self.range[1]))]
+        elif self.range:
+            descriptor.integer_range = [IntegerRange(from_value=int(self.range[0]), to_value=int(self.range[1]))]
+        return descriptor
+
+    def check(self, value):
+        """
+        Return the value as the type of the default; a whole number may stand for a float, as in ``-p rate:=100``.
+
+        Raises
+        ------
+        ValueError : the value has another type, is not finite or is out of range
+
+        """
+        if isinstance(self.default, float) and type(value) is int:
+            value = float(value)
+        wanted = list if isinstance(self.default, Sequence) and not isinstance(self.default, str) else type(self.default)
+        if type(value) is not wanted or (wanted is list and not all(isinstance(item, str) for item in value)):
+            raise ValueError(f'parameter {self.name} is {value!r}, but must be {_WORDS[wanted]}, for example {self.default!r}')
+        if wanted is float and not math.isfinite(value):
+            raise ValueError(f'parameter {self.name} is {value!r}, but must be finite, for example {self.default!r}')
+        if self.range and not self.range[0] <= value <= self.range[1]:
+            low, high = self.range
+            raise ValueError(f'parameter {self.name} is {value!r}, but must be from {low} to {high} {self.unit}'.rstrip())
+        return value
+
+
+_WORDS = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text', list: 'a list of texts'}
+
+
+def declare(node: Node, table: Sequence[Parameter]) -> SimpleNamespace:
+    """
+    Declare the parameters of a table and return their values by name.
+
+    Raises
+    ------
+    ValueError : an override has the wrong type or is out of range; the message is one sentence
+
+    """
+    return SimpleNamespace(**{parameter.name: _declare(node, parameter) for parameter in table})
+
+
+def _declare(node, parameter):
+    # Declared first with any type, since rclpy itself refuses 100 for 100.0, and with a message in several sentences.
+    default = parameter.default if isinstance(parameter.default, (bool, int, float, str)) else list(parameter.default)
+    given = node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True)).value
+    node.undeclare_parameter(parameter.name)
+    value = parameter.check(given)
+    node.declare_parameter(parameter.name, value, parameter.descriptor(), ignore_override=True)
+    return value
+
+
+def current(node: Node, table: Sequence[Parameter]) -> SimpleNamespace:
+    """
+    Return the values that the declared parameters of a table have now: dynamic ones may have been set since.
+
+    """
+    return SimpleNamespace(**{parameter.name: node.get_parameter(parameter.name).value for parameter in table})
+
+
+def diagnostic(node: Node, level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticArray:
+    """
+    Return a message for ``/diagnostics`` with one status.
+
+    Parameters
+    ----------
+    node : Node
+        Gives the stamp and the first half of the name.
+    level : bytes
+        ``DiagnosticStatus.OK``, ``WARN`` or ``ERROR``.
+    name : str
+        What is reported on, for example ``'gyro'``.
+    message : str
+        One sentence.
+    values : mapping of names to anything that has a text
+
+    """
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    status = DiagnosticStatus(level=level, name=f'{node.get_name()}: {name}', message=message, values=pairs)
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = node.get_clock().now().to_msg()
+    return array
+
+
+def run(node_class: type[Node]) -> int:
+    """
+    Start a node, spin it until SIGINT or SIGTERM, and return the exit code of the process.
+
+    Returns
+    -------
+    int
+        0 after a signal; 2 when an argument or a parameter was refused, with one sentence on standard error.
+
+    """
+    stop = _stop_on_signals()
+    try:
+        node = _start(node_class)
+        if node is None:
+            return 2
+        spin(node, stop)
+        return 0
+    finally:
+        rclpy.try_shutdown()
+
+
+def _start(node_class):
+    try:
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+        return node_class()
+    except (ValueError, OSError, RuntimeError) as error:  # rclpy says with a RuntimeError that an argument cannot be parsed
+        print(f'{node_class.__name__}: {error}', file=sys.stderr)
+        return None
+
+
+def _stop_on_signals():
+    """
+    Return an event that SIGINT and SIGTERM set.
+
+    rclpy's own handlers invalidate the context while a callback still publishes, which ends some runs in a traceback.
+
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def spin(node: Node, stop: threading.Event) -> None:
+    """
+    Serve the callbacks of a node until an event is set, then close it.
+
+    """
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+    except ExternalShutdownException:
+        pass  # somebody else shut rclpy down: the same end
+    finally:
+        executor.shutdown()
+        node.destroy_node()

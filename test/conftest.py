@@ -1,0 +1,245 @@
+"""
+Fixtures for tests with real ROS 2 processes: kept on this machine, apart from each other, and ended whatever happens.
+
+"""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+_FOLDER = Path(tempfile.mkdtemp(prefix='gyro_calibration_test_'))
+
+# Discovery takes 0.3 s or 3 s at random by default; so it takes less than 0.6 s.
+_FAST_DISCOVERY = """<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <profiles>
+    <participant profile_name="test" is_default_profile="true">
+      <rtps><builtin><discovery_config>
+        <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
+        <initialAnnouncements><count>10</count><period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
+      </discovery_config></builtin></rtps>
+    </participant>
+  </profiles>
+</dds>
+"""
+
+
+def _prepare_environment():
+    profile = _FOLDER / 'discovery.xml'
+    profile.write_text(_FAST_DISCOVERY)
+    os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+    os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
+    os.environ.update({
+        'ROS_LOG_DIR': str(_FOLDER),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',  # leaves nothing in shared memory after a kill
+        'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile),
+        'FASTDDS_DEFAULT_PROFILES_FILE': str(profile),
+    })
+
+
+_prepare_environment()  # before any test module imports rclpy
+
+
+def pytest_unconfigure(config):
+    """Remove the folder of this run."""
+    shutil.rmtree(_FOLDER, ignore_errors=True)
+
+
+def wait_until(predicate, timeout=10.0, what=None):
+    """
+    Poll a condition until it is true and return its value.
+
+    Raises
+    ------
+    AssertionError : it was not true within the timeout, in seconds
+
+    """
+    deadline = time.monotonic() + timeout
+    while not (value := predicate()):
+        assert time.monotonic() < deadline, f'not within {timeout} s: {what or predicate}'
+        time.sleep(0.01)
+    return value
+
+
+@pytest.fixture(name='wait_until')
+def _wait_until():
+    """Return the function `wait_until(predicate, timeout=10.0, what=None)`."""
+    return wait_until
+
+
+@pytest.fixture
+def data():
+    """Return the folder with recordings of real gyros; skip where it is missing."""
+    folder = Path(os.environ.get('GYRO_CALIBRATION_DATA', '/nonexistent'))
+    if not folder.is_dir():
+        pytest.skip('no recordings: set GYRO_CALIBRATION_DATA to the folder that holds them')
+    return folder
+
+
+@pytest.fixture
+def ros_domain(monkeypatch):
+    """Keep the ROS traffic of a test apart from all others; skip where ROS 2 is missing."""
+    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
+
+
+class NodeProcess:
+    """
+    A node in a process of its own, as a robot starts it.
+
+    """
+
+    def __init__(self, module, parameters, remappings, parameter_files):
+        arguments = [f'{name}:={value}' for name, value in parameters.items()]
+        self._command = [sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args']
+        self._command += [word for argument in arguments for word in ('-p', argument)]
+        self._command += [word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
+        self._command += [word for file in parameter_files for word in ('--params-file', str(file))]
+        self.waited = False
+        handle, self._output = tempfile.mkstemp(dir=_FOLDER)
+        with os.fdopen(handle, 'wb') as output:
+            self.process = subprocess.Popen(self._command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+
+    @property
+    def output(self):
+        """What it has printed so far, standard error included."""
+        return Path(self._output).read_text(errors='replace')
+
+    def wait(self, timeout=15.0):
+        """Wait until it ends by itself and return its exit code."""
+        self.waited = True
+        return self.process.wait(timeout)
+
+    def stop(self, number=signal.SIGINT, timeout=15.0):
+        """Send a signal to its process group, wait, and return its exit code."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, number)
+        return self.wait(timeout)
+
+    def close(self):
+        """End it at all costs, and check that it ended well."""
+        try:
+            code = None if self.waited and self.process.poll() is not None else self.stop()
+        except subprocess.TimeoutExpired:
+            code = 'none: it had to be killed'
+        finally:
+            self._kill()
+        assert code in (None, 0), f'{" ".join(self._command)} ended with code {code}:\n{self.output}'
+        assert 'Traceback' not in self.output, self.output
+
+    def _kill(self):
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+
+@pytest.fixture
+def start_node(ros_domain, request):
+    """
+    Return a function that starts ``python -m gyro_calibration.<module>`` and ends it after the test.
+
+    ``start_node('driver_node', parameters={'port': '/dev/x'}, remappings={'imu/data_raw': 'raw'}, parameter_files=[path])`` gives a
+    `NodeProcess` with ``output``, ``wait()``, ``stop()`` and ``process``. A node that a test did not itself wait for must still run at
+    the end, end on SIGINT with code 0, and never print a traceback.
+
+    """
+    nodes = []
+
+    def start(module, parameters=None, remappings=None, parameter_files=()):
+        nodes.append(NodeProcess(module, parameters or {}, remappings or {}, parameter_files))
+        return nodes[-1]
+
+    failures = request.session.testsfailed
+    yield start
+    if request.session.testsfailed > failures or any('Traceback' in node.output for node in nodes):
+        for node in nodes:
+            print(f'--- output of {" ".join(node._command)}\n{node.output}')
+    _close_all(nodes)
+
+
+def _close_all(nodes):
+    problems = []
+    for node in nodes:
+        try:
+            node.close()
+        except AssertionError as problem:
+            problems.append(str(problem))
+    assert not problems, '\n'.join(problems)
+
+
+class Ros:
+    """
+    A node in the process of the test, with an executor that spins in a thread.
+
+    """
+
+    def __init__(self):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node('test_client', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self):
+        while not self._stop.is_set():
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def collect(self, message_type, topic, quality=None):
+        """Subscribe, and return the list that the messages go to."""
+        messages = []
+        self.node.create_subscription(message_type, topic, messages.append, quality or _sensor_quality())
+        return messages
+
+    def publisher(self, message_type, topic, quality=None):
+        """Return a publisher with the quality of a sensor, if nothing else is said."""
+        return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
+
+    def call(self, service_type, name, request=None, timeout=15.0):
+        """Call a service and return its response."""
+        client = self.node.create_client(service_type, name)
+        assert client.wait_for_service(timeout), f'no service {name} within {timeout} s'
+        future = client.call_async(request or service_type.Request())
+        wait_until(future.done, timeout, f'response of {name}')
+        return future.result()
+
+    def close(self):
+        """Join the thread and leave nothing behind."""
+        self._stop.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+
+def _sensor_quality():
+    from gyro_calibration.node import SENSOR_QUALITY
+    return SENSOR_QUALITY
+
+
+@pytest.fixture
+def ros(ros_domain):
+    """
+    Return a `Ros`: ``node``, ``collect(type, topic)``, ``publisher(type, topic)`` and ``call(service_type, name)``.
+
+    Nodes started by `start_node` in the same test are in the same domain.
+
+    """
+    client = Ros()
+    yield client
+    client.close()
