@@ -1,0 +1,85 @@
+"""From the output of a gyro to the rate, the same for one sample and for a whole log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_calibration.effects import Channels, Number
+from gyro_calibration.model import GyroModel, SelfCalibration
+
+_NONE = SelfCalibration()
+
+
+@dataclass(frozen=True)
+class Compensated:
+    """
+    Compensated samples: numbers, or arrays of shape (n,).
+
+    Attributes
+    ----------
+    modelled : rate after the model and before the self-calibration, rad/s; what a self-calibration is made from
+    rate : rad/s
+    temperature_clipped : the temperature is outside the calibrated range, and its nearest end was used
+    beyond_range : the output is outside the calibrated range of rates
+
+    """
+
+    modelled: Number
+    rate: Number
+    temperature_clipped: Number
+    beyond_range: Number
+
+
+def compensate(model: GyroModel, output: Number, temperature: Number | None = None) -> Compensated:
+    """
+    Compensate by the model (eq. 13 of Ojeda et al.) and then by its self-calibration (eq. 3 of Hong and Park).
+
+    Parameters
+    ----------
+    output : rad/s, a number or shape (n,)
+    temperature : degC, alike; the model's reference temperature where it is None
+
+    """
+    given = model.reference_temperature if temperature is None else temperature
+    low, high = model.temperature_range
+    used = np.minimum(np.maximum(given, low), high)
+    modelled = model.rate(output, used)
+    slowest, fastest = model.rate_range
+    return Compensated(modelled, (model.self_calibration or _NONE).correct(modelled), used != given, (output < slowest) | (output > fastest))
+
+
+def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number) -> np.ndarray:
+    """
+    Return what the rate changes by for each uncertain value of the model, shape (m, ...).
+
+    First the coefficients of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
+    `covariance`.
+
+    """
+    channels = Channels(rate, output, temperature)
+    calibration = model.self_calibration
+    scale = 1.0 if calibration is None else calibration.scale
+    rows = [] if model.covariance is None else [-scale * column for term in model.terms for column in term.columns(channels)]
+    if calibration is not None:
+        rows += [-scale * rate, -scale * np.ones_like(rate)]
+    return np.array([np.broadcast_to(row, np.shape(rate)) for row in rows]).reshape(len(rows), *np.shape(rate))
+
+
+def covariance(model: GyroModel) -> np.ndarray:
+    """Return the covariance of the uncertain values of a model in the order of `rate_sensitivity`, shape (m, m)."""
+    blocks = [] if model.covariance is None else [model.covariance]
+    if model.self_calibration is not None:
+        blocks.append(np.array(model.self_calibration.covariance))
+    size = sum(map(len, blocks))
+    whole, start = np.zeros((size, size)), 0
+    for block in blocks:
+        whole[start:start + len(block), start:start + len(block)] = block
+        start += len(block)
+    return whole
+
+
+def quadratic_form(matrix: np.ndarray, vectors: np.ndarray) -> Number:
+    """Return v' M v for vectors of shape (m, ...)."""
+    return np.einsum('i...,ij,j...->...', vectors, matrix, vectors)

@@ -1,0 +1,164 @@
+"""From rates to a heading: the threshold filter, the integration on the stamps, and how far the heading may be off."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.noise import Noise
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """
+    Settings of the threshold filter (Hong and Park, eq. 12).
+
+    Attributes
+    ----------
+    rate : rad/s; below it the robot counts as standing; 0 switches the filter off
+    window : s; the mean over it is compared with the rate. 0 compares single samples, as published
+    spread : rad/s; a window whose standard deviation is above it is motion whatever its mean; 0 does not look at it
+
+    """
+
+    rate: float = 0.3 * DEGREE
+    window: float = 0.2
+    spread: float = 0.0
+
+
+class ThresholdFilter:
+    """
+    Set the rate to zero while the robot stands, sample by sample.
+
+    As published the filter decides on single samples. With the noise of a cheap gyro this does next to nothing while it stands, so here
+    the mean over a short window decides. What it takes away is for the caller to count: a turn slower than the threshold is lost.
+
+    """
+
+    def __init__(self, settings: Threshold):
+        """Begin with an empty window."""
+        self.settings = settings
+        self._window: deque[tuple[float, float]] = deque()
+        self._sum = 0.0
+        self._squares = 0.0
+
+    def clear(self) -> None:
+        """Forget the window, as after a gap."""
+        self._window.clear()
+        self._sum = self._squares = 0.0
+
+    def filter(self, time: float, rate: float) -> float:
+        """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
+        if not self.settings.rate:
+            return rate
+        return 0.0 if self._stands(time, rate) else rate
+
+    def _stands(self, time: float, rate: float) -> bool:
+        window = self._window
+        window.append((time, rate))
+        self._sum += rate
+        self._squares += rate * rate
+        while window[0][0] <= time - self.settings.window and len(window) > 1:
+            old = window.popleft()[1]
+            self._sum -= old
+            self._squares -= old * old
+        mean = self._sum / len(window)
+        variance = self._squares / len(window) - mean * mean
+        return abs(mean) < self.settings.rate and not (0.0 < self.settings.spread ** 2 < variance)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one sample did: the heading went on, the sample was ignored, or integration began anew."""
+
+    restarted: str = ''
+    ignored: str = ''
+
+
+class HeadingIntegrator:
+    """
+    Integrate rates by the trapezoid rule on their stamps, with the variance of the heading.
+
+    Attributes
+    ----------
+    heading : rad, continuous, not wrapped
+    deleted : heading that the threshold filter took away, rad
+
+    """
+
+    def __init__(self, noise: Noise, maximum_gap: float = 1.0):
+        """Begin at heading zero; over a gap longer than `maximum_gap`, s, nothing is integrated."""
+        self.heading = 0.0
+        self.deleted = 0.0
+        self._noise = noise
+        self._maximum_gap = maximum_gap
+        self._covariance = np.zeros((0, 0))
+        self._settled = 0.0
+        self._last: tuple[float, float, float, np.ndarray] | None = None
+        self._begin_variance()
+
+    def _begin_variance(self) -> None:
+        self._moving_time = 0.0
+        self._sensitivity = np.zeros(len(self._covariance))
+
+    def reset(self) -> None:
+        """Call this direction zero, known exactly."""
+        self.heading = self.deleted = self._settled = 0.0
+        self._begin_variance()
+
+    def use(self, noise: Noise, covariance: np.ndarray) -> None:
+        """Go on with other noise figures and another covariance of the calibration; the heading does not jump."""
+        self._settled = self.variance
+        self._noise, self._covariance, self._last = noise, covariance, None if self._last is None else (*self._last[:3], np.zeros(len(covariance)))
+        self._begin_variance()
+
+    @property
+    def variance(self) -> float:
+        """Return the variance of the heading, rad²."""
+        calibration = self._sensitivity @ self._covariance @ self._sensitivity
+        return self._settled + float(calibration) + self._noise.heading_variance(self._moving_time)
+
+    def add(self, time: float, rate: float, filtered: float, sensitivity: np.ndarray) -> Step:
+        """
+        Take one sample.
+
+        Parameters
+        ----------
+        time : stamp, s
+        rate, filtered : before and after the threshold filter, rad/s
+        sensitivity : of the rate to the values of the calibration, shape (m,), as in `compensation`
+
+        """
+        if self._last is None:
+            self._last = (time, rate, filtered, sensitivity)
+            return Step()
+        before, last_rate, last_filtered, last_sensitivity = self._last
+        interval = time - before
+        if interval == 0.0:
+            return Step(ignored=f'the stamp stands still at {time:.3f} s')
+        self._last = (time, rate, filtered, sensitivity)
+        if interval < 0.0 or interval > self._maximum_gap:
+            return self._restart(interval, max(abs(rate), abs(last_rate)))
+        half = 0.5 * interval
+        self.heading += half * (filtered + last_filtered)
+        self.deleted += half * (rate - filtered + last_rate - last_filtered)
+        moving = half * ((filtered != 0.0) + (last_filtered != 0.0))
+        self._moving_time += moving
+        if len(sensitivity):
+            self._sensitivity += half * ((filtered != 0.0) * sensitivity + (last_filtered != 0.0) * last_sensitivity)
+        return Step()
+
+    def _restart(self, interval: float, fastest: float) -> Step:
+        """Begin anew after a gap or a jump back; what may have been turned meanwhile goes into the variance."""
+        if interval < 0.0:
+            return Step(restarted=f'the stamp jumps back by {-interval:.3f} s')
+        self._settled += (fastest * interval) ** 2
+        return Step(restarted=f'no samples for {interval:.3f} s')
+
+
+def integrate(time: Array, rate: Array) -> Array:
+    """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at 0."""
+    return np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1]))])

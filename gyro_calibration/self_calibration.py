@@ -1,0 +1,482 @@
+"""
+Scale factor error and bias from about 20 s of known motion, with the reasons to refuse.
+
+The gyro is taken as ``output = (1 + s) rate + b + noise`` (Hong and Park, eq. 1). Three methods: the paper's two as they stand, and a
+likelihood fit that has neither their errors nor needs the start of the motion to the millisecond.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
+
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.model import SelfCalibration
+from gyro_calibration.motion import Motion
+from gyro_calibration.noise import ALLAN_FLOOR, Noise
+
+
+class CalibrationRefused(ValueError):
+    """The data do not allow a calibration; the message says why and what would."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """
+    What a run must keep to be believed.
+
+    Attributes
+    ----------
+    samples : at least so many
+    gap : no longer one between samples, s
+    rate_spread : the standard deviation of the profile's rate is at least this, rad/s; one speed cannot part scale from bias
+    scale_factor_error : at most this, 1
+    bias : at most this, rad/s
+    scale_standard_deviation : the scale is known at least so well, 1
+    residual : no stretch of the run may turn otherwise than the profile by more than this beyond chance, rad
+    time_offset : the gyro may lag the profile by at most this, either way, s
+
+    """
+
+    samples: int = 50
+    gap: float = 0.5
+    rate_spread: float = 1.0 * DEGREE
+    scale_factor_error: float = 0.3
+    bias: float = 10.0 * DEGREE
+    scale_standard_deviation: float = 0.02
+    residual: float = 1.0 * DEGREE
+    time_offset: float = 1.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    What a method found.
+
+    Attributes
+    ----------
+    scale_factor_error, bias : s, 1, and b, rad/s
+    covariance : of (s, b), shape (2, 2); nan where the method gives none
+    time_offset : the gyro lags the profile by so much, s
+    angle_random_walk, reference_noise : as the run shows them, rad/√s and rad
+    residual : largest stretch that turned otherwise than the profile, rad, and how unlikely it is, in standard deviations
+
+    """
+
+    scale_factor_error: float
+    bias: float
+    covariance: Array
+    time_offset: float = 0.0
+    angle_random_walk: float = math.nan
+    reference_noise: float = math.nan
+    residual: tuple[float, float] = (0.0, 0.0)
+
+
+def fit_heading(time: Array, rate: Array, motion: Motion) -> Fit:
+    """
+    Fit by Hong and Park's heading reference as it stands (eq. 4 to 7).
+
+    The rectangle rule of eq. 4 is kept: against a continuous heading it errs by several percent where the sampling is slow.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : output of the gyro, rad/s, shape (n,)
+
+    """
+    step = np.diff(time)
+    g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
+    z = motion.heading_at(time[1:]) - motion.heading_at(time[:1])
+    scale, offset = _solve(g.T @ g, g.T @ z)
+    return _from_inverse(scale, offset)
+
+
+def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
+    """
+    Fit by Hong and Park's rate reference (eq. 8 and 9), the columns of the matrix in the order that q = [s̄, b̄] wants.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : output of the gyro, rad/s, shape (n,)
+
+    """
+    true = motion.rate_at(time)
+    g = np.array([[rate @ rate, rate.sum()], [rate.sum(), len(rate)]])
+    scale, offset = _solve(g, np.array([true @ rate, true.sum()]))
+    return _from_inverse(scale, offset)
+
+
+def _solve(matrix: Array, vector: Array) -> Array:
+    if not np.linalg.cond(matrix) < 1e12:
+        raise CalibrationRefused('the gyro did not change its rate, so scale factor error and bias cannot be parted: turn both ways, with stops')
+    return np.linalg.solve(matrix, vector)
+
+
+def _from_inverse(scale: float, offset: float) -> Fit:
+    """Turn s̄ and b̄ of eq. 3 into s and b."""
+    return Fit(1.0 / scale - 1.0, -offset / scale, np.full((2, 2), np.nan))
+
+
+@dataclass(frozen=True)
+class _Increments:
+    """
+    How far the gyro and the reference turned from block to block, each block being a mean over some points.
+
+    Attributes
+    ----------
+    columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; shape (n, 3)
+    turned : increments of the gyro's integral, rad, shape (n,)
+    points : in a block
+    resting : what the encoder's rounding adds wherever the reference stands, one column a stand, rad, shape (n, stands)
+
+    """
+
+    columns: Array
+    turned: Array
+    points: int
+    resting: Array
+
+
+#: Longest block, s. What a run does within it (vibration, backlash, an eccentric encoder) is no random walk and must not be taken for one.
+_BLOCK = 0.5
+
+
+class _Pairing:
+    """A run and a motion, brought together at any time offset."""
+
+    def __init__(self, time: Array, rate: Array, motion: Motion):
+        self._time, self._rate, self._motion = time, rate, motion
+        self._integral = integrate(time, rate)
+        self.sampled = motion.rate is None
+        self._points = motion.time if self.sampled else np.arange(0.0, motion.duration + 1e-9, 0.01)
+        self._step = _encoder_step(motion.heading) if self.sampled else 0.0
+        self._points_in_block = max(1, round(min(_BLOCK, motion.duration / 40.0) / float(np.median(np.diff(self._points)))))
+
+    def _known(self, offset: float) -> Array:
+        """Return at every point reference heading, time, rate and gyro's integral, shape (n, 4), if the gyro is `offset` s late."""
+        points = self._points[(self._points + offset >= self._time[0]) & (self._points + offset <= self._time[-1])]
+        rate = np.interp(points + offset, self._time, self._rate)
+        return np.column_stack([self._motion.heading_at(points), points, rate, self._integral_at(points + offset, rate)])
+
+    def increments(self, offset: float) -> _Increments:
+        """Return the increments if the gyro is `offset` s late."""
+        known = self._known(offset)
+        blocks = len(known) // self._points_in_block
+        grouped = known[:blocks * self._points_in_block].reshape(blocks, self._points_in_block, 4)
+        steps = np.diff(grouped.mean(axis=1), axis=0)
+        resting = np.diff(_stands(grouped[:, :, 0]), axis=0) * self._step / math.sqrt(12.0)
+        return _Increments(steps[:, :3], steps[:, 3], self._points_in_block, resting)
+
+    def _integral_at(self, at: Array, rate: Array) -> Array:
+        """Return the integral of the rate that is linear between the samples."""
+        index = np.clip(np.searchsorted(self._time, at, side='right') - 1, 0, len(self._time) - 1)
+        return self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
+
+    def coarse_offset(self, largest: float) -> float:
+        """Return the offset, s, at which the two headings fit best by plain least squares."""
+        offsets = np.arange(-round(largest / 0.02), round(largest / 0.02) + 1) * 0.02
+        return float(min(offsets, key=lambda offset: (self._misfit(offset), abs(offset))))
+
+    def _misfit(self, offset: float) -> float:
+        known = self._known(offset)
+        if len(known) < 10:
+            return math.inf
+        known = known - known.mean(axis=0)
+        q = np.linalg.lstsq(known[:, :2], known[:, 3], rcond=None)[0]
+        return float(np.mean((known[:, 3] - known[:, :2] @ q) ** 2))
+
+
+def _encoder_step(heading: Array) -> float:
+    """Return the step of an encoder's heading, rad, or 0 where the heading is no multiple of one."""
+    steps = np.abs(np.diff(heading))
+    moved = steps[steps > 1e-9]
+    if not len(moved):
+        return 0.0
+    step = float(np.median(moved[moved < 1.5 * moved.min()]))
+    return step if np.abs(moved / step - np.round(moved / step)).max() < 0.2 else 0.0
+
+
+def _stands(headings: Array) -> Array:
+    """Return which blocks, shape (n, points), stand together at one heading: a column of ones and zeros for each stand."""
+    still = np.ptp(headings, axis=1) == 0.0
+    begins = still & ~np.append(False, still[:-1] & (headings[1:, 0] == headings[:-1, 0]))
+    number = np.cumsum(begins)
+    return (still[:, None] & (number[:, None] == np.arange(1, number[-1] + 1))).astype(float)
+
+
+class _Covariance:
+    """
+    Covariance of the increments, up to one factor: rate noise, and noise of the reference heading in each block.
+
+    A random walk, averaged over blocks of m points, has increments of variance ``interval (2 m² + 1) / 3 m²`` and a covariance with the
+    neighbours of ``interval (m² - 1) / 6 m²``; independent noise of the blocks adds ``2 ratio`` and ``-ratio``: a banded matrix.
+
+    """
+
+    def __init__(self, data: _Increments, ratio: float):
+        intervals, squared = data.columns[:, 1], data.points ** 2
+        band = np.zeros((2, len(intervals)))
+        band[0, 1:] = np.sqrt(intervals[1:] * intervals[:-1]) * (squared - 1) / (6 * squared) - ratio
+        band[1] = intervals * (2 * squared + 1) / (3 * squared) + 2.0 * ratio
+        self.ratio = ratio
+        self._factor = cholesky_banded(band)
+        self.log_determinant = 2.0 * float(np.log(self._factor[1]).sum())
+
+    def solve(self, vector: Array) -> Array:
+        """Return the inverse times a vector or matrix."""
+        return cho_solve_banded((self._factor, False), vector)
+
+    def whiten(self, vector: Array) -> Array:
+        """Return the vector as independent values of one variance."""
+        lower = np.array([self._factor[1], np.append(self._factor[0, 1:], 0.0)])
+        return solve_banded((1, 0), lower, vector)
+
+    def reference_error(self, residual: Array) -> Array:
+        """Return the part of the increments' residual that the noise of the headings is expected to be."""
+        solved = np.concatenate([[0.0], self.solve(residual), [0.0]])
+        return self.ratio * (2.0 * solved[1:-1] - solved[:-2] - solved[2:])
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Values of (1 + s, b, error of the time offset), their covariance, and what is left."""
+
+    values: Array
+    covariance: Array
+    residual: Array
+    rate_variance: float
+    log_likelihood: float
+
+
+#: Variance of a block's reference noise over what the rate noise adds from block to block.
+_RATIOS = np.geomspace(1e-3, 1e3, 19)
+#: Standard deviation, s, of what is assumed of the time offset after the coarse search; it is harmless where the data show the offset.
+_OFFSET_PRIOR = 0.1
+
+
+def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Estimate:
+    """Solve the weighted normal equations; the restricted likelihood is that of the noise, the values being unknown."""
+    n, weighted = len(data.turned), noise.solve(instrument)
+    matrix, vector = weighted.T @ data.columns, weighted.T @ data.turned
+    rate_variance = 0.0
+    for _ in range(3):
+        regular = matrix + np.diag([0.0, 0.0, rate_variance / _OFFSET_PRIOR ** 2])
+        values = np.linalg.lstsq(regular, vector, rcond=1e-14)[0]
+        residual = data.turned - data.columns @ values
+        rate_variance = max(float(residual @ noise.solve(residual)) / (n - 4), 1e-30)
+    inverse = np.linalg.pinv(regular, rcond=1e-14)
+    resting = inverse @ (weighted.T @ data.resting)
+    covariance = rate_variance * inverse + resting @ resting.T
+    log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
+    return _Estimate(values, covariance, residual, rate_variance, -0.5 * ((n - 4) * math.log(rate_variance) + log_determinants))
+
+
+def _estimates(data: _Increments) -> tuple[list[_Covariance], list[_Estimate], Array]:
+    """Return the estimates for every ratio of the two noises, and how likely each ratio is, summing to 1."""
+    interval = float(np.median(data.columns[:, 1]))
+    noises = [_Covariance(data, interval * ratio) for ratio in _RATIOS]
+    estimates = [_estimate(data, noise, data.columns) for noise in noises]
+    log_likelihoods = np.array([estimate.log_likelihood for estimate in estimates])
+    weights = np.exp(log_likelihoods - log_likelihoods.max())
+    return noises, estimates, weights / weights.sum()
+
+
+def _errors_in_variables(data: _Increments, noise: _Covariance, estimate: _Estimate) -> _Estimate:
+    """Estimate again with the reference heading smoothed by what the gyro says as the instrument."""
+    for _ in range(3):
+        instrument = data.columns.copy()
+        instrument[:, 0] += noise.reference_error(estimate.residual) / estimate.values[0]
+        estimate = _estimate(data, noise, instrument)
+    return estimate
+
+
+def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0) -> Fit:
+    """
+    Fit scale factor error, bias and time offset by likelihood.
+
+    Rates are integrated by the trapezoid rule and compared with the reference heading increment by increment. The increments have noise
+    of the rate (a random walk of the heading) and of the reference heading (an encoder's step), so that neighbours are correlated; the
+    ratio of the two is found by restricted likelihood. A heading that was measured is smoothed by what the gyro says before it serves as
+    the regressor, which makes this the errors-in-variables likelihood.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : output of the gyro, rad/s, shape (n,)
+    motion : what the gyro was put through
+    largest_time_offset : how late or early the gyro's stamps may be against the motion, s
+
+    Raises
+    ------
+    CalibrationRefused : gyro and motion hardly overlap
+
+    """
+    pairing = _Pairing(time, rate, motion)
+    offset = pairing.coarse_offset(largest_time_offset)
+    for _ in range(6):
+        data = pairing.increments(offset)
+        if len(data.turned) < 10:
+            raise CalibrationRefused('the samples cover less than ten blocks of the profile: record the whole motion')
+        noises, estimates, weights = _estimates(data)
+        noise, estimate = noises[weights.argmax()], estimates[weights.argmax()]
+        if pairing.sampled:
+            estimate = _errors_in_variables(data, noise, estimate)
+        step = float(np.clip(estimate.values[2], -0.02, 0.02))
+        if abs(step) < 1e-9:
+            break
+        offset -= step
+    covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
+        np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
+    scale, bias, _ = estimate.values
+    return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
+               math.sqrt(estimate.rate_variance * noise.ratio) / abs(float(scale)), _worst_stretch(noise, estimate))
+
+
+def _worst_stretch(noise: _Covariance, estimate: _Estimate) -> tuple[float, float]:
+    """
+    Return the largest stretch of the run that turned otherwise than the profile beyond chance, rad, and its size in standard deviations.
+
+    All stretches of a few lengths are looked at; the scale is the median's, so that the stretch does not hide itself.
+
+    """
+    whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(estimate.residual))])
+    turned = np.concatenate([[0.0], np.cumsum(estimate.residual)])
+    scale = max(float(np.median(np.abs(np.diff(whitened)))) / 0.6745, 1e-15)
+    worst = (0.0, 0.0)
+    for length in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000):
+        if length < len(whitened) / 2:
+            sizes = np.abs(whitened[length:] - whitened[:-length]) / (scale * math.sqrt(length))
+            turns = np.where(sizes > _CHANCE, np.abs(turned[length:] - turned[:-length]), 0.0)
+            worst = max(worst, (float(turns.max()), float(sizes[turns.argmax()])))
+    return worst
+
+
+#: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a robot's life.
+_CHANCE = 7.0
+
+METHODS = {'likelihood': fit_likelihood, 'heading': fit_heading, 'rate': fit_rate}
+
+
+def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'likelihood', limits: Limits | None = None,
+                   noise: Noise | None = None) -> Fit:
+    """
+    Fit a run by one of `METHODS` and refuse what cannot be believed.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
+    noise : of the gyro, if it is known; the wander of the bias goes into its standard deviation
+
+    Raises
+    ------
+    CalibrationRefused : with the reason and the remedy
+
+    """
+    limits = limits or Limits()
+    _refuse_samples(time, rate, limits)
+    _refuse_motion(time, motion, limits)
+    if method == 'likelihood':
+        fit = fit_likelihood(time, rate, motion, limits.time_offset)
+    else:
+        fit = METHODS[method](time, rate, motion)
+    fit = replace(fit, covariance=fit.covariance + np.diag([0.0, _wander(noise)]))
+    _refuse_fit(fit, motion, limits)
+    return fit
+
+
+def _wander(noise: Noise | None) -> float:
+    """Return the variance of the bias, (rad/s)², that no averaging takes away."""
+    return 0.0 if noise is None else (ALLAN_FLOOR * noise.bias_instability) ** 2
+
+
+def _refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
+    if len(time) < limits.samples:
+        raise CalibrationRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: look at the gyro\'s line and rate')
+    gap = float(np.diff(time).max())
+    if gap > limits.gap:
+        raise CalibrationRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be missing: mend the line and run again')
+    if np.ptp(rate) == 0.0:
+        raise CalibrationRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: the gyro is dead or not powered')
+
+
+def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
+    points = np.arange(0.0, motion.duration, 0.05)
+    spread = float(np.std(motion.rate_at(points)))
+    if spread < limits.rate_spread:
+        raise CalibrationRefused(f'the profile turns at one speed (its rate varies by {spread / DEGREE:.2f} deg/s): scale factor error and bias '
+                                 'cannot be parted; turn both ways, with stops')
+    if time[-1] - time[0] < 0.9 * motion.duration - 2.0 * limits.time_offset:
+        raise CalibrationRefused(f'the samples cover {time[-1] - time[0]:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
+
+
+def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
+    s, b = fit.scale_factor_error, fit.bias
+    if abs(1.0 + s) < 0.5:
+        raise CalibrationRefused(f'the gyro saw {100 * (1 + s):.0f} % of the profile\'s turns: did the robot move, and is the gyro alive?')
+    if s < -1.5:
+        raise CalibrationRefused(f'the gyro turns the other way than the profile (scale {1 + s:.2f}): set the driver\'s parameter invert')
+    deviation = math.sqrt(fit.covariance[0, 0])
+    if abs(s) > limits.scale_factor_error + 3.0 * np.nan_to_num(deviation):
+        raise CalibrationRefused(f'a scale factor error of {100 * s:.0f} % is beyond {100 * limits.scale_factor_error:.0f} %: look at the '
+                                 'sensitivity and at the profile\'s unit')
+    if abs(b) > limits.bias:
+        raise CalibrationRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: was the robot turned by hand?')
+    if deviation > limits.scale_standard_deviation:
+        raise CalibrationRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted {100 * limits.scale_standard_deviation:g} %: '
+                                 'turn further, faster, or more often, and check that the profile is the one that was driven')
+    turned, size = fit.residual
+    if turned > limits.residual:
+        raise CalibrationRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile ({size:.0f} standard deviations): '
+                                 'a slip or a bump; run again on free ground')
+
+
+def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise: Noise | None = None) -> tuple[float, float]:
+    """
+    Return the bias of a gyro at rest, rad/s, and its standard deviation (Ojeda et al., eq. 1, or 15 for compensated rates).
+
+    The mean holds the Earth's rate about the axis. A turn slow and steady enough looks just like a bias: the limit on the bias is what
+    guards against it.
+
+    Parameters
+    ----------
+    time : s, shape (n,)
+    rate : compensated by the model, rad/s, shape (n,)
+
+    Raises
+    ------
+    CalibrationRefused : too few samples, a dead gyro, motion, or a mean that is no bias
+
+    """
+    limits = limits or Limits()
+    _refuse_samples(time, rate, limits)
+    blocks = np.array([block.mean() for block in np.array_split(rate, 10)])
+    within = math.sqrt(np.mean([block.var(ddof=1) for block in np.array_split(rate, 10)]) / (len(rate) / 10))
+    largest = float(np.abs(blocks - np.median(blocks)).max())
+    if largest > max(_CHANCE * within, 0.05 * DEGREE):
+        raise CalibrationRefused(f'the gyro was moved: its mean changed by {largest / DEGREE:.2f} deg/s within the rest; keep it still and run again')
+    bias, deviation = float(rate.mean()), math.sqrt(blocks.var(ddof=1) / 10.0 + _wander(noise))
+    if abs(bias) > limits.bias:
+        raise CalibrationRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: the gyro turns, or is broken')
+    if noise is not None and noise.angle_random_walk:
+        _refuse_shaking(time, rate, noise)
+    return bias, deviation
+
+
+def _refuse_shaking(time: Array, rate: Array, noise: Noise) -> None:
+    expected = math.sqrt(noise.rate_variance(float(np.median(np.diff(time)))))
+    if rate.std() > 3.0 * expected:
+        raise CalibrationRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives {expected / DEGREE:.2f} deg/s: '
+                                 'stop the robot and its motors, and run again')
+
+
+def record(fit: Fit, method: str, time: str, temperature: float | None) -> SelfCalibration:
+    """Return what a model keeps of a fit."""
+    (a, b), (_, c) = np.nan_to_num(fit.covariance).tolist()
+    return SelfCalibration(fit.scale_factor_error, fit.bias, ((a, b), (b, c)), time, temperature, method)
