@@ -1,0 +1,42 @@
+"""
+KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1`` with the rate in deg/s and 1 for valid.
+
+The rate is positive clockwise, seen from above. The unit's clock is 2 to 3 % off from unit to unit, so its samples must never be
+integrated with the nominal interval. The letter R, sent three times, asks for rates instead of increments or integrated angles.
+
+Source: KVH DSP-3000 technical manual, asynchronous serial interface, 38400 baud, 100 Hz.
+
+"""
+
+import math
+import re
+from functools import partial
+
+from .lines import LineSplitter
+from .protocol import Protocol, Reading
+
+_LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
+
+
+def _parse(line, settings):
+    match = _LINE.fullmatch(line)
+    return match and Reading(float(match[1]), valid=match[2] == b'1')
+
+
+def _write(reading, settings):
+    return b'%15.6f   1\r\n' % reading.value
+
+
+KVH_DSP3000 = Protocol(
+    name='kvh_dsp3000',
+    description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
+    baud=38400,
+    rate=100.0,
+    sensitivity=math.radians(1.0),
+    splitter=partial(LineSplitter, 64, (b' ',)),
+    parse=_parse,
+    write=_write,
+    invert=True,
+    full_scale=math.radians(375.0),
+    startup=b'RRR',
+)
