@@ -1,0 +1,55 @@
+# `make test` and `make demo` need git, make and Python 3.10 to 3.13, nothing else: what is missing goes into .venv.
+# Where a ROS 2 is sourced (ROS_DISTRO), it is used; elsewhere its wheels are installed (x86-64 Linux only).
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+ROS := $(or $(ROS_DISTRO),wheels)
+
+# A distribution of its own for each ROS, so that a change of it is noticed.
+DEPENDENCIES := $(VENV)/.dependencies-$(ROS)
+INSTALLED := $(VENV)/.installed-$(ROS)
+SOURCES := package.xml $(shell find gyro_calibration config launch lib -type f -not -name '*.pyc')
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
+
+# Launch finds the package in .venv; nothing that runs here is heard on the network.
+export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+.PHONY: test types demo build clean
+
+# ruff does not keep pytest from running, so that one run says everything
+test: $(INSTALLED)
+	@$(BIN)/ruff check --quiet .; checked=$$?; $(BIN)/python -m pytest && exit $$checked
+
+types: $(INSTALLED)
+	@$(BIN)/mypy --ignore-missing-imports gyro_calibration
+
+demo: $(INSTALLED)
+	@$(BIN)/gyro_calibration demo --out demo
+
+build: $(INSTALLED)
+	@$(BIN)/colcon build
+
+clean:
+	rm -rf $(VENV) build install log demo *.egg-info .pytest_cache .ruff_cache .mypy_cache
+
+$(DEPENDENCIES): setup.py
+ifdef ROS_DISTRO
+	@echo 'Setting up $(VENV) beside ROS 2 $(ROS_DISTRO) ...'
+	@$(PYTHON) -m venv --clear --system-site-packages $(VENV)
+	@$(PIP) '.[plot,test]'
+else
+	@echo 'Setting up $(VENV) with ROS 2 from wheels, 400 MB, about a minute ...'
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PIP) '.[ros,plot,test]'
+endif
+	@touch $@
+
+# Not editable, because that installs neither configuration nor launch files; so each change of a source is installed anew, in seconds.
+# What setuptools leaves in build would bring removed modules back.
+$(INSTALLED): $(DEPENDENCIES) $(SOURCES)
+	@echo 'Installing gyro_calibration into $(VENV) ...'
+	@rm -rf build/lib build/bdist.*
+	@$(PIP) --no-deps --no-build-isolation .
+	@touch $@

@@ -1,0 +1,51 @@
+"""
+The driver of a gyro and the compensation of its output, with their parameters from the files in config.
+
+Topics: ``imu/data_raw``, ``imu/temperature``, ``imu/data``, ``yaw_rate``, ``heading``. A launch argument that is given goes before the
+file, one that is left empty changes nothing.
+
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+DRIVER = {
+    'port': 'serial port of the gyro, for example /dev/ttyUSB0',
+    'protocol': 'wire format of the gyro, for example kvh_dsp3000',
+}
+COMPENSATION = {
+    'model_file': 'model of the gyro, as `gyro_calibration fit` writes it',
+    'calibration_file': 'where the last self-calibration is kept',
+    'profile_file': 'motion profile of the self-calibration',
+}
+
+
+def generate_launch_description():
+    """
+    Return the arguments and the two nodes.
+
+    """
+    arguments = [DeclareLaunchArgument(name, default_value='', description=text) for name, text in (DRIVER | COMPENSATION).items()]
+    arguments.append(DeclareLaunchArgument('namespace', default_value='', description='namespace of both nodes and their topics'))
+    return LaunchDescription([*arguments, _file('driver'), _file('compensation'), OpaqueFunction(function=_nodes)])
+
+
+def _file(node):
+    default = PathJoinSubstitution([FindPackageShare('gyro_calibration'), 'config', f'{node}.yaml'])
+    return DeclareLaunchArgument(f'{node}_config', default_value=default, description=f'parameters of {node}_node')
+
+
+def _nodes(context):
+    given = context.launch_configurations
+    return [_node('driver', DRIVER, given), _node('compensation', COMPENSATION, given)]
+
+
+def _node(name, arguments, given):
+    overrides = {argument: ParameterValue(given[argument], value_type=str) for argument in arguments if given[argument]}
+    parameters = [given[f'{name}_config'], *([overrides] if overrides else [])]
+    executable = f'{name}_node'
+    return Node(package='gyro_calibration', executable=executable, name=executable, namespace=given['namespace'], parameters=parameters)

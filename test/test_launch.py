@@ -1,0 +1,110 @@
+"""
+The launch file as users start it: both nodes come up, the heading follows the gyro's topic, and all ends well.
+
+"""
+
+import random
+import time
+import unittest
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+# No import of ROS 2 and no skip at the level of the module: launch_testing imports each test module while it collects, and a skip there
+# would skip every file of this folder.
+LAUNCH = Path(__file__).parents[1] / 'launch'
+DOMAIN = random.SystemRandom().randint(1, 101)
+MISSING = [name for name in ('rclpy', 'launch_ros', 'launch_testing') if find_spec(name) is None]
+needs_launch = unittest.skipIf(MISSING, f'{" and ".join(MISSING)} not installed')
+
+
+@pytest.mark.launch_test
+def generate_test_description():
+    """Start the launch file with a port that does not exist, in a namespace."""
+    import launch_testing.actions
+    from launch import LaunchDescription
+    from launch.actions import IncludeLaunchDescription, SetEnvironmentVariable
+    skip_where_not_installed()
+    arguments = {'port': '/nonexistent/gyro', 'namespace': 'robot'}
+    nodes = IncludeLaunchDescription(str(LAUNCH / 'gyro.launch.py'), launch_arguments=arguments.items())
+    domain = SetEnvironmentVariable('ROS_DOMAIN_ID', str(DOMAIN))
+    return LaunchDescription([domain, nodes, launch_testing.actions.ReadyToTest()])
+
+
+def skip_where_not_installed():
+    """Skip where launch would not find the package."""
+    from ament_index_python import PackageNotFoundError, get_package_prefix
+    try:
+        get_package_prefix('gyro_calibration')
+    except PackageNotFoundError:
+        pytest.skip('gyro_calibration is not installed where AMENT_PREFIX_PATH points')
+
+
+@needs_launch
+class TestHeading(unittest.TestCase):
+    """While the nodes run."""
+
+    def setUp(self):
+        """Join their domain."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node('test_launch', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def tearDown(self):
+        """Leave it."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.shutdown()
+
+    def spin_until(self, condition, each_turn=lambda: None):
+        """Spin for at most 20 s, since discovery takes 0.3 s or 3 s, at random."""
+        deadline = time.monotonic() + 20.0
+        while not condition() and time.monotonic() < deadline:
+            each_turn()
+            self.executor.spin_once(timeout_sec=0.01)
+        return condition()
+
+    def test_both_nodes_are_in_the_namespace(self):
+        def names():
+            return {f'{namespace}/{name}' for name, namespace in self.node.get_node_names_and_namespaces()}
+        assert self.spin_until(lambda: {'/robot/driver_node', '/robot/compensation_node'} <= names()), names()
+
+    def test_a_launch_argument_goes_before_the_file(self):
+        from rcl_interfaces.srv import GetParameters
+        client = self.node.create_client(GetParameters, '/robot/driver_node/get_parameters')
+        assert self.spin_until(client.service_is_ready), 'no driver'
+        answer = client.call_async(GetParameters.Request(names=['port']))
+        assert self.spin_until(answer.done), 'no answer'
+        assert answer.result().values[0].string_value == '/nonexistent/gyro'
+
+    def test_the_heading_follows_the_raw_output(self):
+        from rclpy.qos import qos_profile_sensor_data
+        from sensor_msgs.msg import Imu
+        from std_msgs.msg import Float64
+        headings = []
+        self.node.create_subscription(Float64, '/robot/heading', headings.append, qos_profile_sensor_data)
+        publisher = self.node.create_publisher(Imu, '/robot/imu/data_raw', qos_profile_sensor_data)
+        assert self.spin_until(lambda: headings, lambda: publisher.publish(self.sample(Imu()))), 'no heading'
+
+    def sample(self, message):
+        """Fill in a sample of now: 0.1 rad/s, and no acceleration or orientation, as REP-145 wants it said."""
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        message.angular_velocity.z = 0.1
+        message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
+        return message
+
+
+@needs_launch
+class TestEnd(unittest.TestCase):
+    """After SIGINT."""
+
+    __post_shutdown_test__ = True  # what the decorator launch_testing.post_shutdown_test() sets, without importing it
+
+    def test_both_nodes_end_with_code_0(self, proc_info):
+        import launch_testing.asserts
+        launch_testing.asserts.assertExitCodes(proc_info)

@@ -1,0 +1,107 @@
+"""
+The package as users get it: from colcon and from pip, with data files and with what `ros2 run` finds.
+
+"""
+
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import gyro_calibration
+
+ROOT = Path(__file__).parents[1]
+PARTS = ['package.xml', 'setup.py', 'LICENSE', 'gyro_calibration', 'config', 'launch', 'lib', 'resource']
+EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
+COLCON = shutil.which('colcon', path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
+needs_colcon = pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
+
+
+@pytest.fixture(scope='module')
+def source(tmp_path_factory):
+    """Return a copy of what makes the package: a build may leave things in it."""
+    folder = tmp_path_factory.mktemp('source') / 'gyro_calibration'
+    folder.mkdir()
+    for part in PARTS:
+        copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
+        copy(ROOT / part, folder / part)
+    return folder
+
+
+def run(*command, folder):
+    """Run a command without the checkout on its Python path, and return what it prints."""
+    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONPATH'}
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, f'{command}:\n{result.stdout}{result.stderr}'
+    return result.stdout
+
+
+def expected_data():
+    """Return the data files of an installed package below its prefix."""
+    files = {f'share/gyro_calibration/config/{file.name}' for file in (ROOT / 'config').iterdir()}
+    files |= {f'share/gyro_calibration/launch/{file.name}' for file in (ROOT / 'launch').glob('*.launch.py')}
+    files |= {'share/gyro_calibration/package.xml', 'share/ament_index/resource_index/packages/gyro_calibration'}
+    return files | {f'lib/gyro_calibration/{name}' for name in EXECUTABLES}
+
+
+def test_the_version_of_the_manifest_is_the_version_of_the_module():
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert manifest.findtext('version') == gyro_calibration.__version__
+
+
+def test_every_launcher_is_the_same_and_can_be_executed():
+    launchers = list((ROOT / 'lib/gyro_calibration').iterdir())
+    assert {file.name for file in launchers} == EXECUTABLES
+    assert len({file.read_text() for file in launchers}) == 1
+    assert all(os.access(file, os.X_OK) for file in launchers)
+
+
+@needs_colcon
+def test_colcon_sees_a_ros_package(source, tmp_path):
+    verbs = run(COLCON, '--log-base', tmp_path, '--help', folder=source)
+    if 'list' not in verbs:
+        pytest.skip('colcon is installed without its verb list (colcon-package-information)')
+    assert run(COLCON, '--log-base', tmp_path, 'list', folder=source).split() == ['gyro_calibration', '.', '(ros.ament_python)']
+
+
+@needs_colcon
+@pytest.mark.parametrize('options', [(), ('--symlink-install',)], ids=['copied', 'symlinked'])
+def test_colcon_installs_data_and_executables(source, tmp_path, options):
+    bases = ['--build-base', tmp_path / 'build', '--install-base', tmp_path / 'install']
+    run(COLCON, '--log-base', tmp_path / 'log', 'build', *bases, *options, folder=source)
+    prefix = tmp_path / 'install/gyro_calibration'
+    assert not {file for file in expected_data() if not (prefix / file).is_file()}
+    setup = f'. {tmp_path}/install/local_setup.sh && {prefix}/lib/gyro_calibration/gyro_calibration --help'
+    assert 'fit' in run('sh', '-c', setup, folder=tmp_path)
+
+
+def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
+    pytest.importorskip('setuptools', reason='setuptools is not installed')
+    pytest.importorskip('wheel', reason='wheel is not installed')
+    options = ['--quiet', '--no-deps', '--no-build-isolation', '--no-index', '--wheel-dir', tmp_path]
+    run(sys.executable, '-m', 'pip', 'wheel', *options, source, folder=tmp_path)
+    wheel, = tmp_path.glob('*.whl')
+    with zipfile.ZipFile(wheel) as archive:
+        data = {name.split('.data/data/')[1]: archive.getinfo(name) for name in archive.namelist() if '.data/data/' in name}
+        modules = {name for name in archive.namelist() if name.startswith('gyro_calibration/')}
+    assert set(data) == expected_data()
+    assert all(data[f'lib/gyro_calibration/{name}'].external_attr >> 16 & 0o111 for name in EXECUTABLES)
+    assert modules == {str(file.relative_to(ROOT)) for file in (ROOT / 'gyro_calibration').rglob('*.py')}
+    check_metadata(wheel)
+
+
+def check_metadata(wheel):
+    """Compare the metadata of a wheel with package.xml."""
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    metadata, = importlib.metadata.distributions(path=[str(wheel)])
+    assert metadata.version == manifest.findtext('version')
+    assert metadata.metadata['Summary'] == manifest.findtext('description')
+    licences = [metadata.metadata.get('License'), metadata.metadata.get('License-Expression')]
+    assert manifest.findtext('license') in licences
+    assert {entry.name for entry in metadata.entry_points} == EXECUTABLES
