@@ -171,7 +171,7 @@ class SampleClock:
         self._use_device_time = use_device_time
         self._last = -math.inf
         self._arrival = -math.inf
-        self._device_time = None
+        self._device_time, self._offset = None, 0.0
 
     def stamp(self, times: Sequence[float | None], arrival: float) -> list[float]:
         """
@@ -211,10 +211,10 @@ class SampleClock:
         return average if gap else period
 
     def _follow_device(self, time, arrival):
-        step = None if self._device_time is None else time - self._device_time
+        continues = self._device_time is not None and 0.0 <= time - self._device_time <= _LARGEST_JUMP
         self._device_time = time
-        if step is None or not 0.0 <= step <= _LARGEST_JUMP or math.isinf(self._last):
-            self._last = max(arrival, self._last + _LEAST_STEP)
-        else:
-            self._last += max(step, _LEAST_STEP)
+        if not continues:
+            self._offset = max(arrival, self._last + _LEAST_STEP) - time
+        # Not the last stamp plus an interval, which would add up the rounding of seconds since 1970.
+        self._last = max(time + self._offset, self._last + _LEAST_STEP)
         return self._last

@@ -1,0 +1,143 @@
+"""
+The emulated gyro, read through a real pseudo-terminal.
+
+"""
+
+import itertools
+import math
+import os
+import threading
+import time
+
+import pytest
+
+from gyro_calibration.emulator import Emulator, emulate
+from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.serial_port import PortError, SerialPort
+
+
+def samples(count=None, rate=100.0):
+    """Return samples at a fixed rate, endless without a count."""
+    indices = itertools.count() if count is None else range(count)
+    return (Sample(0.1 * math.sin(k), 25.0, 5.0 + k / rate) for k in indices)
+
+
+def read_all(path, protocol, enough=None, settings=None):
+    """Read until the gyro is unplugged, or until there are enough samples."""
+    port, decoder, received = SerialPort(str(path), 115200), find(protocol).decoder(settings), []
+    port.open()
+    try:
+        while enough is None or len(received) < enough:
+            received += decoder.feed(port.read())
+    except PortError:
+        pass
+    finally:
+        port.close()
+    return received
+
+
+@pytest.mark.parametrize('name', sorted(PROTOCOLS))
+def test_a_reader_gets_every_sample(name, tmp_path):
+    emulator = Emulator(find(name), samples(200), speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
+    with emulator:
+        received = read_all(emulator.path, name, enough=200)
+    resolution = find(name).sensitivity if name != 'csv' else 1e-9
+    assert [sample.output for sample in received] == pytest.approx([sample.output for sample in samples(200)], abs=resolution)
+
+
+def test_nothing_is_lost_when_the_samples_end(tmp_path):
+    emulator = Emulator(find('csv'), samples(5000), speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
+    thread = threading.Thread(target=emulate, args=[emulator])
+    thread.start()
+    while not (tmp_path / 'gyro').exists():
+        time.sleep(0.001)
+    assert len(read_all(tmp_path / 'gyro', 'csv')) == 5000
+    thread.join()
+
+
+@pytest.mark.parametrize('speed', [1.0, 10.0])
+def test_samples_come_at_their_times(speed):
+    with Emulator(find('csv'), samples(rate=100.0), speed=speed, wait_for_reader=True) as emulator:
+        read_all(emulator.path, 'csv', enough=1)
+        begin = time.monotonic()
+        received = read_all(emulator.path, 'csv', enough=int(50 * speed))
+        elapsed = time.monotonic() - begin
+    assert received[-1].time - received[0].time == pytest.approx(0.5 * speed, rel=0.1)
+    assert elapsed == pytest.approx(0.5, abs=0.2)
+
+
+def test_samples_are_pulled_one_by_one():
+    pulled = []
+    source = (pulled.append(sample) or sample for sample in samples(rate=10.0))
+    with Emulator(find('csv'), source, wait_for_reader=True) as emulator:
+        received = read_all(emulator.path, 'csv', enough=3)
+        assert len(pulled) <= len(received) + 1
+
+
+def test_bytes_that_nobody_reads_are_lost_in_real_time(wait_until):
+    with Emulator(find('csv'), samples(rate=1000.0)) as emulator:
+        wait_until(lambda: emulator.lost_bytes > 1000)
+        first = read_all(emulator.path, 'csv', enough=1)[0]
+    assert first.time > 5.02
+    assert emulator.sent_bytes < 1000
+
+
+def test_a_replay_waits_for_its_reader():
+    with Emulator(find('csv'), samples(20000), speed=math.inf) as emulator:
+        received = read_all(emulator.path, 'csv', enough=19990)
+    assert emulator.lost_bytes == 0
+    assert received[-1].time - received[0].time == pytest.approx(0.01 * (len(received) - 1))
+
+
+def test_what_the_driver_sends_is_ignored():
+    with Emulator(find('kvh_dsp3000'), samples(rate=100.0), wait_for_reader=True) as emulator:
+        port, decoder, received = SerialPort(emulator.path, 38400), find('kvh_dsp3000').decoder(), []
+        port.open()
+        while len(received) < 30:
+            port.write(b'RRR' * 100)
+            received += decoder.feed(port.read())
+        port.close()
+    assert decoder.discarded_bytes == 0
+
+
+def test_the_link_is_replaced_and_removed(tmp_path):
+    link = tmp_path / 'gyro'
+    link.symlink_to('/nonexistent')
+    with Emulator(find('csv'), samples(), link=link) as emulator:
+        assert os.readlink(link) == emulator.path
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
+    link = tmp_path / 'gyro'
+    with Emulator(find('csv'), samples(), link=link):
+        second = Emulator(find('csv'), samples(), link=link)
+        second.open()
+    assert os.readlink(link) == second.path
+    second.close()
+
+
+def test_a_file_in_the_place_of_the_link_is_kept(tmp_path):
+    (tmp_path / 'notes').write_text('precious')
+    with pytest.raises(FileExistsError, match='choose another path'):
+        Emulator(find('csv'), samples(), link=tmp_path / 'notes').open()
+    assert (tmp_path / 'notes').read_text() == 'precious'
+
+
+def test_stop_ends_an_endless_gyro_at_once():
+    emulator = Emulator(find('csv'), samples(rate=0.01))
+    begin = time.monotonic()
+    with emulator:
+        pass
+    assert time.monotonic() - begin < 1.0
+
+
+@pytest.mark.parametrize('speed', [0.0, -1.0, math.nan])
+def test_an_impossible_speed_is_refused(speed):
+    with pytest.raises(ValueError, match='speed is .* above 0'):
+        Emulator(find('csv'), samples(), speed=speed)
+
+
+def test_settings_that_do_not_suffice_are_refused_before_the_start():
+    with pytest.raises(ValueError, match='sensitivity'):
+        Emulator(find('csv'), samples(), Settings(columns=('gyro_counts',)))

@@ -1,0 +1,237 @@
+"""
+The wire formats. Vectors of a device come from its manual or from a public decoder, as said beside them.
+
+"""
+
+import math
+import random
+
+import pytest
+
+from gyro_calibration.protocols import PLANNED, PROTOCOLS, Sample, Settings, find
+
+ALL = sorted(PROTOCOLS)
+DPS = math.radians(1.0)
+
+SETTINGS = {name: Settings() for name in ALL}
+LARGEST = {'kvh_dsp3000': 375.0, 'kvh_ecore': 59.9, 'minimu9': 2293.0, 'csv': 1e6}  # deg/s
+RESOLUTION = {'kvh_dsp3000': 1e-6, 'kvh_ecore': 0.00183, 'minimu9': 0.07, 'csv': 1e-2}  # deg/s, the csv at 9 digits of 1e6
+
+# Device, bytes, deg/s in its own sense of rotation.
+VECTORS = [
+    ('kvh_dsp3000', b'       0.015733   1\r\n', 0.015733),  # technical manual of the DSP-3000
+    ('kvh_dsp3000', b'    -120.500000   1\r\n', -120.5),
+    ('kvh_ecore', bytes.fromhex('8A40000000000768'), 1.83),  # count +1000; frame and checksum of the public decoder of the E-Core 2000
+    ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # print routine of the firmware, 0.07 deg/s a count
+    ('csv', b'12.5,-3.25,24.5\r\n', -3.25),
+]
+
+
+def stream(name, count=20, seed=1):
+    """Return samples and the bytes that a device sends for them."""
+    generator = random.Random(seed)
+    timed = name == 'csv'
+    samples = [
+        Sample(generator.uniform(-1.0, 1.0), generator.uniform(-40.0, 85.0) if timed else None, 0.01 * k if timed else None)
+        for k in range(count)
+    ]
+    protocol = find(name)
+    return samples, protocol.awakening + b''.join(protocol.encode(sample) for sample in samples)
+
+
+def opened(name, settings=None):
+    """Return a decoder that knows where the next frame begins."""
+    decoder = find(name).decoder(settings)
+    decoder.feed(find(name).awakening)
+    return decoder
+
+
+@pytest.mark.parametrize(('name', 'data', 'rate'), VECTORS)
+def test_published_frames_are_read(name, data, rate):
+    sample, = opened(name, Settings(invert=False)).feed(data)
+    assert sample.output == pytest.approx(rate * DPS, rel=1e-9)
+
+
+def test_the_published_frame_of_the_ecore_is_written():
+    assert find('kvh_ecore').encode(Sample(1.83 * DPS)) == bytes.fromhex('8A40000000000768')
+
+
+def test_clockwise_on_a_dsp3000_is_negative():
+    """The DSP-3000 counts clockwise positive, ROS counter-clockwise (REP-103)."""
+    sample, = find('kvh_dsp3000').decoder().feed(b'      10.000000   1\r\n')
+    assert sample.output == pytest.approx(-10.0 * DPS)
+
+
+@pytest.mark.parametrize('name', ALL)
+@pytest.mark.parametrize('invert', [True, False])
+def test_decoding_undoes_encoding(name, invert):
+    settings = Settings(invert=invert)
+    for part in (-1.0, -0.3, 0.0, 1e-3, 1.0):
+        output = part * LARGEST[name] * DPS
+        sample, = opened(name, settings).feed(find(name).encode(Sample(output), settings))
+        assert sample.output == pytest.approx(output, abs=0.51 * RESOLUTION[name] * DPS)
+
+
+def test_csv_keeps_time_and_temperature():
+    sample, = opened('csv').feed(find('csv').encode(Sample(0.5, 21.25, 1700000000.125)))
+    assert (sample.time, sample.temperature) == (1700000000.125, 21.25)
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_any_split_of_the_bytes_gives_the_same_samples(name):
+    _, data = stream(name)
+    whole = find(name).decoder().feed(data)
+    generator = random.Random(2)
+    for _ in range(50):
+        decoder, cuts = find(name).decoder(), sorted(generator.choices(range(len(data)), k=30))
+        pieces = [data[start:end] for start, end in zip([0, *cuts], [*cuts, len(data)], strict=True)]
+        assert [sample for piece in pieces for sample in decoder.feed(piece)] == whole
+    assert len(whole) == 20
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_garbage_costs_at_most_one_frame(name):
+    samples, data = stream(name)
+    garbage = bytes(random.Random(3).randrange(256) for _ in range(200))
+    decoder = opened(name)
+    decoder.feed(garbage)
+    received = decoder.feed(data.removeprefix(find(name).awakening))
+    assert len(received) >= len(samples) - 1
+    assert received[-1].output == pytest.approx(samples[-1].output, abs=RESOLUTION[name] * DPS)
+    assert decoder.discarded_bytes >= 100
+
+
+@pytest.mark.parametrize('name', ['kvh_dsp3000', 'csv'])
+def test_half_a_number_is_no_number(name):
+    """A port is opened in the middle of a line, where 120.5 looks like 20.5."""
+    _, data = stream(name, 2)
+    whole = {sample.output for sample in find(name).decoder().feed(data)}
+    for start in range(len(find(name).awakening) + 1, len(data)):
+        assert {sample.output for sample in find(name).decoder().feed(data[start:])} <= whole
+
+
+@pytest.mark.parametrize('bit', range(64))
+def test_a_flipped_bit_in_an_ecore_frame_gives_no_wrong_rate(bit):
+    frames = [bytearray(find('kvh_ecore').encode(Sample(rate * DPS))) for rate in (1.0, 2.0, 3.0)]
+    good = [find('kvh_ecore').decoder().feed(frame)[0] for frame in frames]
+    frames[1][bit // 8] ^= 1 << bit % 8
+    decoder = find('kvh_ecore').decoder()
+    received = decoder.feed(b''.join(frames))
+    assert received in ([good[0], good[2]], [good[0]], [good[2]])
+    assert decoder.discarded_bytes >= 8
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_a_megabyte_of_noise_raises_nothing_and_holds_no_memory(name):
+    decoder, generator = opened(name), random.Random(4)
+    received = []
+    for _ in range(256):
+        received += decoder.feed(generator.randbytes(4096))
+    assert decoder.discarded_bytes > 900_000
+    assert all(math.isfinite(sample.output) for sample in received)
+    assert len(decoder._splitter._tail) <= 1024
+
+
+@pytest.mark.parametrize('name', ['kvh_dsp3000', 'minimu9', 'csv'])
+def test_an_endless_line_is_thrown_away(name):
+    decoder = opened(name)
+    for _ in range(1000):
+        assert decoder.feed(b' 1' * 500) == []
+    assert decoder.discarded_bytes > 990_000
+    decoder.feed(b'\n')
+    assert len(decoder.feed(find(name).encode(Sample(0.1)))) == 1
+
+
+@pytest.mark.parametrize('text', [b'nan', b'inf', b'-inf', b'1e999', b'1_0', b'0x10', b'', b'\xb2', b'1.5.2', b'--1', b'infinity'])
+def test_csv_discards_what_is_no_finite_rate(text):
+    decoder = opened('csv')
+    assert decoder.feed(b'0.1,' + text + b',20.0\n') == []
+    assert decoder.discarded_bytes == len(text) + 9
+
+
+@pytest.mark.parametrize('text', [b'nan', b'NaN', b''])
+def test_a_failed_temperature_sensor_does_not_cost_the_rate(text):
+    sample, = opened('csv').feed(b'0.1,5.0,' + text + b'\n')
+    assert sample.temperature is None
+    assert sample.output == pytest.approx(5.0 * DPS)
+
+
+@pytest.mark.parametrize(('name', 'data', 'settings'), [
+    ('kvh_dsp3000', b'     400.000000   1\r\n', Settings()),  # the DSP-3000 measures up to 375 deg/s
+    ('kvh_ecore', find('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
+    ('minimu9', b'!ANG:0,0,0,AN:0,0,40000,0,0,0,0,0,0\r\n', Settings()),  # counts have 16 bits
+    ('csv', b'0.1,501.0,20.0\n', Settings(full_scale=500.0 * DPS)),
+])
+def test_a_rate_that_the_device_cannot_mean_is_thrown_away(name, data, settings):
+    decoder = opened(name, settings)
+    assert decoder.feed(data) == []
+    assert decoder.out_of_range == 1
+
+
+def test_a_sample_that_the_dsp3000_calls_invalid_is_a_fault():
+    decoder = find('kvh_dsp3000').decoder()
+    assert decoder.feed(b'       0.015733   0\r\n') == []
+    assert (decoder.faults, decoder.discarded_bytes) == (1, 0)
+
+
+def test_the_axis_chooses_among_three():
+    line = b'!ANG:0.10,-0.20,90.00,AN:100,200,300,4,5,250,7,8,9\r\n'
+    rates = [find('minimu9').decoder(Settings(axis=axis)).feed(line)[0].output for axis in 'xyz']
+    assert rates == pytest.approx([7.0 * DPS, 14.0 * DPS, 21.0 * DPS])
+
+
+@pytest.mark.parametrize(('columns', 'sensitivity', 'line'), [
+    (('gyro_rad_s',), None, b'0.5'),
+    (('temperature_degc', 'gyro_counts', 'time_s'), 0.001, b'20,500,1'),
+    (('sequence', 'gyro_dps', 'voltage'), None, b'x,28.64788975654116,?'),
+])
+def test_csv_columns_have_the_units_of_their_names(columns, sensitivity, line):
+    sample, = opened('csv', Settings(columns=columns, sensitivity=sensitivity)).feed(line + b'\r')
+    assert sample.output == pytest.approx(0.5)
+
+
+def test_full_scale_follows_the_sensitivity():
+    """A MinIMU-9 set to 250 deg/s still has 16 bits: all its counts are good."""
+    settings = Settings(sensitivity=0.00875 * DPS)
+    sample, = find('minimu9').decoder(settings).feed(find('minimu9').encode(Sample(280.0 * DPS), settings))
+    assert sample.output == pytest.approx(280.0 * DPS, rel=1e-4)
+
+
+@pytest.mark.parametrize('name', ['kvh_dsp3000', 'kvh_ecore', 'minimu9'])
+def test_an_emulated_gyro_saturates_at_its_full_scale(name):
+    sample, = opened(name).feed(find(name).encode(Sample(-1000.0)))
+    assert sample.output == pytest.approx(-find(name).full_scale, rel=1e-4)
+
+
+def test_a_lost_port_does_not_join_two_halves():
+    decoder = opened('csv')
+    decoder.feed(b'0.1,1')
+    decoder.reset()
+    assert decoder.feed(b'2.5,20.0\n0.2,3.0,20.0\n') == [Sample(3.0 * DPS, 20.0, 0.2)]
+    assert decoder.discarded_bytes == 13
+
+
+@pytest.mark.parametrize(('values', 'message'), [
+    ({'sensitivity': -1.0}, 'set invert'),
+    ({'sensitivity': math.nan}, 'above 0'),
+    ({'full_scale': math.inf}, 'above 0'),
+    ({'axis': 'w'}, 'x, y or z'),
+    ({'columns': ('time_s',)}, 'exactly one'),
+    ({'columns': ('gyro_dps', 'gyro_counts')}, 'exactly one'),
+    ({'columns': ('gyro_dps', 'time_s', 'time_s')}, 'only once'),
+])
+def test_impossible_settings_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**values)
+
+
+@pytest.mark.parametrize('settings', [Settings(columns=('gyro_counts',)), Settings(sensitivity=0.1)])
+def test_csv_wants_a_sensitivity_for_counts_and_only_for_them(settings):
+    with pytest.raises(ValueError, match='sensitivity'):
+        find('csv').decoder(settings)
+
+
+@pytest.mark.parametrize('name', [*PLANNED, 'kvh_dsp_3000', ''])
+def test_an_unknown_protocol_is_refused_with_the_known_ones(name):
+    with pytest.raises(ValueError, match=r'^protocol .*: choose one of kvh_dsp3000, kvh_ecore, minimu9, csv'):
+        find(name)
