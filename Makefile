@@ -12,24 +12,24 @@ INSTALLED := $(VENV)/.installed-$(ROS)
 SOURCES := package.xml $(shell find gyro_calibration config launch lib -type f -not -name '*.pyc')
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 
-# Launch finds the package in .venv; nothing that runs here is heard on the network.
-export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
+# Nothing that runs here is heard on the network, and launch finds the package in .venv.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+test demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
 
 .PHONY: test types demo build clean
 
 # ruff does not keep pytest from running, so that one run says everything
 test: $(INSTALLED)
-	@$(BIN)/ruff check --quiet .; checked=$$?; $(BIN)/python -m pytest && exit $$checked
+	@$(BIN)/python -m ruff check --quiet --output-format concise .; checked=$$?; $(BIN)/python -m pytest && exit $$checked
 
 types: $(INSTALLED)
-	@$(BIN)/mypy --ignore-missing-imports gyro_calibration
+	@$(BIN)/python -m mypy --ignore-missing-imports gyro_calibration
 
 demo: $(INSTALLED)
 	@$(BIN)/gyro_calibration demo --out demo
 
 build: $(INSTALLED)
-	@$(BIN)/colcon build
+	@PATH="$(CURDIR)/$(BIN):$$PATH" colcon build --event-handlers console_direct-
 
 clean:
 	rm -rf $(VENV) build install log demo *.egg-info .pytest_cache .ruff_cache .mypy_cache

@@ -36,7 +36,8 @@ def source(tmp_path_factory):
 
 def run(*command, folder):
     """Run a command without the checkout on its Python path, and return what it prints."""
-    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONPATH'}
+    paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep) if path and Path(path) != ROOT]
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(paths)}
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, f'{command}:\n{result.stdout}{result.stderr}'
     return result.stdout
