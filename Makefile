@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ROS := $(or $(ROS_DISTRO),wheels)
 
-# A distribution of its own for each ROS, so that a change of it is noticed.
+# Stamps of their own for each ROS, so that a change of it is noticed.
 DEPENDENCIES := $(VENV)/.dependencies-$(ROS)
 INSTALLED := $(VENV)/.installed-$(ROS)
 SOURCES := package.xml $(shell find gyro_calibration config launch lib -type f -not -name '*.pyc')
