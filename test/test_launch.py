@@ -1,5 +1,5 @@
 """
-The launch file as users start it: both nodes come up, the heading follows the gyro's topic, and all ends well.
+The launch files as users start them: the nodes come up, the heading follows the gyro, and all ends well.
 
 """
 
@@ -21,15 +21,20 @@ needs_launch = unittest.skipIf(MISSING, f'{" and ".join(MISSING)} not installed'
 
 @pytest.mark.launch_test
 def generate_test_description():
-    """Start the launch file with a port that does not exist, in a namespace."""
+    """Start the demo, and besides the nodes alone, in a namespace, with a port that does not exist."""
     import launch_testing.actions
     from launch import LaunchDescription
-    from launch.actions import IncludeLaunchDescription, SetEnvironmentVariable
+    from launch.actions import SetEnvironmentVariable
     skip_where_not_installed()
-    arguments = {'port': '/nonexistent/gyro', 'namespace': 'robot'}
-    nodes = IncludeLaunchDescription(str(LAUNCH / 'gyro.launch.py'), launch_arguments=arguments.items())
     domain = SetEnvironmentVariable('ROS_DOMAIN_ID', str(DOMAIN))
-    return LaunchDescription([domain, nodes, launch_testing.actions.ReadyToTest()])
+    nodes = include('gyro.launch.py', {'port': '/nonexistent/gyro', 'namespace': 'robot'})
+    return LaunchDescription([domain, include('demo.launch.py', {}), nodes, launch_testing.actions.ReadyToTest()])
+
+
+def include(name, arguments):
+    """Include a launch file whose arguments stay its own."""
+    from launch.actions import GroupAction, IncludeLaunchDescription
+    return GroupAction([IncludeLaunchDescription(str(LAUNCH / name), launch_arguments=arguments.items())])
 
 
 def skip_where_not_installed():
@@ -42,7 +47,7 @@ def skip_where_not_installed():
 
 
 @needs_launch
-class TestHeading(unittest.TestCase):
+class TestGraph(unittest.TestCase):
     """While the nodes run."""
 
     def setUp(self):
@@ -85,11 +90,21 @@ class TestHeading(unittest.TestCase):
     def test_the_heading_follows_the_raw_output(self):
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import Imu
-        from std_msgs.msg import Float64
-        headings = []
-        self.node.create_subscription(Float64, '/robot/heading', headings.append, qos_profile_sensor_data)
+        headings = self.headings('/robot/heading')
         publisher = self.node.create_publisher(Imu, '/robot/imu/data_raw', qos_profile_sensor_data)
         assert self.spin_until(lambda: headings, lambda: publisher.publish(self.sample(Imu()))), 'no heading'
+
+    def test_the_demo_has_a_heading(self):
+        headings = self.headings('/heading')
+        assert self.spin_until(lambda: headings), 'no heading'
+
+    def headings(self, topic):
+        """Return the list that the headings go to."""
+        from rclpy.qos import qos_profile_sensor_data
+        from std_msgs.msg import Float64
+        headings = []
+        self.node.create_subscription(Float64, topic, headings.append, qos_profile_sensor_data)
+        return headings
 
     def sample(self, message):
         """Fill in a sample of now: 0.1 rad/s, and no acceleration or orientation, as REP-145 wants it said."""
@@ -105,6 +120,6 @@ class TestEnd(unittest.TestCase):
 
     __post_shutdown_test__ = True  # what the decorator launch_testing.post_shutdown_test() sets, without importing it
 
-    def test_both_nodes_end_with_code_0(self, proc_info):
+    def test_all_end_with_code_0(self, proc_info):
         import launch_testing.asserts
         launch_testing.asserts.assertExitCodes(proc_info)
