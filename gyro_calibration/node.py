@@ -103,6 +103,7 @@ class Parameter:
         return value
 
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WORDS = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text', list: 'a list of texts'}
 
 
@@ -179,6 +180,9 @@ def run(node_class: type[Node]) -> int:
         return 0
     finally:
         rclpy.try_shutdown()
+        # Ctrl-C under a launch file comes twice, and the second would kill the interpreter while it ends.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _start(node_class):
@@ -198,7 +202,7 @@ def _stop_on_signals():
 
     """
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _SIGNALS:
         signal.signal(number, lambda *_: stop.set())
     return stop
 

@@ -122,9 +122,13 @@ class NodeProcess:
 
     def stop(self, number=signal.SIGINT, timeout=15.0):
         """Send a signal to its process group, wait, and return its exit code."""
+        self.interrupt(number)
+        return self.wait(timeout)
+
+    def interrupt(self, number=signal.SIGINT):
+        """Send a signal to its process group, if it still runs."""
         if self.process.poll() is None:
             os.killpg(self.process.pid, number)
-        return self.wait(timeout)
 
     def close(self):
         """End it at all costs, and check that it ended well."""

@@ -7,6 +7,7 @@ import itertools
 import math
 import os
 import re
+import time
 import tty
 from pathlib import Path
 
@@ -220,6 +221,17 @@ def test_a_signal_ends_it_with_code_0_while_it_reads(robot):
     with Emulator(find('csv'), turning()) as gyro:
         driver = robot(gyro.path)
         driver.receive()
+        assert driver.node.stop(timeout=3.0) == 0
+
+
+def test_an_impatient_second_signal_changes_nothing(robot):
+    """Under a launch file Ctrl-C comes twice: from the terminal and from launch."""
+    with Emulator(find('csv'), turning()) as gyro:
+        driver = robot(gyro.path)
+        driver.receive()
+        for _ in range(40):
+            driver.node.interrupt()
+            time.sleep(0.01)
         assert driver.node.stop(timeout=3.0) == 0
 
 
