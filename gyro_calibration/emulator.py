@@ -73,7 +73,7 @@ class Emulator:
         self._wait_for_reader = wait_for_reader
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
-        self._master, self._reader_poll = None, select.poll()
+        self._master, self._reader_poll = -1, select.poll()
         self.path = ''
         self.sent_bytes = 0
         self.lost_bytes = 0
@@ -99,14 +99,19 @@ class Emulator:
         """
         Send the samples until they end or `stop` is called.
 
+        Raises
+        ------
+        ValueError : a sample has no time
+
         """
         if self._wait_for_reader:
             self._wait_until_read()
         self._send(self._protocol.awakening)
         start = None
         for sample in self._samples:
-            start = time.monotonic() - sample.time / self._speed if start is None else start
-            if self._stopped_before(start + sample.time / self._speed):
+            due = _time(sample) / self._speed
+            start = time.monotonic() - due if start is None else start
+            if self._stopped_before(start + due):
                 return
             self._send(self._protocol.encode(sample, self._settings))
         if self.is_read():
@@ -137,9 +142,9 @@ class Emulator:
         """
         if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.path:
             self._link.unlink()
-        if self._master is not None:
+        if self._master >= 0:
             os.close(self._master)
-            self._master = None
+            self._master = -1
 
     def join(self) -> None:
         """
@@ -194,6 +199,12 @@ class Emulator:
             return os.write(self._master, data)
         except BlockingIOError:
             return 0
+
+
+def _time(sample):
+    if sample.time is None:
+        raise ValueError('a sample has no time, but the emulator sends each at its time: set Sample.time in seconds')
+    return sample.time
 
 
 def emulate(emulator: Emulator) -> None:

@@ -141,3 +141,8 @@ def test_an_impossible_speed_is_refused(speed):
 def test_settings_that_do_not_suffice_are_refused_before_the_start():
     with pytest.raises(ValueError, match='sensitivity'):
         Emulator(find('csv'), samples(), Settings(columns=('gyro_counts',)))
+
+
+def test_a_sample_without_a_time_is_refused():
+    with pytest.raises(ValueError, match='set Sample.time'):
+        emulate(Emulator(find('csv'), [Sample(0.5)]))
