@@ -33,7 +33,12 @@ def generate_launch_description():
 def _emulator(port):
     program = ExecutableInPackage(package=PACKAGE, executable='gyro_calibration')
     command = [program, 'emulate', '--protocol', PROTOCOL, '--model', _model(), '--motion', 'robot', '--link', port]
-    return ExecuteProcess(cmd=command, name='emulator', output='screen', on_exit=Shutdown(reason='the emulated gyro has ended'))
+    return ExecuteProcess(cmd=command, name='emulator', output='screen', on_exit=_end)
+
+
+def _end(event, context):
+    # After Ctrl-C everything ends by itself, and a second signal would hit nodes that are about to.
+    return [] if context.is_shutdown else [Shutdown(reason='the emulated gyro has ended')]
 
 
 def _model():
