@@ -1,5 +1,5 @@
 """
-The wire formats. Vectors of a device come from its manual or from a public decoder, as said beside them.
+The wire formats: what each looks like on the line, that any bytes are survived, and that wrong settings are refused.
 
 """
 
@@ -14,15 +14,15 @@ ALL = sorted(PROTOCOLS)
 DPS = math.radians(1.0)
 
 SETTINGS = {name: Settings() for name in ALL}
-LARGEST = {'kvh_dsp3000': 375.0, 'kvh_ecore': 59.9, 'minimu9': 2293.0, 'csv': 1e6}  # deg/s
+LARGEST = {'kvh_dsp3000': 500.0, 'kvh_ecore': 59.9, 'minimu9': 2293.0, 'csv': 1e6}  # deg/s
 RESOLUTION = {'kvh_dsp3000': 1e-6, 'kvh_ecore': 0.00183, 'minimu9': 0.07, 'csv': 1e-2}  # deg/s, the csv at 9 digits of 1e6
 
-# Device, bytes, deg/s in its own sense of rotation.
+# Format, bytes, deg/s in the device's own sense of rotation.
 VECTORS = [
-    ('kvh_dsp3000', b'       0.015733   1\r\n', 0.015733),  # technical manual of the DSP-3000
+    ('kvh_dsp3000', b'       0.015733   1\r\n', 0.015733),  # in the format of the technical manual, section 2.1
     ('kvh_dsp3000', b'    -120.500000   1\r\n', -120.5),
-    ('kvh_ecore', bytes.fromhex('8A40000000000768'), 1.83),  # count +1000; frame and checksum of the public decoder of the E-Core 2000
-    ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # print routine of the firmware, 0.07 deg/s a count
+    ('kvh_ecore', bytes.fromhex('8A40000000000768'), 1.83),  # count +1000, worked out by hand from the layout of a public decoder
+    ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # as the firmware's print routine writes it; 0.07 deg/s a count
     ('csv', b'12.5,-3.25,24.5\r\n', -3.25),
 ]
 
@@ -47,12 +47,12 @@ def opened(name, settings=None):
 
 
 @pytest.mark.parametrize(('name', 'data', 'rate'), VECTORS)
-def test_published_frames_are_read(name, data, rate):
+def test_frames_of_the_documented_layout_are_read(name, data, rate):
     sample, = opened(name, Settings(invert=False)).feed(data)
     assert sample.output == pytest.approx(rate * DPS, rel=1e-9)
 
 
-def test_the_published_frame_of_the_ecore_is_written():
+def test_a_frame_of_the_ecore_is_written_as_documented():
     assert find('kvh_ecore').encode(Sample(1.83 * DPS)) == bytes.fromhex('8A40000000000768')
 
 
@@ -157,7 +157,7 @@ def test_a_failed_temperature_sensor_does_not_cost_the_rate(text):
 
 
 @pytest.mark.parametrize(('name', 'data', 'settings'), [
-    ('kvh_dsp3000', b'     400.000000   1\r\n', Settings()),  # the DSP-3000 measures up to 375 deg/s
+    ('kvh_dsp3000', b'     501.000000   1\r\n', Settings()),  # manual of the DSP-3000, table 2
     ('kvh_ecore', find('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
     ('minimu9', b'!ANG:0,0,0,AN:0,0,40000,0,0,0,0,0,0\r\n', Settings()),  # counts have 16 bits
     ('csv', b'0.1,501.0,20.0\n', Settings(full_scale=500.0 * DPS)),

@@ -4,7 +4,9 @@ KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1
 The rate is positive clockwise, seen from above. The unit's clock is 2 to 3 % off from unit to unit, so its samples must never be
 integrated with the nominal interval. The letter R, sent three times, asks for rates instead of increments or integrated angles.
 
-Source: KVH DSP-3000 technical manual, asynchronous serial interface, 38400 baud, 100 Hz.
+Source: KVH DSP-3000 technical manual, 54-0215 revision C, section 2, for the unit with the asynchronous interface of 100 Hz (part
+02-1222-01); that of 1000 Hz (02-1222-07) sends binary and is not read here. The linearity is given up to 375 deg/s, and beyond 500 deg/s
+the output is unreliable, whatever the valid bit says (table 2).
 
 """
 
@@ -37,6 +39,6 @@ KVH_DSP3000 = Protocol(
     parse=_parse,
     write=_write,
     invert=True,
-    full_scale=math.radians(375.0),
+    full_scale=math.radians(500.0),
     startup=b'RRR',
 )
