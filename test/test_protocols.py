@@ -22,7 +22,7 @@ VECTORS = [
     ('kvh_dsp3000', b'       0.015733   1\r\n', 0.015733),  # in the format of the technical manual, section 2.1
     ('kvh_dsp3000', b'    -120.500000   1\r\n', -120.5),
     ('kvh_ecore', bytes.fromhex('8A40000000000768'), 1.83),  # count +1000, worked out by hand from the layout of a public decoder
-    ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # as the firmware's print routine writes it; 0.07 deg/s a count
+    ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # as the firmware prints it; 0.07 deg/s a count
     ('csv', b'12.5,-3.25,24.5\r\n', -3.25),
 ]
 
