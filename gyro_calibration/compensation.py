@@ -47,7 +47,8 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     used = np.minimum(np.maximum(given, low), high)
     modelled = model.rate(output, used)
     slowest, fastest = model.rate_range
-    return Compensated(modelled, (model.self_calibration or _NONE).correct(modelled), used != given, (output < slowest) | (output > fastest))
+    rate = (model.self_calibration or _NONE).correct(modelled)
+    return Compensated(modelled, rate, used != given, (output < slowest) | (output > fastest))
 
 
 def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number) -> np.ndarray:

@@ -20,13 +20,14 @@ class Threshold:
     ----------
     rate : rad/s; below it the robot counts as standing; 0 switches the filter off
     window : s; the mean over it is compared with the rate. 0 compares single samples, as published
-    spread : rad/s; a window whose standard deviation is above it is motion whatever its mean; 0 does not look at it
+    angle_random_walk : rad/√s; a window that varies by more than three times what this explains is motion, whatever its mean; 0 does
+        not look at it
 
     """
 
     rate: float = 0.3 * DEGREE
     window: float = 0.2
-    spread: float = 0.0
+    angle_random_walk: float = 0.0
 
 
 class ThresholdFilter:
@@ -66,16 +67,12 @@ class ThresholdFilter:
             self._sum -= old
             self._squares -= old * old
         mean = self._sum / len(window)
-        variance = self._squares / len(window) - mean * mean
-        return abs(mean) < self.settings.rate and not (0.0 < self.settings.spread ** 2 < variance)
+        return abs(mean) < self.settings.rate and not self._shakes(self._squares / len(window) - mean * mean)
 
-
-@dataclass(frozen=True)
-class Step:
-    """What one sample did: the heading went on, the sample was ignored, or integration began anew."""
-
-    restarted: str = ''
-    ignored: str = ''
+    def _shakes(self, variance: float) -> bool:
+        """Tell whether the window varies by more than noise would."""
+        explained, lasts = self.settings.angle_random_walk ** 2 * len(self._window), self._window[-1][0] - self._window[0][0]
+        return 0.0 < 9.0 * explained < variance * lasts
 
 
 class HeadingIntegrator:
@@ -89,11 +86,11 @@ class HeadingIntegrator:
 
     """
 
-    def __init__(self, noise: Noise, maximum_gap: float = 1.0):
+    def __init__(self, maximum_gap: float = 1.0):
         """Begin at heading zero; over a gap longer than `maximum_gap`, s, nothing is integrated."""
         self.heading = 0.0
         self.deleted = 0.0
-        self._noise = noise
+        self._noise = Noise()
         self._maximum_gap = maximum_gap
         self._covariance = np.zeros((0, 0))
         self._settled = 0.0
@@ -112,7 +109,9 @@ class HeadingIntegrator:
     def use(self, noise: Noise, covariance: np.ndarray) -> None:
         """Go on with other noise figures and another covariance of the calibration; the heading does not jump."""
         self._settled = self.variance
-        self._noise, self._covariance, self._last = noise, covariance, None if self._last is None else (*self._last[:3], np.zeros(len(covariance)))
+        self._noise, self._covariance = noise, covariance
+        if self._last is not None:
+            self._last = (*self._last[:3], np.zeros(len(covariance)))
         self._begin_variance()
 
     @property
@@ -121,7 +120,7 @@ class HeadingIntegrator:
         calibration = self._sensitivity @ self._covariance @ self._sensitivity
         return self._settled + float(calibration) + self._noise.heading_variance(self._moving_time)
 
-    def add(self, time: float, rate: float, filtered: float, sensitivity: np.ndarray) -> Step:
+    def add(self, time: float, rate: float, filtered: float, sensitivity: np.ndarray) -> str:
         """
         Take one sample.
 
@@ -131,15 +130,16 @@ class HeadingIntegrator:
         rate, filtered : before and after the threshold filter, rad/s
         sensitivity : of the rate to the values of the calibration, shape (m,), as in `compensation`
 
+        Returns
+        -------
+        '', or why the integration began anew with this sample
+
         """
-        if self._last is None:
-            self._last = (time, rate, filtered, sensitivity)
-            return Step()
-        before, last_rate, last_filtered, last_sensitivity = self._last
+        last, self._last = self._last, (time, rate, filtered, sensitivity)
+        if last is None:
+            return ''
+        before, last_rate, last_filtered, last_sensitivity = last
         interval = time - before
-        if interval == 0.0:
-            return Step(ignored=f'the stamp stands still at {time:.3f} s')
-        self._last = (time, rate, filtered, sensitivity)
         if interval < 0.0 or interval > self._maximum_gap:
             return self._restart(interval, max(abs(rate), abs(last_rate)))
         half = 0.5 * interval
@@ -149,14 +149,14 @@ class HeadingIntegrator:
         self._moving_time += moving
         if len(sensitivity):
             self._sensitivity += half * ((filtered != 0.0) * sensitivity + (last_filtered != 0.0) * last_sensitivity)
-        return Step()
+        return ''
 
-    def _restart(self, interval: float, fastest: float) -> Step:
+    def _restart(self, interval: float, fastest: float) -> str:
         """Begin anew after a gap or a jump back; what may have been turned meanwhile goes into the variance."""
         if interval < 0.0:
-            return Step(restarted=f'the stamp jumps back by {-interval:.3f} s')
+            return f'the stamp jumps back by {-interval:.3f} s'
         self._settled += (fastest * interval) ** 2
-        return Step(restarted=f'no samples for {interval:.3f} s')
+        return f'no samples for {interval:.3f} s'
 
 
 def integrate(time: Array, rate: Array) -> Array:

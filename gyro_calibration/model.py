@@ -13,7 +13,7 @@ import yaml
 
 from gyro_calibration.effects import CATALOGUE, Channels, Effect, Number, polynomial_from_matrix, rate_temperature_polynomial
 from gyro_calibration.files import write_atomically
-from gyro_calibration.log import Array
+from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.noise import Noise
 
 FORMAT = 'gyro_calibration/model'
@@ -83,6 +83,21 @@ class SelfCalibration:
     def correct(self, rate: Number) -> Number:
         """Return the rate, rad/s, from one that the model has compensated (eq. 3)."""
         return self.scale * rate + self.offset
+
+    def figures(self) -> dict[str, Any]:
+        """Return what there is to know, by name, in SI."""
+        scale_deviation, bias_deviation = self.standard_deviations
+        return {'scale_factor_error': self.scale_factor_error, 'scale_factor_error_standard_deviation': scale_deviation,
+                'bias': self.bias, 'bias_standard_deviation': bias_deviation, 's_bar': self.scale, 'b_bar': self.offset,
+                'calibration_time': self.time, 'calibration_temperature': self.temperature, 'method': self.method}
+
+    def __str__(self) -> str:
+        """Return a sentence for people."""
+        scale_deviation, bias_deviation = self.standard_deviations
+        temperature = '' if self.temperature is None else f' at {self.temperature:.1f} degC'
+        return (f'scale factor error {100 * self.scale_factor_error:.3f} +- {100 * scale_deviation:.3f} %, '
+                f'bias {self.bias / DEGREE:.4f} +- {bias_deviation / DEGREE:.4f} deg/s '
+                f'(s_bar {self.scale:.6f}, b_bar {self.offset:.6f} rad/s){temperature}')
 
 
 @dataclass(frozen=True)
@@ -208,7 +223,8 @@ def _mapping(place: str, value: Any) -> dict[str, Any]:
 
 def _number(place: str, value: Any, low: float = -math.inf) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < low:
-        raise _PlaceError(place, value, 'a finite number' + (f' of at least {low:g}' if low > -math.inf else '') + '; mend it or calibrate again')
+        least = f' of at least {low:g}' if low > -math.inf else ''
+        raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
     return float(value)
 
 
@@ -230,10 +246,10 @@ def _range(place: str, value: Any) -> tuple[float, float]:
 
 
 def _matrix(place: str, value: Any, size: int) -> Array:
-    rows = value if isinstance(value, list) and len(value) == size and all(isinstance(row, list) and len(row) == size for row in value) else None
-    if rows is None:
+    if not isinstance(value, list) or [len(row) for row in value if isinstance(row, list)] != [size] * size:
         raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a coefficient')
-    matrix = np.array([[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(rows)]).reshape(size, size)
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
+    matrix = np.array(numbers).reshape(size, size)
     if not np.allclose(matrix, matrix.T) or (np.linalg.eigvalsh(matrix) < -1e-9 * np.abs(matrix).max(initial=0.0)).any():
         raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
     return matrix
@@ -310,7 +326,8 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
     content['gyro'] = dict(model.gyro)
     content['origin'] = dict(model.origin)
     if model.self_calibration is not None:
-        content['self_calibration'] = {**vars(model.self_calibration), 'covariance': [list(row) for row in model.self_calibration.covariance]}
+        rows = [list(row) for row in model.self_calibration.covariance]
+        content['self_calibration'] = {**vars(model.self_calibration), 'covariance': rows}
     return content
 
 

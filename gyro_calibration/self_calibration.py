@@ -114,7 +114,7 @@ def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
 
 def _solve(matrix: Array, vector: Array) -> Array:
     if not np.linalg.cond(matrix) < 1e12:
-        raise CalibrationRefused('the gyro did not change its rate, so scale factor error and bias cannot be parted: turn both ways, with stops')
+        raise CalibrationRefused('the gyro did not change its rate, so scale and bias cannot be parted: turn both ways, with stops')
     return np.linalg.solve(matrix, vector)
 
 
@@ -410,10 +410,11 @@ def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
     points = np.arange(0.0, motion.duration, 0.05)
     spread = float(np.std(motion.rate_at(points)))
     if spread < limits.rate_spread:
-        raise CalibrationRefused(f'the profile turns at one speed (its rate varies by {spread / DEGREE:.2f} deg/s): scale factor error and bias '
+        raise CalibrationRefused(f'the profile turns at one speed (its rate varies by {spread / DEGREE:.2f} deg/s): scale and bias '
                                  'cannot be parted; turn both ways, with stops')
     if time[-1] - time[0] < 0.9 * motion.duration - 2.0 * limits.time_offset:
-        raise CalibrationRefused(f'the samples cover {time[-1] - time[0]:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
+        covered = time[-1] - time[0]
+        raise CalibrationRefused(f'the samples cover {covered:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
 
 
 def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
@@ -422,19 +423,20 @@ def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
         raise CalibrationRefused(f'the gyro saw {100 * (1 + s):.0f} % of the profile\'s turns: did the robot move, and is the gyro alive?')
     if s < -1.5:
         raise CalibrationRefused(f'the gyro turns the other way than the profile (scale {1 + s:.2f}): set the driver\'s parameter invert')
+    turned, size = fit.residual
+    if turned > limits.residual:
+        raise CalibrationRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile '
+                                 f'({size:.0f} standard deviations): a slip or a bump; run again on free ground')
     deviation = math.sqrt(fit.covariance[0, 0])
     if abs(s) > limits.scale_factor_error + 3.0 * np.nan_to_num(deviation):
         raise CalibrationRefused(f'a scale factor error of {100 * s:.0f} % is beyond {100 * limits.scale_factor_error:.0f} %: look at the '
                                  'sensitivity and at the profile\'s unit')
     if abs(b) > limits.bias:
-        raise CalibrationRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: was the robot turned by hand?')
+        raise CalibrationRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
+                                 'was the robot turned by hand?')
     if deviation > limits.scale_standard_deviation:
-        raise CalibrationRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted {100 * limits.scale_standard_deviation:g} %: '
-                                 'turn further, faster, or more often, and check that the profile is the one that was driven')
-    turned, size = fit.residual
-    if turned > limits.residual:
-        raise CalibrationRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile ({size:.0f} standard deviations): '
-                                 'a slip or a bump; run again on free ground')
+        raise CalibrationRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
+                                 f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often, and check that the profile is the one that was driven')
 
 
 def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise: Noise | None = None) -> tuple[float, float]:
@@ -460,10 +462,12 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     within = math.sqrt(np.mean([block.var(ddof=1) for block in np.array_split(rate, 10)]) / (len(rate) / 10))
     largest = float(np.abs(blocks - np.median(blocks)).max())
     if largest > max(_CHANCE * within, 0.05 * DEGREE):
-        raise CalibrationRefused(f'the gyro was moved: its mean changed by {largest / DEGREE:.2f} deg/s within the rest; keep it still and run again')
+        raise CalibrationRefused(f'the gyro was moved: its mean changed by {largest / DEGREE:.2f} deg/s within the rest; '
+                                 'keep it still and run again')
     bias, deviation = float(rate.mean()), math.sqrt(blocks.var(ddof=1) / 10.0 + _wander(noise))
     if abs(bias) > limits.bias:
-        raise CalibrationRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: the gyro turns, or is broken')
+        raise CalibrationRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
+                                 'the gyro turns, or is broken')
     if noise is not None and noise.angle_random_walk:
         _refuse_shaking(time, rate, noise)
     return bias, deviation
