@@ -428,8 +428,9 @@ class CompensationNode(Node):
         self._last_counts = dict(self._counts)
         level, message = self._trouble(grown)
         deviation = math.sqrt(self._heading.variance) / DEGREE if self._model.noise.angle_random_walk else math.nan
-        values = {**self._counts, 'heading_deg': f'{self._heading.heading / DEGREE:.3f}',
-                  'heading_standard_deviation_deg': f'{deviation:.3f}', 'deleted_by_threshold_deg': f'{self._heading.deleted / DEGREE:.3f}', 'last_event': self._events}
+        degrees = {'heading_deg': self._heading.heading / DEGREE, 'heading_standard_deviation_deg': deviation,
+                   'deleted_by_threshold_deg': self._heading.deleted / DEGREE}
+        values = {**self._counts, **{name: f'{value:.3f}' for name, value in degrees.items()}, 'last_event': self._events}
         if self._temperature:
             values['temperature_degc'] = f'{self._temperature[1]:.2f}'
         if self._model.self_calibration:

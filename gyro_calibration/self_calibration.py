@@ -436,7 +436,8 @@ def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
                                  'was the robot turned by hand?')
     if deviation > limits.scale_standard_deviation:
         raise CalibrationRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
-                                 f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often, and check that the profile is the one that was driven')
+                                 f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often, '
+                                 'and check that the profile is the one that was driven')
 
 
 def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise: Noise | None = None) -> tuple[float, float]:
