@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from gyro_calibration.files import write_atomically
 
 Array = NDArray[np.float64]
+Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 
@@ -84,7 +86,7 @@ class Log:
         return 0 if first is None else len(first)
 
 
-def read_log(path: str | Path, sensitivity: float | None = None) -> Log:
+def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None) -> Log:
     """
     Read a log file (.csv or .csv.gz).
 
@@ -92,6 +94,7 @@ def read_log(path: str | Path, sensitivity: float | None = None) -> Log:
     ----------
     path : the file
     sensitivity : rad/s a count; used where the file has raw counts alone
+    rate : Hz; the samples came at this rate, whatever the file says of time
 
     Raises
     ------
@@ -105,6 +108,8 @@ def read_log(path: str | Path, sensitivity: float | None = None) -> Log:
     columns = list(zip(*rows))
     arrays = {quantity: _numbers(path, first_row, header[index], columns[index], quantity) * factor
               for quantity, (index, factor) in named.items()}
+    if rate is not None:
+        arrays['time'] = np.arange(len(rows)) / rate
     _refuse_time(path, first_row, arrays.get('time'))
     if 'output' not in arrays and sensitivity is not None:
         arrays['output'] = arrays['counts'] * sensitivity
@@ -117,16 +122,18 @@ def _rows(path: Path) -> tuple[list[str], list[str], int, list[list[str]]]:
     """Return notes, header, the line number of the first row, and the rows, each as long as the header."""
     try:
         data = path.read_bytes()
-        lines = (gzip.decompress(data) if path.suffix == '.gz' else data).decode('utf-8').splitlines(keepends=True)
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        lines = (gzip.decompress(data) if path.suffix == '.gz' else data).decode('utf-8-sig').splitlines(keepends=True)
+        start = next((number for number, line in enumerate(lines) if not line.startswith('#')), len(lines))
+        table = list(csv.reader(lines[start:]))
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({error}); wanted a CSV file, .csv or .csv.gz') from error
-    start = next((number for number, line in enumerate(lines) if not line.startswith('#')), len(lines))
     notes = [line[1:].strip() for line in lines[:start]]
-    table = list(csv.reader(lines[start:]))
     header = [name.strip() for name in table[0]] if table else []
     if not any(name in COLUMNS for name in header):
         raise LogError(f'{path}: line {start + 1} is no header; name the columns there, such as time_s,gyro_dps,temperature_degc')
-    rows = [row for row in table[1:] if row]
+    rows = table[1:]
+    while rows and not rows[-1]:
+        rows.pop()
     for number, row in enumerate(rows, start + 2):
         if len(row) != len(header):
             raise LogError(f'{path}: line {number} has {len(row)} values where the header has {len(header)}; mend or remove the line')

@@ -1,0 +1,77 @@
+"""
+The house: imports go in one direction, ROS 2 stays in the nodes, and the core neither prints nor opens sockets nor reads a clock.
+
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import gyro_calibration
+
+PACKAGE = Path(gyro_calibration.__file__).parent
+FILES = sorted(PACKAGE.rglob('*.py'))
+#: As the package's docstring gives it.
+ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order:')[2])
+CORE = ORDER[:ORDER.index('protocols')]
+MAY_USE_ROS = {'node.py', 'driver_node.py', 'compensation_node.py', 'demo.py'}
+ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w+_msgs|\w+_srvs')
+OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'datetime', 'threading', 'random', 'argparse'}
+
+
+def imports(path):
+    """Return the modules that a file imports, anywhere in it."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    folders = ['gyro_calibration', *path.relative_to(PACKAGE).parts[:-1]]
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom):
+            where = folders[:len(folders) + 1 - node.level] if node.level else []
+            names += ['.'.join([*where, *filter(None, [node.module]), alias.name]) for alias in node.names]
+    return names
+
+
+def own(names):
+    """Return the modules of this package among imported names."""
+    parts = [name.split('.') for name in names if name.startswith('gyro_calibration.')]
+    return {part[1] for part in parts if (PACKAGE / part[1]).is_dir() or (PACKAGE / f'{part[1]}.py').exists()}
+
+
+def calls(path):
+    """Return the names that a file calls without a dot."""
+    functions = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    return {function.id for function in functions if isinstance(function, ast.Name)}
+
+
+@pytest.mark.parametrize('module', ORDER)
+def test_a_module_imports_only_what_is_read_before_it(module):
+    path = PACKAGE / f'{module}.py'
+    paths = [path] if path.exists() else sorted((PACKAGE / module).glob('*.py'))
+    known = set(ORDER[:ORDER.index(module)]) | {'files', 'node', module}
+    known |= {'demo', 'picture'} if module == ORDER[-1] else set()
+    assert all(own(imports(path)) <= known for path in paths), [(path.name, own(imports(path)) - known) for path in paths]
+
+
+def test_files_stands_on_nothing():
+    assert not own(imports(PACKAGE / 'files.py'))
+
+
+@pytest.mark.parametrize('path', FILES, ids=[str(path.relative_to(PACKAGE)) for path in FILES])
+def test_only_the_nodes_know_ros(path):
+    used = {name for name in imports(path) if ROS.fullmatch(name.split('.')[0])}
+    assert path.name in MAY_USE_ROS or not used
+
+
+@pytest.mark.parametrize('module', [*CORE, 'files'])
+def test_the_core_only_computes(module):
+    path = PACKAGE / f'{module}.py'
+    roots = {name.split('.')[0] for name in imports(path)}
+    assert not roots & OUTSIDE_WORLD and not calls(path) & {'print', 'input', 'exec', 'eval'}
+
+
+def test_no_random_number_comes_from_a_hidden_source():
+    hidden = re.compile(r'np\.random\.(?!Generator)|default_rng')
+    found = [path.name for path in FILES if path.stem in CORE and hidden.search(path.read_text())]
+    assert not found
