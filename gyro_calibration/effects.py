@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gyro_calibration.log import DEGREE, Array
-
-Number = Any  # a float, or an array of shape (n,): every formula here serves both
+from gyro_calibration.log import DEGREE, Array, Number
 
 
 @dataclass(frozen=True)

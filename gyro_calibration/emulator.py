@@ -13,7 +13,7 @@ import select
 import threading
 import time
 import tty
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from .protocols import Protocol, Sample, Settings
@@ -69,7 +69,7 @@ class Emulator:
         self._protocol = protocol
         self._samples = samples
         self._speed = speed
-        self._link = None if link is None else Path(link)
+        self.link = None if link is None else Path(link)
         self._wait_for_reader = wait_for_reader
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
@@ -140,8 +140,8 @@ class Emulator:
         Unplug the gyro: its reader sees that the port is gone.
 
         """
-        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.path:
-            self._link.unlink()
+        if self.link is not None and self.link.is_symlink() and os.readlink(self.link) == self.path:
+            self.link.unlink()
         if self._master >= 0:
             os.close(self._master)
             self._master = -1
@@ -164,13 +164,13 @@ class Emulator:
         self.close()
 
     def _make_link(self):
-        if self._link is None:
+        if self.link is None:
             return
-        if self._link.exists() and not self._link.is_symlink():
-            raise FileExistsError(f'{self._link} is no link, so it is not replaced: choose another path for the link')
-        temporary = self._link.with_name(f'.{self._link.name}.{os.getpid()}')
+        if self.link.exists() and not self.link.is_symlink():
+            raise FileExistsError(f'{self.link} is no link, so it is not replaced: choose another path for the link')
+        temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
         os.symlink(self.path, temporary)
-        os.replace(temporary, self._link)
+        os.replace(temporary, self.link)
 
     def _wait_until_read(self):
         while not self.is_read() and not self._stop.wait(_POLL):
@@ -207,13 +207,20 @@ def _time(sample):
     return sample.time
 
 
-def emulate(emulator: Emulator) -> None:
+def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: None) -> None:
     """
     Send all samples of an emulator from this thread, and clean up also after an interrupt.
+
+    Parameters
+    ----------
+    emulator : Emulator
+    announce : callable
+        Gets the path to open, once it is there.
 
     """
     try:
         emulator.open()
+        announce(emulator.path if emulator.link is None else str(emulator.link))
         emulator.run()
     finally:
         emulator.close()

@@ -162,3 +162,35 @@ class HeadingIntegrator:
 def integrate(time: Array, rate: Array) -> Array:
     """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at 0."""
     return np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1]))])
+
+
+def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
+    """Return what `ThresholdFilter` makes of a whole log, rad/s, shape (n,)."""
+    if not settings.rate:
+        return rate
+    end = np.arange(1, len(rate) + 1)
+    begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
+    sums, squares = (np.concatenate([[0.0], np.cumsum(values)]) for values in (rate, rate * rate))
+    count = end - begin
+    mean = (sums[end] - sums[begin]) / count
+    variance = (squares[end] - squares[begin]) / count - mean * mean
+    explained = 9.0 * settings.angle_random_walk ** 2 * count
+    shakes = (explained > 0.0) & (explained < variance * (time - time[begin]))
+    return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)
+
+
+def integrate_with_deviation(time: Array, filtered: Array, sensitivity: Array, covariance: Array, noise: Noise) -> tuple[Array, Array]:
+    """
+    Return the heading and its standard deviation, rad, shape (n,) each, as `HeadingIntegrator` gives them for a log without gaps.
+
+    Parameters
+    ----------
+    filtered : rates after the threshold filter, rad/s, shape (n,)
+    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
+    covariance : of those values, shape (m, m)
+
+    """
+    moving = (filtered != 0.0).astype(float)
+    grown = np.array([integrate(time, moving * row) for row in sensitivity]).reshape(len(covariance), len(time))
+    variance = np.einsum('in,ij,jn->n', grown, covariance, grown) + noise.heading_variance(integrate(time, moving))
+    return integrate(time, filtered), np.sqrt(variance)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import oaconvolve
 
-from gyro_calibration.log import Array
+from gyro_calibration.log import Array, Number
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
@@ -35,7 +35,7 @@ class Noise:
         """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
         return self.angle_random_walk ** 2 / interval
 
-    def heading_variance(self, duration: float) -> float:
+    def heading_variance(self, duration: Number) -> Number:
         """
         Return the variance, rad², of a heading that was integrated for `duration` s from a bias known at its start.
 

@@ -1,0 +1,269 @@
+"""
+The demonstration: the whole graph on this machine, with a robot that exists in this file alone.
+
+The robot follows ``cmd_vel``; its gyro is emulated on a pseudo-terminal and tells of the motion that the robot really makes; driver
+and compensation run as processes of their own, as on a robot. The compensation drives the calibration, then a drive follows.
+
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Twist
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+from tqdm import tqdm
+
+from gyro_calibration.emulator import Emulator
+from gyro_calibration.heading import Threshold, filter_rates, integrate
+from gyro_calibration.log import DEGREE, Array, Log, write_log
+from gyro_calibration.model import GyroModel, read_model
+from gyro_calibration.motion import CALIBRATION, Motion, turns
+from gyro_calibration.node import SENSOR_QUALITY
+from gyro_calibration.noise import simulate_noise
+from gyro_calibration.picture import draw_headings
+from gyro_calibration.protocols import Sample, find
+
+PROTOCOL = 'kvh_dsp3000'
+INTERVAL = 0.01  # s between samples
+ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
+DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20), (4, 0), (1, 0)])
+#: Table 1 of Hong and Park (2008): mean and standard deviation of the heading error over 160 s, deg.
+PUBLISHED = {'pure integration': (1.6675, 1.5075), 'self-calibration': (1.1511, 1.1675),
+             'threshold filter': (0.7768, 1.2653), 'both': (0.5985, 1.2998)}
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What the demonstration found, in words and as data."""
+
+    text: str
+    data: dict[str, Any]
+
+
+@dataclass
+class Robot:
+    """
+    A robot that turns as it is told, within what its wheels can do; its gyro sees the motion with the errors of a model.
+
+    Attributes
+    ----------
+    command : rad/s
+    truth : of each sample the time by the clock of this machine, s, and the true heading, rad
+
+    """
+
+    model: GyroModel
+    noise: Array
+    command: float = 0.0
+    truth: list[tuple[float, float]] = field(default_factory=list)
+
+    def samples(self) -> Iterator[Sample]:
+        """Give the samples of the gyro, each at its time, until the noise ends."""
+        rate, heading, begin = 0.0, 0.0, time.monotonic()
+        for number, noise in enumerate(self.noise):
+            time.sleep(max(0.0, begin + number * INTERVAL - time.monotonic()))
+            change = np.clip(self.command - rate, -ACCELERATION * INTERVAL, ACCELERATION * INTERVAL)
+            heading += INTERVAL * (rate + 0.5 * change)
+            rate += change
+            self.truth.append((time.time(), heading))
+            yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise), time=number * INTERVAL)
+
+
+class Client:
+    """
+    What hears and calls the nodes, spinning in a thread of its own.
+
+    Attributes
+    ----------
+    raw, headings : time, s, with the raw rate, rad/s, and with the published heading, rad, of each message
+
+    """
+
+    def __init__(self, robot: Robot):
+        """Subscribe; the robot hears ``cmd_vel`` from now on."""
+        self.raw: list[tuple[float, float]] = []
+        self.headings: list[tuple[float, float]] = []
+        self._node = rclpy.create_node('demonstration')
+        self._node.create_subscription(Imu, 'imu/data_raw', lambda m: self.raw.append((_seconds(m), m.angular_velocity.z)), SENSOR_QUALITY)
+        self._node.create_subscription(Imu, 'imu/data', lambda m: self.headings.append((_seconds(m), _yaw(m))), SENSOR_QUALITY)
+        self._node.create_subscription(Twist, 'cmd_vel', lambda m: setattr(robot, 'command', m.angular.z), 10)
+        self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._stop.is_set():
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def call(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
+        """Call a service, wait a little again and again until it answers, and return its message."""
+        client = self._node.create_client(Trigger, name)
+        if not client.wait_for_service(20.0):
+            raise OSError(f'the service {name} did not appear within 20 s')
+        answer, deadline = client.call_async(Trigger.Request()), time.monotonic() + timeout
+        while not answer.done():
+            if time.monotonic() > deadline:
+                raise OSError(f'{name} did not answer within {timeout:g} s')
+            wait()
+        if not answer.result().success:
+            raise OSError(f'{name}: {answer.result().message}')
+        return answer.result().message
+
+    def turn(self, rate: float) -> None:
+        """Command a rate, rad/s."""
+        command = Twist()
+        command.angular.z = rate
+        self._velocity.publish(command)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stop.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+
+def _seconds(message: Imu) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def _yaw(message: Imu) -> float:
+    return 2.0 * float(np.arctan2(message.orientation.z, message.orientation.w))
+
+
+@contextmanager
+def _process(module: str, **parameters: object) -> Iterator[None]:
+    """Run a node in a process of its own."""
+    arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, '--log-level', 'error'])
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(20.0)
+
+
+def run_demo(out: Path, seed: int) -> Demonstration:
+    """
+    Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
+
+    Raises
+    ------
+    OSError : a node does not answer, or the folder cannot be written to
+
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    calibration_file, port = out / 'calibration.yaml', out.absolute() / 'gyro'
+    calibration_file.unlink(missing_ok=True)
+    # Nothing of this is heard on the network of a robot, nor by other graphs on this machine.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(random.randint(1, 101)))
+    model = read_model(_share('config', 'xv3500.yaml'))
+    robot = Robot(model, simulate_noise(model.noise, 12000, INTERVAL, np.random.default_rng(seed)))
+    with ExitStack() as stack:
+        stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port, wait_for_reader=True))
+        stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL, reopen_interval=0.5))
+        stack.enter_context(_process('compensation_node', calibration_file=calibration_file, drive_profile=True))
+        rclpy.init()
+        stack.callback(rclpy.try_shutdown)
+        client = Client(robot)
+        stack.callback(client.close)
+        begin = _perform(client)
+    return _evaluate(out, robot, client, begin, seed)
+
+
+def _share(*parts: str) -> Path:
+    """Return a file of the package's share folder, or of its sources where it runs from them."""
+    for root in (Path(sys.prefix) / 'share' / 'gyro_calibration', Path(__file__).parents[1]):
+        if root.joinpath(*parts).exists():
+            return root.joinpath(*parts)
+    raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')
+
+
+def _perform(client: Client) -> float:
+    """Calibrate and drive; return when the drive began, s."""
+    total = round(CALIBRATION.duration + 1.0 + DRIVE.duration)
+    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s', disable=None) as bar:
+        bar.set_description('starting driver and compensation')
+        _until(lambda: client.raw and client.headings, 20.0)
+        bar.set_description('calibrating on the motion profile')
+        client.call('calibrate', 60.0, lambda: _pass(bar, 0.2))
+        client.call('reset_heading', 10.0, lambda: time.sleep(0.01))
+        bar.set_description('driving')
+        begin = time.time()
+        _drive(client, DRIVE, bar)
+    return begin
+
+
+def _until(condition: Callable[[], object], timeout: float) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            raise OSError(f'no heading came within {timeout:g} s; is another program using the port?')
+        time.sleep(0.02)
+
+
+def _pass(bar: tqdm, seconds: float) -> None:
+    time.sleep(seconds)
+    bar.update(seconds)
+
+
+def _drive(client: Client, motion: Motion, bar: tqdm) -> None:
+    begin = time.monotonic()
+    while (now := time.monotonic() - begin) < motion.duration:
+        client.turn(float(motion.rate_at(np.array(now))))
+        _pass(bar, 0.02)
+    client.turn(0.0)
+    _pass(bar, 0.5)
+
+
+def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) -> Demonstration:
+    """Compare four headings of the drive with the truth."""
+    clock, truth = np.array(robot.truth).T
+    time_, raw = np.array([pair for pair in client.raw if pair[0] >= begin]).T
+    stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
+    true = np.interp(time_, clock, truth)
+    calibration = read_model(out / 'calibration.yaml').self_calibration
+    assert calibration is not None  # calibrate succeeded, so it is stored
+    corrected, threshold = calibration.correct(raw), Threshold()
+    headings = {
+        'pure integration': integrate(time_, raw),
+        'self-calibration': integrate(time_, corrected),
+        'threshold filter': integrate(time_, filter_rates(threshold, time_, raw)),
+        'both': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
+    draw_headings(out / 'heading.png', time_ - begin, true - true[0], headings)
+    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true - true[0]))
+    errors = {name: np.abs(heading - (true - true[0])) / DEGREE for name, heading in headings.items()}
+    table = _table(errors)
+    (out / 'table.md').write_text(table)
+    text = f'{table}\nSelf-calibration: {calibration}.\nSeed {seed}. Picture, table and log are in {out}.'
+    means = {name: float(error.mean()) for name, error in errors.items()}
+    return Demonstration(text, {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
+
+
+def _table(errors: dict[str, Array]) -> str:
+    """Return the table as Markdown, beside that of Hong and Park."""
+    lines = ['| heading | mean error | standard deviation | off pure integration | Hong and Park, table 1 |', '|---|---|---|---|---|']
+    pure, published = errors['pure integration'].mean(), PUBLISHED['pure integration'][0]
+    for name, error in errors.items():
+        mean, deviation = PUBLISHED[name]
+        lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg | {100 * (1 - error.mean() / pure):.0f} % '
+                     f'| {mean:.3f} deg, {deviation:.3f} deg, {100 * (1 - mean / published):.0f} % |')
+    return '\n'.join(lines) + '\n'
