@@ -34,7 +34,7 @@ setup(
     maintainer_email=manifest.find('maintainer').get('email'),
     packages=find_packages(include=[name, f'{name}.*']),
     python_requires='>=3.10,<3.14',
-    install_requires=['numpy', 'scipy', 'pyserial', 'PyYAML'],
+    install_requires=['numpy', 'scipy', 'pyserial', 'PyYAML', 'tqdm'],
     extras_require={'ros': ros, 'plot': plot, 'test': test},
     zip_safe=False,
     entry_points={
