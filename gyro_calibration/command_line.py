@@ -137,7 +137,7 @@ def _compensate(given: argparse.Namespace) -> Answer:
         threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
         columns['rate_rad_s'] = filter_rates(threshold, log.time, result.rate)
         columns['heading_rad'], columns['heading_std_rad'] = integrate_with_deviation(
-            log.time, columns['rate_rad_s'], sensitivity, covariance(model), model.noise)
+            log.time, result.rate, columns['rate_rad_s'], sensitivity, covariance(model), model.noise)
     columns['temperature_clipped'] = np.broadcast_to(result.temperature_clipped, len(log))
     columns['beyond_range'] = result.beyond_range
     write_log(given.out, log, columns)
@@ -167,7 +167,7 @@ def _add_self_calibrate(verbs: Any) -> argparse.ArgumentParser:
                    'run.csv --profile profile.csv --out model.yaml')
     _add_log(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or rate_dps; default: the reference of the log')
-    parser.add_argument('--method', choices=list(METHODS), default='likelihood', help='default: likelihood; the others are as Hong and Park published')
+    parser.add_argument('--method', choices=list(METHODS), default='likelihood', help='default: likelihood; the others as published')
     parser.add_argument('--model', metavar='MODEL.yaml', help='compensate by it first')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model with this self-calibration')
     return parser

@@ -145,10 +145,10 @@ class HeadingIntegrator:
         half = 0.5 * interval
         self.heading += half * (filtered + last_filtered)
         self.deleted += half * (rate - filtered + last_rate - last_filtered)
-        moving = half * ((filtered != 0.0) + (last_filtered != 0.0))
-        self._moving_time += moving
+        kept, last_kept = filtered == rate, last_filtered == last_rate
+        self._moving_time += half * (kept + last_kept)
         if len(sensitivity):
-            self._sensitivity += half * ((filtered != 0.0) * sensitivity + (last_filtered != 0.0) * last_sensitivity)
+            self._sensitivity += half * (kept * sensitivity + last_kept * last_sensitivity)
         return ''
 
     def _restart(self, interval: float, fastest: float) -> str:
@@ -179,18 +179,19 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)
 
 
-def integrate_with_deviation(time: Array, filtered: Array, sensitivity: Array, covariance: Array, noise: Noise) -> tuple[Array, Array]:
+def integrate_with_deviation(time: Array, rate: Array, filtered: Array, sensitivity: Array, covariance: Array,
+                             noise: Noise) -> tuple[Array, Array]:
     """
     Return the heading and its standard deviation, rad, shape (n,) each, as `HeadingIntegrator` gives them for a log without gaps.
 
     Parameters
     ----------
-    filtered : rates after the threshold filter, rad/s, shape (n,)
+    rate, filtered : before and after the threshold filter, rad/s, shape (n,)
     sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
     covariance : of those values, shape (m, m)
 
     """
-    moving = (filtered != 0.0).astype(float)
-    grown = np.array([integrate(time, moving * row) for row in sensitivity]).reshape(len(covariance), len(time))
-    variance = np.einsum('in,ij,jn->n', grown, covariance, grown) + noise.heading_variance(integrate(time, moving))
+    kept = (filtered == rate).astype(float)
+    grown = np.array([integrate(time, kept * row) for row in sensitivity]).reshape(len(covariance), len(time))
+    variance = np.einsum('in,ij,jn->n', grown, covariance, grown) + noise.heading_variance(integrate(time, kept))
     return integrate(time, filtered), np.sqrt(variance)

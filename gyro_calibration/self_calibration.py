@@ -120,7 +120,7 @@ def _solve(matrix: Array, vector: Array) -> Array:
 
 def _from_inverse(scale: float, offset: float) -> Fit:
     """Turn s̄ and b̄ of eq. 3 into s and b."""
-    return Fit(1.0 / scale - 1.0, -offset / scale, np.full((2, 2), np.nan))
+    return Fit(float(1.0 / scale - 1.0), float(-offset / scale), np.full((2, 2), np.nan))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,166 @@
+"""The program as people and other programs call it."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gyro_calibration.command_line import main
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.model import read_model
+from gyro_calibration.motion import CALIBRATION
+from gyro_calibration.protocols import find
+
+VERBS = ('compensate', 'self-calibrate', 'simulate', 'emulate', 'demo')
+GYRO = 'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: -0.1}}'
+NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
+
+
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs the program and gives its exit code, standard output and standard error."""
+    def run(*words):
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as end:  # argparse
+            code = end.code
+        return code, *capsys.readouterr()
+    return run
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / 'model.yaml'
+    path.write_text(GYRO)
+    return path
+
+
+@pytest.fixture
+def log(run, model, tmp_path):
+    path = tmp_path / 'log.csv'
+    assert run('simulate', '--model', model, '--motion', 'calibration', '--out', path, '--seed', 1)[0] == 0
+    return path
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_every_verb_has_help_with_an_example(run, verb):
+    code, text, _ = run(verb, '--help')
+    assert code == 0 and f'example: gyro_calibration {verb}' in ' '.join(text.split()) and '--json' in text
+
+
+def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, tmp_path):
+    code, text, _ = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--json')
+    assert code == 0
+    answer = json.loads(text)
+    assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
+    compensated = read_log(tmp_path / 'out.csv')
+    heading = np.array(compensated.others['heading_rad'], dtype=float)
+    np.testing.assert_allclose(heading, compensated.reference_heading, atol=1e-9)
+    np.testing.assert_allclose(np.array(compensated.others['rate_rad_s'], dtype=float), compensated.reference_rate, atol=1e-12)
+
+
+def test_compensate_says_how_sure_it_is(run, log, tmp_path):
+    (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
+    code, text, _ = run('compensate', log, '--model', tmp_path / 'noisy.yaml', '--out', tmp_path / 'out.csv')
+    deviation = np.array(read_log(tmp_path / 'out.csv').others['heading_std_rad'], dtype=float)
+    assert code == 0 and 'deg' in text
+    assert deviation[-1] == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
+
+
+def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
+    (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0\n10,9.1\n')
+    assert run('compensate', tmp_path / 'table.csv', '--model', model, '--out', tmp_path / 'out.csv')[0] == 0
+    columns = read_log(tmp_path / 'out.csv').others
+    assert 'rate_rad_s' in columns and 'heading_rad' not in columns
+
+
+@pytest.mark.parametrize('method, tolerance', [('likelihood', 1e-6), ('rate', 1e-6), ('heading', 0.05)])
+def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tolerance):
+    profile = tmp_path / 'profile.csv'
+    profile.write_text('time_s,rate_dps\n' + ''.join(f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
+    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method, '--out', tmp_path / 'new.yaml', '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['scale_factor_error'] == pytest.approx(-0.1, rel=tolerance)
+    assert read_model(tmp_path / 'new.yaml').self_calibration.bias == pytest.approx(0.002, rel=tolerance)
+
+
+def test_self_calibrate_takes_the_reference_of_the_log_itself(run, log):
+    code, text, _ = run('self-calibrate', log)
+    assert code == 0 and 'scale factor error -10.000' in text.lower()
+
+
+def test_what_the_data_do_not_allow_ends_with_1_and_one_sentence(run, tmp_path):
+    (tmp_path / 'dead.csv').write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},0\n' for i in range(2000)))
+    (tmp_path / 'profile.csv').write_text('time_s,rate_dps\n0,0\n5,30\n10,-30\n20,0\n')
+    code, text, error = run('self-calibrate', tmp_path / 'dead.csv', '--profile', tmp_path / 'profile.csv')
+    assert code == 1 and not text and 'same value' in error and error.count('\n') == 1
+
+
+@pytest.mark.parametrize('words, said', [
+    (['compensate', 'missing.csv', '--model', 'MODEL', '--out', 'x.csv'], 'missing.csv: cannot be read'),
+    (['compensate', 'LOG', '--model', 'missing.yaml', '--out', 'x.csv'], 'missing.yaml: there is no such file'),
+    (['simulate', '--model', 'MODEL', '--motion', 'waltz', '--out', 'x.csv'], 'waltz: cannot be read as a motion profile'),
+    (['emulate', '--protocol', 'morse', '--model', 'MODEL'], "protocol 'morse' is not known"),
+    (['emulate', '--protocol', 'razor', '--model', 'MODEL'], 'razor is planned'),
+    (['dance'], 'invalid choice'),
+    ([], 'required'),
+])
+def test_wrong_use_ends_with_2_and_says_why(run, model, log, words, said):
+    code, text, error = run(*[{'MODEL': model, 'LOG': log}.get(word, word) for word in words])
+    assert code == 2 and not text and said in error and 'Traceback' not in error
+
+
+def test_a_log_of_counts_wants_its_sensitivity(run, model, tmp_path):
+    (tmp_path / 'counts.csv').write_text('gyro_counts\n' + '100\n' * 10)
+    words = ['compensate', tmp_path / 'counts.csv', '--model', model, '--out', tmp_path / 'out.csv', '--rate', 10]
+    code, _, error = run(*words)
+    assert code == 2 and '--sensitivity' in error
+    assert run(*words, '--sensitivity', 0.07)[0] == 0
+    assert float(read_log(tmp_path / 'out.csv').others['rate_rad_s'][0]) == pytest.approx((7 * DEGREE - 0.002) / 0.9)
+
+
+def test_the_same_seed_gives_the_same_log_and_the_seed_is_said(run, tmp_path):
+    (tmp_path / 'model.yaml').write_text(NOISY_GYRO)
+    words = ['simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest', '--json', '--out']
+    seed = json.loads(run(*words, tmp_path / 'a.csv')[1])['seed']
+    run(*words, tmp_path / 'b.csv', '--seed', seed)
+    assert (tmp_path / 'a.csv').read_bytes() == (tmp_path / 'b.csv').read_bytes()
+
+
+def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
+    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'kvh_dsp3000', '--model', model, '--json',
+               '--motion', 'calibration', '--wait', '--link', tmp_path / 'gyro']
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert json.loads(process.stdout.readline())['path'] == str(tmp_path / 'gyro')
+        decoder, samples, port = find('kvh_dsp3000').decoder(), [], os.open(tmp_path / 'gyro', os.O_RDONLY | os.O_NOCTTY)
+        while len(samples) < 30:
+            samples += decoder.feed(os.read(port, 1000))
+        assert samples[0].output == pytest.approx(0.002, abs=1e-7)
+        os.close(port)
+    finally:
+        process.terminate()
+        assert process.wait(10) == 0
+    assert not (tmp_path / 'gyro').exists(), 'the link was left behind'
+
+
+@pytest.fixture
+def demo(ros_domain, tmp_path):
+    """Run the demonstration as a person would, and return its folder, time and process."""
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo', '--out', tmp_path / 'demo', '--seed', '2', '--json'],
+                          capture_output=True, text=True, timeout=120), tmp_path / 'demo'
+
+
+def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_picture_table_and_log(demo):
+    process, folder = demo
+    assert process.returncode == 0 and 'Traceback' not in process.stderr, process.stderr
+    errors = json.loads(process.stdout)['mean_error_deg']
+    assert errors['both'] < 0.6 * errors['pure integration']
+    assert (folder / 'heading.png').read_bytes().startswith(b'\x89PNG')
+    assert 'Hong and Park' in (folder / 'table.md').read_text()
+    assert len(read_log(folder / 'log.csv')) > 4000

@@ -1,0 +1,73 @@
+"""A measured gyro through the whole chain: emulator, serial port, driver, compensation, calibration over the service."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.emulator import Emulator
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.protocols import Sample, Settings, find
+
+try:
+    from sensor_msgs.msg import Imu
+    from std_srvs.srv import Trigger
+except ImportError:
+    pass  # the fixture `ros` skips, and says why
+
+DURATION, CALIBRATED, SPEED = 300.0, 20.0, 8.0
+
+
+@pytest.fixture
+def recording(data):
+    """Return time, s, output, rad/s, and encoder heading, rad, of 300 s; the gyro is mounted upside down against the encoder."""
+    log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
+    part = log.time < DURATION
+    return log.time[part], log.output[part], log.reference_heading[part] - log.reference_heading[0]
+
+
+def _write_profile(path, time, heading):
+    rows = zip(time[time <= CALIBRATED], heading[time <= CALIBRATED] / DEGREE)
+    path.write_text('time_s,heading_deg\n' + ''.join(f'{t},{h}\n' for t, h in rows))
+
+
+def _start_nodes(start_node, folder):
+    """Start both nodes as a robot would; the port is not there yet."""
+    start_node('driver_node', parameters={
+        'port': folder / 'gyro', 'protocol': 'csv', 'columns': '[time_s, gyro_dps]', 'invert': 'always', 'time_source': 'device',
+        'reopen_interval': 0.2})
+    start_node('compensation_node', parameters={
+        'profile_file': folder / 'profile.csv', 'calibration_file': folder / 'calibration.yaml', 'threshold': 0.0})
+
+
+def _stamped_yaw(messages):
+    stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages])
+    return stamps - stamps[0], np.unwrap([2 * math.atan2(m.orientation.z, m.orientation.w) for m in messages])
+
+
+def _rms(error):
+    return math.sqrt(np.mean(error ** 2)) / DEGREE
+
+
+def test_calibrated_on_20_s_the_published_heading_follows_the_encoder_for_five_minutes(start_node, ros, wait_until, recording, tmp_path):
+    time, output, heading = recording
+    _write_profile(tmp_path / 'profile.csv', time, heading)
+    _start_nodes(start_node, tmp_path)
+    raw, corrected = ros.collect(Imu, 'imu/data_raw'), ros.collect(Imu, 'imu/data')
+    calibrate = ros.node.create_client(Trigger, 'calibrate')
+    wait_until(lambda: calibrate.service_is_ready() and ros.node.count_publishers('imu/data_raw') and ros.node.count_publishers('imu/data')
+               and ros.node.count_subscribers('imu/data_raw') == 2, 20.0, 'the nodes')
+    answer = calibrate.call_async(Trigger.Request())
+    samples = [Sample(rate, time=t) for t, rate in zip(time.tolist(), output.tolist())]
+    settings = Settings(columns=('time_s', 'gyro_dps'))
+    with Emulator(find('csv'), samples, settings, SPEED, tmp_path / 'gyro', wait_for_reader=True) as emulator:
+        emulator.join()
+        wait_until(lambda: len(corrected) > 0.999 * len(time), 20.0, 'the last samples')
+    assert answer.done() and answer.result().success, answer.result()
+    clock, yaw = _stamped_yaw(corrected)
+    error = yaw - np.interp(clock, time, heading)
+    pure = integrate(time, -output) - heading
+    print(f'rms error over {DURATION:g} s: {_rms(error):.2f} deg, pure integration {_rms(pure):.2f} deg; {answer.result().message}')
+    assert len(raw) > 0.999 * len(time)
+    assert _rms(error) < _rms(pure) / 3
