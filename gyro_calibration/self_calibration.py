@@ -130,7 +130,7 @@ class _Increments:
 
     Attributes
     ----------
-    columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; shape (n, 3)
+    columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; what a lag adds, rad/s²; shape (n, 4)
     turned : increments of the gyro's integral, rad, shape (n,)
     points : in a block
     resting : what the encoder's rounding adds wherever the reference stands, one column a stand, rad, shape (n, stands)
@@ -170,8 +170,10 @@ class _Pairing:
         blocks = len(known) // self._points_in_block
         grouped = known[:blocks * self._points_in_block].reshape(blocks, self._points_in_block, 4)
         steps = np.diff(grouped.mean(axis=1), axis=0)
+        accelerations = (grouped[:, -1, 2] - grouped[:, 0, 2]) / max(grouped[0, -1, 1] - grouped[0, 0, 1], 1e-9)
+        columns = np.column_stack([steps[:, :3], np.diff(accelerations)])
         resting = np.diff(_stands(grouped[:, :, 0]), axis=0) * self._step / math.sqrt(12.0)
-        return _Increments(steps[:, :3], steps[:, 3], self._points_in_block, resting)
+        return _Increments(columns, steps[:, 3], self._points_in_block, resting)
 
     def _integral_at(self, at: Array, rate: Array) -> Array:
         """Return the integral of the rate that is linear between the samples."""
@@ -245,7 +247,7 @@ class _Covariance:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Values of (1 + s, b, error of the time offset), their covariance, and what is left."""
+    """Values of (1 + s, b, error of the time offset, lag), their covariance, and what is left."""
 
     values: Array
     covariance: Array
@@ -256,25 +258,25 @@ class _Estimate:
 
 #: Variance of a block's reference noise over what the rate noise adds from block to block.
 _RATIOS = np.geomspace(1e-3, 1e3, 19)
-#: Standard deviation, s, of what is assumed of the time offset after the coarse search; it is harmless where the data show the offset.
-_OFFSET_PRIOR = 0.1
+#: Standard deviations of what is assumed of s, b, time offset, s, and lag, s²; they matter only where the data do not show the two latter.
+_PRIOR = np.array([math.inf, math.inf, 0.1, 0.1])
 
 
 def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Estimate:
     """Solve the weighted normal equations; the restricted likelihood is that of the noise, the values being unknown."""
-    n, weighted = len(data.turned), noise.solve(instrument)
+    freedom, weighted = len(data.turned) - 5, noise.solve(instrument)  # four values and the ratio of the noises
     matrix, vector = weighted.T @ data.columns, weighted.T @ data.turned
     rate_variance = 0.0
     for _ in range(3):
-        regular = matrix + np.diag([0.0, 0.0, rate_variance / _OFFSET_PRIOR ** 2])
+        regular = matrix + np.diag(rate_variance / _PRIOR ** 2)
         values = np.linalg.lstsq(regular, vector, rcond=1e-14)[0]
         residual = data.turned - data.columns @ values
-        rate_variance = max(float(residual @ noise.solve(residual)) / (n - 4), 1e-30)
+        rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
     inverse = np.linalg.pinv(regular, rcond=1e-14)
     resting = inverse @ (weighted.T @ data.resting)
     covariance = rate_variance * inverse + resting @ resting.T
     log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
-    return _Estimate(values, covariance, residual, rate_variance, -0.5 * ((n - 4) * math.log(rate_variance) + log_determinants))
+    return _Estimate(values, covariance, residual, rate_variance, -0.5 * (freedom * math.log(rate_variance) + log_determinants))
 
 
 def _estimates(data: _Increments) -> tuple[list[_Covariance], list[_Estimate], Array]:
@@ -305,6 +307,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     ratio of the two is found by restricted likelihood. A heading that was measured is smoothed by what the gyro says before it serves as
     the regressor, which makes this the errors-in-variables likelihood.
 
+    A robot follows its profile late and smoothly, so delay and lag are fitted too, the lag to second order: left out, a first-order lag
+    of 0.2 s costs 0.9 % of scale.
+
     Parameters
     ----------
     time : s since the start of the motion, shape (n,)
@@ -333,7 +338,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         offset -= step
     covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
-    scale, bias, _ = estimate.values
+    scale, bias = estimate.values[:2]
     return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
                math.sqrt(estimate.rate_variance * noise.ratio) / abs(float(scale)), _worst_stretch(noise, estimate))
 
