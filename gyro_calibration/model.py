@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -156,7 +157,7 @@ def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Numb
     if not implicit:
         return b
     g_a = b
-    for _ in range(4):
+    for _ in range(6):
         g_b = g(b)
         step = b - a
         slope = (g_b - g_a) / (step + (step == 0.0))
@@ -178,7 +179,7 @@ def read_model(path: str | Path) -> GyroModel:
         content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except FileNotFoundError:
         raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         place = f'line {error.problem_mark.line + 1}: ' if getattr(error, 'problem_mark', None) else ''
         raise ModelError(f'{path}: {place}cannot be read as YAML; restore the file or calibrate again') from error
     try:
@@ -187,9 +188,13 @@ def read_model(path: str | Path) -> GyroModel:
         raise ModelError(f'{path}: {error}') from None
 
 
+_SHORT = reprlib.Repr()  # a few lines of YAML can unfold to gigabytes
+_SHORT.maxlevel = 3
+
+
 class _PlaceError(ValueError):
     def __init__(self, place: str, given: Any, wanted: str):
-        super().__init__(f'{place} is {given!r}; wanted {wanted}')
+        super().__init__(f'{place} is {_SHORT.repr(given)}; wanted {wanted}')
 
 
 def _from_content(content: Any) -> GyroModel:
@@ -211,7 +216,7 @@ def _from_content(content: Any) -> GyroModel:
         terms, _covariance(top.get('covariance'), sum(len(term.effect.coefficients) for term in terms)),
         _range('valid.rate', valid.get('rate')), temperature_range,
         _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
-        {str(key): str(value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
+        {str(key): _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
         _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')))
 
 
@@ -221,8 +226,18 @@ def _mapping(place: str, value: Any) -> dict[str, Any]:
     return value
 
 
+#: Beyond this no value of a gyro lies, and its square still is a number.
+_LARGEST = 1e100
+
+
+def _text(place: str, value: Any) -> str:
+    if isinstance(value, (list, dict, set)):
+        raise _PlaceError(place, value, 'a text')
+    return str(value)
+
+
 def _number(place: str, value: Any, low: float = -math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < low:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST or value < low:
         least = f' of at least {low:g}' if low > -math.inf else ''
         raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
     return float(value)
@@ -246,11 +261,11 @@ def _range(place: str, value: Any) -> tuple[float, float]:
 
 
 def _matrix(place: str, value: Any, size: int) -> Array:
-    if not isinstance(value, list) or [len(row) for row in value if isinstance(row, list)] != [size] * size:
+    if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1 for row in value] != [size] * size:
         raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a coefficient')
     numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
     matrix = np.array(numbers).reshape(size, size)
-    if not np.allclose(matrix, matrix.T) or (np.linalg.eigvalsh(matrix) < -1e-9 * np.abs(matrix).max(initial=0.0)).any():
+    if not np.allclose(matrix, matrix.T) or (matrix.diagonal() < 0.0).any() or (np.linalg.eigvalsh(matrix) < -1e-9 * np.abs(matrix).max(initial=0.0)).any():
         raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
     return matrix
 
@@ -285,15 +300,22 @@ def _polynomial(place: str, given: Mapping[str, Any]) -> Term:
     """Read a polynomial: the paper's matrix, or orders [rate, temperature] with named values."""
     if 'matrix_dps' in given:
         _only(place, given, ['matrix_dps'])
-        try:
-            return Term(*polynomial_from_matrix(given['matrix_dps']))
-        except ValueError as error:
-            raise _PlaceError(f'{place}.matrix_dps', given['matrix_dps'], str(error)) from None
+        return _polynomial_from_matrix(f'{place}.matrix_dps', given['matrix_dps'])
     orders = given.get('orders')
-    if not isinstance(orders, list) or len(orders) != 2 or not all(isinstance(order, int) and 0 <= order <= 20 for order in orders):
+    if not isinstance(orders, list) or len(orders) != 2 or not all(type(order) is int and 0 <= order <= 20 for order in orders):
         raise _PlaceError(f'{place}.orders', orders, 'the orders in rate and temperature, such as [3, 2], or matrix_dps')
     effect = rate_temperature_polynomial(*orders)
     return Term(effect, _values(place, effect, {name: value for name, value in given.items() if name != 'orders'}))
+
+
+def _polynomial_from_matrix(place: str, rows: Any) -> Term:
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        raise _PlaceError(place, rows, 'rows of finite numbers')
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(rows)]
+    try:
+        return Term(*polynomial_from_matrix(numbers))
+    except ValueError as error:
+        raise _PlaceError(place, rows, str(error)) from None
 
 
 def _self_calibration(value: Any) -> SelfCalibration | None:
@@ -305,8 +327,9 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
     covariance = _matrix('self_calibration.covariance', given.get('covariance', [[0.0, 0.0], [0.0, 0.0]]), 2).tolist()
     temperature = given.get('temperature')
     return SelfCalibration(
-        scale_factor_error, _number('self_calibration.bias', given.get('bias')), tuple(map(tuple, covariance)), str(given.get('time', '')),
-        None if temperature is None else _number('self_calibration.temperature', temperature), str(given.get('method', '')))
+        scale_factor_error, _number('self_calibration.bias', given.get('bias')), tuple(map(tuple, covariance)), _text('self_calibration.time', given.get('time', '')),
+        None if temperature is None else _number('self_calibration.temperature', temperature),
+        _text('self_calibration.method', given.get('method', '')))
 
 
 def write_model(path: str | Path, model: GyroModel) -> None:
