@@ -1,0 +1,45 @@
+"""
+Compensate a log by a model, and integrate the heading with its standard deviation.
+
+    python compensate_a_log.py [OUT.csv]
+
+The log is simulated here, so that the truth is known. With files of your own: ``log = read_log('drive.csv')``, and
+``model = read_model('model.yaml')``.
+
+"""
+
+import sys
+
+import numpy as np
+
+from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.heading import Threshold, filter_rates, integrate, integrate_with_deviation
+from gyro_calibration.log import DEGREE, write_log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.motion import ROBOT
+from gyro_calibration.noise import Noise
+from gyro_calibration.simulation import simulate
+
+NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
+MODEL = GyroModel(
+    (Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,))),
+    covariance=np.diag([1e-4, 5e-4]) ** 2,  # of bias, (rad/s)², and of the scale factor error
+    noise=NOISE)
+
+
+def main(path='compensated.csv'):
+    log = simulate(MODEL, ROBOT, 100.0, np.random.default_rng(1))
+    result = compensate(MODEL, log.output, log.temperature)
+    sensitivity = rate_sensitivity(MODEL, log.output, result.rate, log.temperature)
+    filtered = filter_rates(Threshold(angle_random_walk=NOISE.angle_random_walk), log.time, result.rate)
+    heading, deviation = integrate_with_deviation(log.time, result.rate, filtered, sensitivity, covariance(MODEL), NOISE)
+    write_log(path, log, {'rate_rad_s': filtered, 'heading_rad': heading, 'heading_std_rad': deviation})
+
+    raw = integrate(log.time, log.output)
+    print(f'After {log.time[-1]:.0f} s the heading is off by {(raw - log.reference_heading)[-1] / DEGREE:.2f} deg as reported, and by '
+          f'{(heading - log.reference_heading)[-1] / DEGREE:.2f} deg (standard deviation {deviation[-1] / DEGREE:.2f}) when compensated.')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

@@ -1,0 +1,39 @@
+"""
+Find scale factor error and bias from 20 s of known motion, and write them into a model file.
+
+    python self_calibrate_a_log.py [MODEL.yaml]
+
+The log is simulated here, so that the truth is known. With a log of your own: ``log = read_log('run.csv')``, and
+``motion = read_motion('profile.csv')``.
+
+"""
+
+import sys
+
+import numpy as np
+
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model import GyroModel, Term, with_self_calibration, write_model
+from gyro_calibration.motion import CALIBRATION
+from gyro_calibration.noise import Noise
+from gyro_calibration.self_calibration import CalibrationRefused, record, self_calibrate
+from gyro_calibration.simulation import simulate
+
+NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
+TRUE_GYRO = GyroModel((Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=NOISE)
+
+
+def main(path='model.yaml'):
+    log = simulate(TRUE_GYRO, CALIBRATION, 100.0, np.random.default_rng(1))
+    model = GyroModel(noise=NOISE)  # nothing is known of this gyro but its noise
+    try:
+        fit = self_calibrate(log.time, log.output, CALIBRATION, noise=model.noise)
+    except CalibrationRefused as reason:
+        sys.exit(f'refused: {reason}')
+    calibration = record(fit, 'likelihood', '2025-01-01T00:00:00+00:00', temperature=None)
+    write_model(path, with_self_calibration(model, calibration))
+    print(f'Found {calibration}; true are -10 % and 0.1146 deg/s. Written to {path}.')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

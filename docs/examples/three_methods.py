@@ -1,0 +1,66 @@
+"""
+Compare the three methods of self-calibration on simulated runs; the numbers are those of docs/self_calibration.md.
+
+    python three_methods.py [RUNS]
+
+"""
+
+import sys
+
+import numpy as np
+from scipy.signal import lfilter
+
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.motion import CALIBRATION, Motion, from_headings
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.self_calibration import METHODS
+
+#: What Hong and Park (2008) report of the Epson XV-3500.
+GYRO = GyroModel((Term(BIAS, (2.18e-4,)), Term(SCALE_FACTOR_ERROR, (0.0373,))), noise=Noise(7.27e-4, 8.73e-5))
+TRUE = np.array([0.0373, 2.18e-4])
+TIME = np.arange(2001) / 100.0
+LAG = 0.2  # s
+
+
+def encoder() -> Motion:
+    """Return the motion as an encoder with steps of 0.5 deg sees it at 20 Hz."""
+    time = np.arange(401) / 20.0
+    return from_headings(time, np.round(CALIBRATION.heading_at(time) / DEGREE * 2.0) / 2.0 * DEGREE)
+
+
+def lagging() -> Array:
+    """Return the rates of a robot that follows the profile by a first-order lag."""
+    kept = np.exp(-0.01 / LAG)
+    return lfilter([1.0 - kept], [1.0, -kept], CALIBRATION.rate_at(TIME))
+
+
+def errors(true_rate: Array, reference: Motion, runs: int) -> dict[str, Array]:
+    """Return the errors of s and b of each method, shape (runs, 2)."""
+    found = {name: np.empty((runs, 2)) for name in METHODS}
+    for number in range(runs):
+        noise = simulate_noise(GYRO.noise, len(TIME), 0.01, np.random.default_rng(number))
+        output = GYRO.output(true_rate, 25.0) + noise
+        for name, method in METHODS.items():
+            fit = method(TIME, output, reference)
+            found[name][number] = fit.scale_factor_error, fit.bias
+    return {name: values - TRUE for name, values in found.items()}
+
+
+def main(runs='200'):
+    cases = {
+        'as the profile says': (CALIBRATION.rate_at(TIME), CALIBRATION),
+        'gyro 50 ms late': (CALIBRATION.rate_at(TIME - 0.05), CALIBRATION),
+        f'robot lags by {LAG} s': (lagging(), CALIBRATION),
+        'encoder, 0.5 deg, 20 Hz': (CALIBRATION.rate_at(TIME), encoder()),
+    }
+    print('| run | method | rms error of s | rms error of b |\n|---|---|---|---|')
+    for case, (rate, reference) in cases.items():
+        for name, error in errors(rate, reference, int(runs)).items():
+            s, b = np.sqrt(np.mean(error ** 2, axis=0))
+            print(f'| {case} | `{name}` | {100 * s:.3f} % | {b / DEGREE:.4f} deg/s |')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

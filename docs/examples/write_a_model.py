@@ -1,0 +1,44 @@
+"""
+Write the model of a gyro from a calibration that is known as the matrix C of Ojeda, Chung and Borenstein (2000), eq. 11.
+
+    python write_a_model.py [MODEL.yaml]
+
+The matrix is in deg/s and degC, highest powers first. The numbers are made up: put those of your own gyro in their place.
+
+"""
+
+import math
+import sys
+
+from gyro_calibration.effects import polynomial_from_matrix, polynomial_to_matrix
+from gyro_calibration.model import GyroModel, Term, read_model, write_model
+from gyro_calibration.noise import Noise
+
+DEGREE = math.radians(1.0)
+MATRIX = [[1e-10, 2e-9, 3e-7, -2e-5],  # T²: its factors of w³, w², w and 1
+          [-4e-9, -3e-7, -1e-5, 1.2e-3],  # T
+          [-3e-7, 5e-6, 4e-3, -2e-2]]  # 1
+
+
+def main(path='model.yaml'):
+    effect, values = polynomial_from_matrix(MATRIX)
+    model = GyroModel(
+        terms=(Term(effect, values),),
+        rate_range=(-100 * DEGREE, 100 * DEGREE),
+        temperature_range=(25.0, 45.0),
+        reference_temperature=35.0,
+        noise=Noise(angle_random_walk=0.1 * DEGREE / 60.0, bias_instability=2.0 * DEGREE / 3600.0),
+        gyro={'name': 'an open-loop fibre-optic gyro', 'technology': 'open_loop_fog'},
+        origin={'note': 'written by write_a_model.py'})
+    write_model(path, model)
+
+    term, = read_model(path).terms
+    print(f'{path} holds the matrix')
+    for row in polynomial_to_matrix(term.effect, term.values):
+        print('  '.join(f'{value:9.2e}' for value in row))
+    rate = model.rate(50 * DEGREE, 30.0) / DEGREE
+    print(f'An output of 50 deg/s at 30 degC is a rate of {rate:.4f} deg/s.')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
