@@ -130,7 +130,7 @@ class GyroModel:
 
     def error(self, channels: Channels) -> Number:
         """Return the sum of all effects, rad/s."""
-        return sum(term.error(channels) for term in self.terms)
+        return _sum(self.terms, channels)
 
     def looks_at(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""
@@ -138,11 +138,24 @@ class GyroModel:
 
     def output(self, rate: Number, temperature: Number) -> Number:
         """Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``; without noise."""
-        return _solve(lambda output: rate + self.error(Channels(rate, output, temperature)), rate, self.looks_at('output'))
+        known, sought = self._split('output')
+        given = rate + _sum(known, Channels(rate, rate, temperature))
+        return _solve(lambda output: given + _sum(sought, Channels(rate, output, temperature)), rate, bool(sought))
 
     def rate(self, output: Number, temperature: Number) -> Number:
         """Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``."""
-        return _solve(lambda rate: output - self.error(Channels(rate, output, temperature)), output, self.looks_at('rate'))
+        known, sought = self._split('rate')
+        given = output - _sum(known, Channels(output, output, temperature))
+        return _solve(lambda rate: given - _sum(sought, Channels(rate, output, temperature)), output, bool(sought))
+
+    def _split(self, channel: str) -> tuple[list[Term], list[Term]]:
+        """Return the effects that do not look at a channel, which need no repetition to solve for it, and those that do."""
+        looking = [channel in term.effect.looks_at for term in self.terms]
+        return ([term for term, looks in zip(self.terms, looking) if not looks], [term for term, looks in zip(self.terms, looking) if looks])
+
+
+def _sum(terms: Sequence[Term], channels: Channels) -> Number:
+    return sum(term.error(channels) for term in terms)
 
 
 def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Number:
@@ -161,7 +174,7 @@ def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Numb
         g_b = g(b)
         step = b - a
         slope = (g_b - g_a) / (step + (step == 0.0))
-        slope = slope * (np.abs(slope) < 0.9)
+        slope = slope * (abs(slope) < 0.9)
         a, g_a, b = b, g_b, b + (g_b - b) / (1.0 - slope)
     return b
 
@@ -265,7 +278,8 @@ def _matrix(place: str, value: Any, size: int) -> Array:
         raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a coefficient')
     numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
     matrix = np.array(numbers).reshape(size, size)
-    if not np.allclose(matrix, matrix.T) or (matrix.diagonal() < 0.0).any() or (np.linalg.eigvalsh(matrix) < -1e-9 * np.abs(matrix).max(initial=0.0)).any():
+    smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + 1e-9 * np.abs(matrix).max(initial=0.0))], default=0.0)
+    if not np.allclose(matrix, matrix.T) or smallest < 0.0:
         raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
     return matrix
 
@@ -327,7 +341,8 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
     covariance = _matrix('self_calibration.covariance', given.get('covariance', [[0.0, 0.0], [0.0, 0.0]]), 2).tolist()
     temperature = given.get('temperature')
     return SelfCalibration(
-        scale_factor_error, _number('self_calibration.bias', given.get('bias')), tuple(map(tuple, covariance)), _text('self_calibration.time', given.get('time', '')),
+        scale_factor_error, _number('self_calibration.bias', given.get('bias')), tuple(map(tuple, covariance)),
+        _text('self_calibration.time', given.get('time', '')),
         None if temperature is None else _number('self_calibration.temperature', temperature),
         _text('self_calibration.method', given.get('method', '')))
 
