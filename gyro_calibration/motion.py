@@ -109,9 +109,9 @@ def read_motion(path: str | Path) -> Motion:
 
     """
     try:
-        lines = [line for line in Path(path).read_text(encoding='utf-8').splitlines() if line.strip() and not line.startswith('#')]
+        lines = [line for line in Path(path).read_text(encoding='utf-8-sig').splitlines() if line.strip() and not line.startswith('#')]
         rows = list(csv.DictReader(lines))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MotionError(f'{path}: cannot be read as a motion profile ({error}); wanted a CSV file with time_s and heading_deg') from error
     found = [name for name in _WORDS if rows and name in rows[0]]
     if not rows or 'time_s' not in rows[0] or len(found) != 1:

@@ -1,0 +1,99 @@
+"""
+Motions: the heading is the exact integral of the rate, and a profile's file means what its columns say.
+
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.log import DEGREE
+from gyro_calibration.motion import CALIBRATION, NAMED, ROBOT, MotionError, from_headings, from_rates, read_motion, turns
+
+
+@pytest.mark.parametrize('name', NAMED)
+def test_the_heading_is_the_integral_of_the_rate(name):
+    """By Simpson's rule, which is exact for a rate that is linear between the grid's points: all corners are multiples of 0.1 s."""
+    motion = NAMED[name]
+    time = np.arange(round(motion.duration * 20) + 1) / 20.0
+    middle = motion.rate_at((time[1:] + time[:-1]) / 2)
+    rate = motion.rate_at(time)
+    heading = np.concatenate([[0.0], np.cumsum((rate[1:] + 4 * middle + rate[:-1]) / 6 / 20.0)])
+    assert motion.heading_at(time) == pytest.approx(heading, abs=1e-12)
+
+
+def test_a_ramp_turns_half_of_what_its_end_rate_would():
+    motion = from_rates(np.array([5.0, 7.0, 8.0]), np.array([0.0, 1.0, 1.0]))
+    assert motion.heading_at(np.array([0.0, 1.0, 2.0, 3.0])).tolist() == [0.0, 0.25, 1.0, 2.0]
+
+
+def test_before_and_after_a_motion_stands():
+    assert CALIBRATION.rate_at(np.array([-1.0, CALIBRATION.duration + 1.0])).tolist() == [0.0, 0.0]
+    assert ROBOT.heading_at(np.array([-5.0, ROBOT.duration + 5.0])).tolist() == [0.0, ROBOT.heading[-1]]
+
+
+def test_the_calibration_takes_20_s_turns_both_ways_at_two_speeds_and_comes_back():
+    rate = CALIBRATION.rate_at(np.arange(2001) / 100.0) / DEGREE
+    assert CALIBRATION.duration == 20.0 and CALIBRATION.heading[-1] == pytest.approx(0.0, abs=1e-12)
+    assert all((np.abs(rate - speed) < 1e-9).mean() > 0.1 for speed in (-45, -30, 0, 30, 45))
+
+
+def test_the_robot_drives_160_s_and_stands_for_half_of_them():
+    """Hong and Park, section 4.1: a trajectory of 160 s."""
+    rate = ROBOT.rate_at(np.arange(16001) / 100.0)
+    assert ROBOT.duration == pytest.approx(160.0) and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_stretch_turns_rate_times_duration():
+    assert turns([(1, 0), (4, 45), (1, 0)]).heading[-1] == pytest.approx(4 * 45 * DEGREE)
+
+
+def test_known_headings_are_met_and_joined_by_lines():
+    motion = from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
+    assert motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist() == [0.0, 0.5, 1.0, 1.25, 1.5]
+
+
+@pytest.mark.parametrize('column, factor', [
+    ('heading_deg', DEGREE), ('heading_rad', 1.0), ('reference_heading_deg', DEGREE), ('reference_heading_rad', 1.0)])
+def test_a_profile_of_headings_is_read(tmp_path, column, factor):
+    (tmp_path / 'profile.csv').write_text(f'# note\n{column},time_s,lap\n1,0,a\n3,2,b\n\n')
+    motion = read_motion(tmp_path / 'profile.csv')
+    assert motion.heading.tolist() == pytest.approx([0.0, 2.0 * factor]) and motion.rate is None and motion.duration == 2.0
+
+
+@pytest.mark.parametrize('column, factor', [
+    ('rate_dps', DEGREE), ('rate_rad_s', 1.0), ('reference_rate_dps', DEGREE), ('reference_rate_rad_s', 1.0)])
+def test_a_profile_of_rates_is_read(tmp_path, column, factor):
+    (tmp_path / 'profile.csv').write_text(f'\ufefftime_s,{column}\n5,0\n7,3\n')
+    motion = read_motion(tmp_path / 'profile.csv')
+    assert motion.rate.tolist() == [0.0, 3.0 * factor] and motion.heading_at(2.0) == pytest.approx(3.0 * factor)
+
+
+REFUSED = {
+    'empty': ('', 'the columns are nothing'), 'no rows': ('time_s,rate_dps\n', 'wanted time_s and one of heading_deg'),
+    'no time': ('rate_dps\n1\n2\n', 'wanted time_s'), 'no motion': ('time_s\n1\n2\n', 'wanted time_s and one of'),
+    'two motions': ('time_s,rate_dps,heading_deg\n0,1,1\n1,1,1\n', 'wanted time_s and one of'),
+    'one row': ('time_s,rate_dps\n0,1\n', 'at least two rows'), 'time stands': ('time_s,rate_dps\n0,1\n0,1\n', 'time_s must increase'),
+    'text': ('time_s,rate_dps\n0,1\n1,fast\n', 'column rate_dps'), 'nan': ('time_s,rate_dps\n0,nan\n1,1\n', 'column rate_dps'),
+    'inf': ('time_s,rate_dps\n0,1\ninf,1\n', 'column time_s'), 'short': ('time_s,rate_dps\n0,1\n1\n', 'column rate_dps'),
+    'binary': (bytes(range(256)), 'cannot be read'), 'endless field': ('time_s,rate_dps\n0,' + '1' * 200000, 'cannot be read'),
+}
+
+
+@pytest.mark.parametrize('text, message', REFUSED.values(), ids=REFUSED)
+def test_what_is_no_profile_is_refused(tmp_path, text, message):
+    path = tmp_path / 'profile.csv'
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(MotionError) as refused:
+        read_motion(path)
+    assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(MotionError, match='cannot be read'):
+        read_motion(tmp_path / 'profile.csv')
+
+
+def test_a_still_motion_is_one():
+    assert math.fsum(np.abs(NAMED['rest'].heading_at(np.arange(60.0)))) == 0.0

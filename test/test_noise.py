@@ -1,0 +1,73 @@
+"""
+Simulated noise has the Allan deviation of IEEE Std 952: N / sqrt(tau), 0.664 B, K sqrt(tau / 3).
+
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
+
+INTERVAL = 0.01
+
+
+def allan_variance(rate, size):
+    """Return the Allan variance of non-overlapping means of `size` samples (IEEE Std 952, C.1), and how many differences it has."""
+    means = rate[:len(rate) // size * size].reshape(-1, size).mean(axis=1)
+    return np.mean(np.diff(means) ** 2) / 2.0, len(means) - 1
+
+
+def assert_variance(noise, size, wanted, count=2 ** 18, runs=8):
+    """
+    Assert the Allan variance within four standard errors.
+
+    The n differences of neighbours correlate by -1/2 or less, so their mean square has a relative variance of at most 3 / n.
+
+    """
+    generator = np.random.default_rng(952)
+    found = [allan_variance(simulate_noise(noise, count, INTERVAL, generator), size) for _ in range(runs)]
+    tolerance = 4.0 * math.sqrt(3.0 / (found[0][1] * runs))
+    assert tolerance < 0.25
+    assert np.mean([variance for variance, _ in found]) / wanted == pytest.approx(1.0, abs=tolerance)
+
+
+@pytest.mark.parametrize('size', [1, 10, 100, 1000])
+def test_white_noise_falls_with_the_square_root_of_time(size):
+    assert_variance(Noise(angle_random_walk=7e-4), size, 7e-4 ** 2 / (size * INTERVAL))
+
+
+@pytest.mark.parametrize('size', [100, 300, 1000])
+def test_flicker_has_a_floor_of_0_664_times_the_bias_instability(size):
+    assert round(ALLAN_FLOOR, 3) == 0.664
+    assert_variance(Noise(bias_instability=1e-4), size, (ALLAN_FLOOR * 1e-4) ** 2)
+
+
+@pytest.mark.parametrize('size', [30, 100, 1000])
+def test_a_random_walk_grows_with_the_square_root_of_time(size):
+    wanted = 1e-5 ** 2 * size * INTERVAL / 3.0 * (1.0 + 0.5 / size ** 2)  # exactly, for a walk in steps
+    assert_variance(Noise(rate_random_walk=1e-5), size, wanted)
+
+
+def test_the_three_add_up_and_none_is_silence():
+    generator = np.random.default_rng(1)
+    assert not simulate_noise(Noise(), 100, INTERVAL, generator).any()
+    parts = Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)
+    alone = sum(simulate_noise(part, 100, INTERVAL, np.random.default_rng(2)) for part in parts)
+    assert simulate_noise(Noise(7e-4, 1e-4, 1e-5), 100, INTERVAL, np.random.default_rng(2)) == pytest.approx(alone, abs=1e-12)
+
+
+def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_so():
+    """Their introduction: 2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 minutes; the floor of 18 deg/h alone gives 6."""
+    degree = math.pi / 180.0
+    assert math.sqrt(Noise(2.5 * degree / 60).heading_variance(3600.0)) / degree == pytest.approx(2.5)
+    both = math.sqrt(Noise(2.5 * degree / 60, 18 * degree / 3600).heading_variance(1800.0)) / degree
+    assert both == pytest.approx(math.hypot(2.5 * math.sqrt(0.5), 0.664 * 9.0), rel=1e-3) and both < 11.0
+
+
+@pytest.mark.parametrize('noise', [Noise(7e-4), Noise(rate_random_walk=1e-4)], ids=['angle random walk', 'rate random walk'])
+def test_the_heading_varies_as_foretold(noise):
+    generator, runs, count = np.random.default_rng(3), 2000, 500
+    ends = [simulate_noise(noise, count, INTERVAL, generator).sum() * INTERVAL for _ in range(runs)]
+    assert np.mean(np.square(ends)) / noise.heading_variance(count * INTERVAL) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / runs) + 0.01)
