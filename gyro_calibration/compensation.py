@@ -44,11 +44,16 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     """
     given = model.reference_temperature if temperature is None else temperature
     low, high = model.temperature_range
-    used = np.minimum(np.maximum(given, low), high)
+    used = _clip(given, low, high)
     modelled = model.rate(output, used)
     slowest, fastest = model.rate_range
     rate = (model.self_calibration or _NONE).correct(modelled)
     return Compensated(modelled, rate, used != given, (output < slowest) | (output > fastest))
+
+
+def _clip(value: Number, low: float, high: float) -> Number:
+    # numpy would make a numpy scalar of a number, and all that is computed from it three times slower.
+    return np.clip(value, low, high) if isinstance(value, np.ndarray) else min(max(value, low), high)
 
 
 def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number) -> np.ndarray:
@@ -59,13 +64,14 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     `covariance`.
 
     """
-    channels = Channels(rate, output, temperature)
-    calibration = model.self_calibration
-    scale = 1.0 if calibration is None else calibration.scale
-    rows = [] if model.covariance is None else [-scale * column for term in model.terms for column in term.columns(channels)]
+    channels, calibration = Channels(rate, output, temperature), model.self_calibration
+    rows = [] if model.covariance is None else [column for term in model.terms for column in term.columns(channels)]
     if calibration is not None:
-        rows += [-scale * rate, -scale * np.ones_like(rate)]
-    return np.array([np.broadcast_to(row, np.shape(rate)) for row in rows]).reshape(len(rows), *np.shape(rate))
+        rows += [rate, 1.0]
+    sensitivity = np.empty((len(rows), *np.shape(rate)))
+    for index, row in enumerate(rows):
+        sensitivity[index] = row
+    return sensitivity * (-1.0 if calibration is None else -calibration.scale)
 
 
 def covariance(model: GyroModel) -> np.ndarray:

@@ -150,8 +150,8 @@ class GyroModel:
 
     def _split(self, channel: str) -> tuple[list[Term], list[Term]]:
         """Return the effects that do not look at a channel, which need no repetition to solve for it, and those that do."""
-        looking = [channel in term.effect.looks_at for term in self.terms]
-        return ([term for term, looks in zip(self.terms, looking) if not looks], [term for term, looks in zip(self.terms, looking) if looks])
+        known = [term for term in self.terms if channel not in term.effect.looks_at]
+        return known, [term for term in self.terms if channel in term.effect.looks_at]
 
 
 def _sum(terms: Sequence[Term], channels: Channels) -> Number:
