@@ -129,7 +129,6 @@ class CompensationNode(Node):
         self._epoch: int | None = None
         self._last_time, self._last_heard, self._interval = -math.inf, self._now(), math.inf
         self._run: Run | None = None
-        self._driving = False
         self._counts = dict.fromkeys(('samples', 'not_finite', 'stamps_ignored', 'restarts', 'temperature_clipped', 'beyond_range'), 0)
         self._last_counts = dict(self._counts)
         self._events = ''
@@ -155,7 +154,8 @@ class CompensationNode(Node):
         for name, callback in (('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
                                ('cancel_calibration', self._on_cancel), ('reset_heading', self._on_reset)):
             self.create_service(Trigger, name, callback, callback_group=group)
-        self.create_timer(0.05, self._drive)
+        self._drive_timer = self.create_timer(0.05, self._drive)
+        self._drive_timer.cancel()  # it runs only while the robot is driven, for a wake-up costs as much as a sample
         self.create_timer(0.2, self._watch)
         self.create_timer(1.0, self._diagnose)
 
@@ -317,7 +317,8 @@ class CompensationNode(Node):
         if self._problem:
             return self._answer(response, False, f'refused: {self._problem}')
         run = self._run = Run(motion, duration, Future(), self._now())
-        self._driving = motion is not None and current(self, PARAMETERS).drive_profile
+        if motion is not None and current(self, PARAMETERS).drive_profile:
+            self._drive_timer.reset()
         self._show_state()
         success, message = False, ''
         try:
@@ -375,9 +376,13 @@ class CompensationNode(Node):
         self._heading.reset()
         return self._answer(response, True, 'the heading is zero here and now')
 
+    @property
+    def _driving(self) -> bool:
+        return not self._drive_timer.is_canceled()
+
     def _drive(self) -> None:
         """Command what the profile wants now; the robot moves only while samples come."""
-        if not self._driving or not self._run or not self._run.times:
+        if not self._run or not self._run.times:
             return
         now = self._run.elapsed + self._now() - self._run.heard
         command = Twist()
@@ -386,7 +391,7 @@ class CompensationNode(Node):
 
     def _stop_robot(self) -> None:
         if self._driving:
-            self._driving = False
+            self._drive_timer.cancel()
             self._velocity.publish(Twist())
 
     # What goes on
