@@ -293,9 +293,14 @@ def _errors_in_variables(data: _Increments, noise: _Covariance, estimate: _Estim
     """Estimate again with the reference heading smoothed by what the gyro says as the instrument."""
     for _ in range(3):
         instrument = data.columns.copy()
-        instrument[:, 0] += noise.reference_error(estimate.residual) / estimate.values[0]
+        instrument[:, 0] += noise.reference_error(estimate.residual) / _away_from_zero(estimate.values[0])
         estimate = _estimate(data, noise, instrument)
     return estimate
+
+
+def _away_from_zero(scale: float) -> float:
+    """Return the scale, but not one that a dead gyro has."""
+    return math.copysign(max(abs(float(scale)), 1e-3), scale)
 
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0) -> Fit:
@@ -340,7 +345,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
     scale, bias = estimate.values[:2]
     return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
-               math.sqrt(estimate.rate_variance * noise.ratio) / abs(float(scale)), _worst_stretch(noise, estimate))
+               math.sqrt(estimate.rate_variance * noise.ratio) / abs(_away_from_zero(scale)), _worst_stretch(noise, estimate))
 
 
 def _worst_stretch(noise: _Covariance, estimate: _Estimate) -> tuple[float, float]:
@@ -404,6 +409,8 @@ def _wander(noise: Noise | None) -> float:
 def _refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
     if len(time) < limits.samples:
         raise CalibrationRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: look at the gyro\'s line and rate')
+    if not np.isfinite(rate).all():
+        raise CalibrationRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: leave them out, or mend the line')
     gap = float(np.diff(time).max())
     if gap > limits.gap:
         raise CalibrationRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be missing: mend the line and run again')
@@ -412,6 +419,8 @@ def _refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
 
 
 def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
+    if not np.isfinite(motion.heading).all():
+        raise CalibrationRefused('the reference was lost somewhere in the profile: leave those points out, or run again')
     points = np.arange(0.0, motion.duration, 0.05)
     spread = float(np.std(motion.rate_at(points)))
     if spread < limits.rate_spread:

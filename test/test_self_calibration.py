@@ -1,0 +1,316 @@
+"""
+Self-calibration: the paper's two methods show the paper's numbers, the likelihood fit finds the truth and says how well, and what
+cannot be believed is refused.
+
+"""
+
+import math
+import runpy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turns
+from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
+from gyro_calibration.self_calibration import (
+    CalibrationRefused,
+    Limits,
+    calibrate_bias,
+    fit_heading,
+    fit_likelihood,
+    fit_rate,
+    self_calibrate,
+)
+
+#: Hong and Park, section 3.1.3: s = -10 %, b = 0.1 rad/s.
+S, B = -0.1, 0.1
+#: Their XV3500: 2.5 deg/sqrt(h); s and b as their experiment found them, b in deg/min (see sources).
+XV3500, XV3500_S, XV3500_B = Noise(2.5 * DEGREE / 60), 0.0373, 0.75 * DEGREE / 60
+TIME = np.arange(2001) / 100.0
+RATE = CALIBRATION.rate_at(TIME)
+
+
+def sampled(motion, rate=20.0, step=0.0, phase=0.0):
+    """Return the motion as a heading reference gives it, `rate` times a second, by an encoder of that step, rad, if there is one."""
+    time = np.arange(round(motion.duration * rate) + 1) / rate
+    heading = motion.heading_at(time) + phase
+    return from_headings(time, np.round(heading / step) * step if step else heading)
+
+
+# Hong and Park's evaluation: a move of 3.8 s to 0.4 rad/s, a quarter of it ramp, at 20 Hz.
+MOVE = from_rates(np.array([0.0, 0.95, 2.85, 3.8]), np.array([0.0, 0.4, 0.4, 0.0]))
+MOVE_TIME = np.arange(77) / 20.0
+MOVE_RATE = (1 + S) * MOVE.rate_at(MOVE_TIME) + B
+
+
+def test_the_heading_reference_errs_as_published():
+    """Printed are 4.8 % and 20.26 %: the rectangle rule of eq. 4 gives them for s_bar and b_bar, not for s and b, which err by more."""
+    fit = fit_heading(MOVE_TIME, MOVE_RATE, MOVE)
+    scale, offset = 1 / (1 + fit.scale_factor_error), -fit.bias / (1 + fit.scale_factor_error)
+    assert scale * (1 + S) - 1 == pytest.approx(-0.0482, abs=0.0002)
+    assert offset / (-B / (1 + S)) - 1 == pytest.approx(-0.209, abs=0.002)
+    assert fit.scale_factor_error / S - 1 == pytest.approx(-0.45, abs=0.01)
+
+
+def test_the_rectangle_rule_alone_makes_that_error():
+    fine = np.arange(38001) / 10000.0
+    fit = fit_heading(fine, (1 + S) * MOVE.rate_at(fine) + B, MOVE)
+    assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=2e-4)
+
+
+def test_the_rate_reference_shows_no_error():
+    fit = fit_rate(MOVE_TIME, MOVE_RATE, MOVE)
+    assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-12)
+
+
+@pytest.mark.parametrize('reference', [MOVE, sampled(MOVE)], ids=['rate profile', 'sampled heading'])
+def test_the_likelihood_shows_no_error_on_their_move(reference):
+    fit = fit_likelihood(MOVE_TIME, MOVE_RATE, reference, 0.5)
+    assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-9)
+
+
+@pytest.mark.parametrize('gyro, reference', [(100, 0), (100, 20), (20, 20)])
+@pytest.mark.parametrize('offset', [0.0, 0.137, -0.42])
+def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference, offset):
+    time = np.arange(21 * gyro) / gyro - 0.5
+    rate = (1 + S) * CALIBRATION.rate_at(time - offset) + B
+    fit = fit_likelihood(time, rate, sampled(CALIBRATION, reference) if reference else CALIBRATION)
+    # at 20 Hz it is the trapezoid rule between the samples about a corner that errs
+    assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-6 if gyro == 100 else 1e-5)
+    assert fit.time_offset == pytest.approx(offset, abs=1e-5)
+
+
+def test_equation_8_as_printed_returns_its_unknowns_swapped():
+    true = MOVE.rate_at(MOVE_TIME)
+    printed = np.array([[MOVE_RATE.sum(), MOVE_RATE @ MOVE_RATE], [len(true), MOVE_RATE.sum()]])
+    first, second = np.linalg.solve(printed, [true @ MOVE_RATE, true.sum()])
+    assert (round(second, 3), round(first, 3)) == (1.111, -0.111)  # they name the first s_bar and the second b_bar
+
+
+STEP = 0.088 * DEGREE
+RUNS = 300
+
+
+@cache
+def honest(reference):
+    """Return, for noisy runs with known truth, errors of (s, b), their claimed standard deviations, and how many were refused."""
+    errors, deviations, refused = [], [], 0
+    for seed in range(RUNS):
+        generator = np.random.default_rng([seed, len(reference)])
+        rate = (1 + XV3500_S) * RATE + XV3500_B + simulate_noise(XV3500, len(TIME), 0.01, generator)
+        motion = CALIBRATION if reference == 'profile' else sampled(CALIBRATION, 20.0, STEP, generator.uniform(0.0, STEP))
+        try:
+            fit = self_calibrate(TIME, rate, motion)
+        except CalibrationRefused:
+            refused += 1
+            continue
+        errors.append((fit.scale_factor_error - XV3500_S, fit.bias - XV3500_B))
+        deviations.append(np.sqrt(np.diag(fit.covariance)))
+    return np.array(errors), np.array(deviations), refused
+
+
+def bound(reference):
+    """Return the Cramer-Rao bound of s and b: white noise of the rate, encoder steps as noise of step / sqrt(12), time offset unknown."""
+    time = TIME if reference == 'profile' else np.arange(401) / 20.0
+    heading, rate = CALIBRATION.heading_at(time), CALIBRATION.rate_at(time)
+    columns = np.column_stack([np.diff(heading), np.diff(time), np.diff(rate)])
+    differences = np.diff(np.eye(len(time)), axis=0)
+    steps = 0.0 if reference == 'profile' else ((1 + XV3500_S) * STEP) ** 2 / 12
+    noise = np.diag(np.diff(time)) * XV3500.angle_random_walk ** 2 + steps * differences @ differences.T
+    return np.sqrt(np.diag(np.linalg.inv(columns.T @ np.linalg.solve(noise, columns))))[:2]
+
+
+@pytest.mark.parametrize('reference', ['profile', 'encoder'])
+def test_the_likelihood_is_unbiased(reference):
+    errors, _, _ = honest(reference)
+    assert (np.abs(errors.mean(axis=0)) < 4.0 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))).all()
+
+
+@pytest.mark.parametrize('reference', ['profile', 'encoder'])
+def test_the_95_percent_intervals_cover_the_truth(reference):
+    errors, deviations, _ = honest(reference)
+    covered = (np.abs(errors) < 1.96 * deviations).mean(axis=0)
+    assert (covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / RUNS)).all() and (covered <= 0.995).all(), covered
+
+
+@pytest.mark.parametrize('reference', ['profile', 'encoder'])
+def test_the_likelihood_comes_near_the_cramer_rao_bound(reference):
+    """Measured: 1.0 to 1.1 times the bound, in standard deviations; 300 runs tell it to 4 %."""
+    errors, _, _ = honest(reference)
+    assert (errors.std(axis=0, ddof=1) < 1.2 * bound(reference)).all(), errors.std(axis=0, ddof=1) / bound(reference)
+
+
+@pytest.mark.parametrize('reference', ['profile', 'encoder'])
+def test_honest_runs_are_not_refused(reference):
+    assert honest(reference)[2] <= 1
+
+
+def lagging(constant):
+    """Return the rate of a robot that follows the calibration with a first-order lag, s."""
+    fine = np.arange(20001) / 1000.0
+    decay, state, rates = math.exp(-0.001 / constant), 0.0, []
+    for wanted in CALIBRATION.rate_at(fine):
+        state = decay * state + (1 - decay) * wanted
+        rates.append(state)
+    return np.array(rates[::10])
+
+
+SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (4, 30), (4, -30), (1, 0)], ramp=0.7).rate_at(TIME)
+ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1), 'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
+          'ramps of 0.7 instead of 0.5 s': (SOFT, 0.5)}
+
+
+@pytest.mark.parametrize('rate, percent', ROBOTS.values(), ids=ROBOTS)
+def test_a_robot_that_follows_late_or_softly_is_calibrated_all_the_same(rate, percent):
+    for seed in range(5):
+        noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(seed))
+        fit = self_calibrate(TIME, (1 + XV3500_S) * rate + XV3500_B + noise, CALIBRATION)
+        assert 100 * abs(fit.scale_factor_error - XV3500_S) < percent
+        assert abs(fit.scale_factor_error - XV3500_S) < 4.0 * math.sqrt(fit.covariance[0, 0])
+
+
+def run(seed=0, true=RATE, s=XV3500_S):
+    """Return the output of the XV3500 on this true rate."""
+    return (1 + s) * true + XV3500_B + simulate_noise(XV3500, len(true), 0.01, np.random.default_rng(seed))
+
+
+def bumped(seed, degrees):
+    """Return the rates of a robot that is pushed by some degrees within 0.3 s, anywhere."""
+    start = np.random.default_rng([7, seed]).uniform(1.0, 18.0)
+    return RATE + np.where((start <= TIME) & (start + 0.3 > TIME), degrees * DEGREE / 0.3, 0.0)
+
+
+@pytest.mark.parametrize('degrees', [5.0, 3.0, 2.0])
+def test_a_slip_or_bump_is_refused(degrees):
+    """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is let through, as the limit says."""
+    refused = 0
+    for seed in range(20):
+        try:
+            self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION)
+        except CalibrationRefused as error:
+            refused += 'slip or a bump' in str(error)
+    assert refused >= 19
+
+
+def test_a_bump_below_the_limit_does_little_harm():
+    errors = [self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION).scale_factor_error - XV3500_S for seed in range(10)]
+    assert np.abs(errors).max() < 0.005
+
+
+ONE_SPEED = from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
+OTHER = turns([(2, 0), (5, -40), (3, 20), (5, 40), (4, -20), (1, 0)])
+GAP = (TIME < 8.0) | (TIME > 9.0)
+SPEEDS = turns([(10, 20), (10, 10)])
+REFUSED = {
+    'too few samples': (TIME[:40], run()[:40], CALIBRATION, 'only 40 samples came; at least 50'),
+    'a gap': (TIME[GAP], run()[GAP], CALIBRATION, 'no samples came for 1.0'),
+    'dead': (TIME, np.zeros(len(TIME)), CALIBRATION, 'the gyro is dead'),
+    'stuck': (TIME, np.full(len(TIME), 0.02), CALIBRATION, 'the gyro is dead'),
+    'a lost sample': (TIME, np.where(TIME == 5.0, np.nan, run()), CALIBRATION, 'not a finite number'),
+    'a lost reference': (TIME, run(), from_headings(TIME, np.where(TIME == 5.0, np.nan, RATE)), 'the reference was lost'),
+    'one speed': (TIME, run(), ONE_SPEED, 'the profile turns at one speed'),
+    'half the motion': (TIME[:1000], run()[:1000], CALIBRATION, 'the samples cover 10.0 s of the profile\'s 20.0 s'),
+    'not moved': (TIME, run(true=0.0 * RATE), CALIBRATION, 'did the robot move'),
+    'wrong sign': (TIME, -run(), CALIBRATION, 'the gyro turns the other way'),
+    'another profile': (TIME, run(true=OTHER.rate_at(TIME)), CALIBRATION, ''),
+    'degrees for radians': (TIME, run() / DEGREE, CALIBRATION, ''),
+    'half of the scale': (TIME, run(s=-0.4), CALIBRATION, 'a scale factor error of -40 % is beyond 30 %'),
+    'carried round': (TIME, run() + 0.3, CALIBRATION, 'is beyond 10 deg/s: was the robot turned by hand?'),
+}
+
+
+@pytest.mark.parametrize('time, rate, motion, reason', REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_believed_is_refused_with_its_reason(time, rate, motion, reason):
+    with pytest.raises(CalibrationRefused) as refused:
+        self_calibrate(time, rate, motion)
+    assert reason in str(refused.value) and '\n' not in str(refused.value)
+
+
+@pytest.mark.parametrize('method', ['heading', 'rate', 'likelihood'])
+def test_no_method_calibrates_by_a_dead_gyro(method):
+    with pytest.raises(CalibrationRefused):
+        self_calibrate(TIME, np.where(TIME > 19.9, 1e-9, 0.0), CALIBRATION, method)
+
+
+def test_the_wander_of_the_bias_is_in_its_standard_deviation():
+    flicker = Noise(bias_instability=18 * DEGREE / 3600)
+    without, with_it = (self_calibrate(TIME, run(), CALIBRATION, noise=noise).covariance[1, 1] for noise in (None, flicker))
+    assert with_it - without == pytest.approx((ALLAN_FLOOR * flicker.bias_instability) ** 2)
+
+
+def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():
+    """Ojeda et al., eq. 1. A standard deviation from 10 blocks is good to 24 %; its interval is Student's, 2.26 for 95 %."""
+    covered, runs = 0, 400
+    for seed in range(runs):
+        rate = run(seed, np.zeros(1000))
+        bias, deviation = calibrate_bias(TIME[:1000], rate)
+        assert bias == pytest.approx(rate.mean(), abs=1e-15)
+        covered += abs(bias - XV3500_B) < 2.26 * deviation
+    assert covered / runs == pytest.approx(0.95, abs=4.0 * math.sqrt(0.95 * 0.05 / runs))
+
+
+NOT_RESTING = {
+    'turned once': (np.where((TIME > 5) & (TIME < 6), 0.1, 0.0), 'the gyro was moved'),
+    'a slow turn that begins midway': (np.where(TIME > 10, 1.0 * DEGREE, 0.0), 'the gyro was moved'),
+    'a slower turn that begins midway': (np.where(TIME > 10, 0.6 * DEGREE, 0.0), 'the gyro was moved'),
+    'shaken': (0.2 * np.sin(2 * np.pi * 7.0 * TIME), 'stop the robot and its motors'),
+    'turning steadily': (np.full(len(TIME), 15 * DEGREE), 'beyond 10 deg/s'),
+}
+
+
+@pytest.mark.parametrize('true, reason', NOT_RESTING.values(), ids=NOT_RESTING)
+def test_a_bias_is_not_taken_in_motion(true, reason):
+    with pytest.raises(CalibrationRefused, match=reason):
+        calibrate_bias(TIME, run(0, true), noise=XV3500)
+
+
+@pytest.mark.parametrize('count, rate, reason', [(40, None, 'only 40 samples'), (500, 0.0, 'dead')])
+def test_a_bias_is_not_taken_from_a_dead_gyro_or_a_few_samples(count, rate, reason):
+    with pytest.raises(CalibrationRefused, match=reason):
+        calibrate_bias(TIME[:count], run(0, np.zeros(count)) if rate is None else np.full(count, rate))
+
+
+def test_limits_are_for_the_caller_to_set():
+    fit = self_calibrate(TIME, run(s=-0.4), CALIBRATION, limits=Limits(scale_factor_error=0.5))
+    assert fit.scale_factor_error == pytest.approx(-0.4, abs=0.002)
+
+
+def test_the_chain_of_hong_and_park_takes_off_what_this_package_promises():
+    """Their table 1 says 31 % and 64 %; single samples below the published threshold hold next to no drift (see sources)."""
+    benchmark = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'heading_error.py'))
+    errors = benchmark['errors']()
+    means = errors.mean(axis=0)
+    (off, single), table = 1.0 - means / means[:, :1], '\n' + benchmark['table'](errors)
+    assert off[1] >= 0.45 and off[3] >= 0.70, table
+    assert single[2] <= 0.02, table
+
+
+def heading_error(log, start, calibrated):
+    """Return the rms heading error, deg, over the 300 s from `start`, with the calibration of its first 20 s or without."""
+    used = (log.time >= start) & (log.time < start + 300.0)
+    time, output = log.time[used] - log.time[used][0], -log.output[used]  # the gyro was mounted upside down
+    heading, first, fit = log.reference_heading[used], time < 20.0, None
+    if calibrated:
+        fit = self_calibrate(time[first], output[first], from_headings(time[first], heading[first]))
+        output = (output - fit.bias) / (1.0 + fit.scale_factor_error)
+    error = integrate(time, output) - (heading - heading[0])
+    return math.sqrt(np.mean(error ** 2)) / DEGREE
+
+
+def test_20_s_by_an_encoder_take_two_thirds_off_the_error_of_a_measured_gyro(data):
+    log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
+    starts = (0, 100, 300, 500, 700, 1000, 1200)
+    table = {start: (heading_error(log, start, True), heading_error(log, start, False)) for start in starts}
+    ratios = [calibrated / pure for calibrated, pure in table.values()]
+    assert ratios[0] < 1 / 3 and max(ratios) < 0.6 and np.median(ratios) < 1 / 3, table
+
+
+def test_a_log_of_25_minutes_is_fitted_within_seconds_and_by_1e_3(data):
+    """The encoder's firmware is trusted to 0.2 %; long and short runs must agree."""
+    log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
+    fit = fit_likelihood(log.time - log.time[0], -log.output, from_headings(log.time, log.reference_heading))
+    assert fit.scale_factor_error == pytest.approx(0.006, abs=0.002) and math.sqrt(fit.covariance[0, 0]) < 2e-4
