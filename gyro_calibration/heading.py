@@ -145,7 +145,7 @@ class HeadingIntegrator:
         half = 0.5 * interval
         self.heading += half * (filtered + last_filtered)
         self.deleted += half * (rate - filtered + last_rate - last_filtered)
-        kept, last_kept = filtered == rate, last_filtered == last_rate
+        kept, last_kept = float(filtered == rate), float(last_filtered == last_rate)
         self._moving_time += half * (kept + last_kept)
         if len(sensitivity):
             self._sensitivity += half * (kept * sensitivity + last_kept * last_sensitivity)

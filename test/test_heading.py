@@ -1,0 +1,194 @@
+"""
+From rates to a heading: the trapezoid rule, the threshold filter, and a variance that Monte Carlo runs with known truth confirm.
+
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
+from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter, filter_rates, integrate, integrate_with_deviation
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model import GyroModel, SelfCalibration
+from gyro_calibration.motion import CALIBRATION, ROBOT
+from gyro_calibration.noise import Noise, simulate_noise
+
+NONE = np.zeros(0)
+INTERVAL = 0.01
+XV3500 = Noise(2.5 * DEGREE / 60)
+
+
+def noisy_robot(seed=0):
+    """Return times and rates of the robot with the XV3500's white noise."""
+    time = np.arange(16001) * INTERVAL
+    return time, ROBOT.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(seed))
+
+
+def filtered_singly(settings, time, rate):
+    """Return what the filter makes of samples that come one by one."""
+    threshold = ThresholdFilter(settings)
+    return np.array([threshold.filter(*sample) for sample in zip(time.tolist(), rate.tolist())])
+
+
+def added(integrator, time, rate, filtered=None, sensitivity=None):
+    """Add samples to the integrator and return what it said, and its headings."""
+    said, headings = [], []
+    for index, (stamp, value) in enumerate(zip(time, rate)):
+        kept = value if filtered is None else filtered[index]
+        said.append(integrator.add(stamp, value, kept, NONE if sensitivity is None else sensitivity[:, index]))
+        headings.append(integrator.heading)
+    return said, np.array(headings)
+
+
+def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
+    time = np.concatenate([[0.0], np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 500))])
+    heading = integrate(time, 0.3 - 0.02 * time)
+    assert heading == pytest.approx(0.3 * time - 0.01 * time ** 2, abs=1e-12)
+
+
+def test_the_calibration_comes_back_to_its_first_heading():
+    time = np.arange(2001) * INTERVAL
+    assert integrate(time, CALIBRATION.rate_at(time)) == pytest.approx(CALIBRATION.heading_at(time), abs=1e-12)
+
+
+@pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
+def test_the_integrator_does_as_the_batch(offset):
+    time, rate = noisy_robot()
+    said, headings = added(HeadingIntegrator(), time + offset, rate)
+    assert not any(said)
+    assert headings == pytest.approx(integrate(time, rate), abs=1e-9 if not offset else 1e-5)  # 1e9 s has steps of 0.1 us
+
+
+SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(), 'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
+            'long': Threshold(1.0 * DEGREE, 1.0), 'off': Threshold(0.0)}
+
+
+@pytest.mark.parametrize('settings', SETTINGS.values(), ids=SETTINGS)
+def test_a_log_at_once_is_filtered_as_sample_by_sample(settings):
+    time, rate = noisy_robot()
+    assert np.array_equal(filter_rates(settings, time, rate), filtered_singly(settings, time, rate))
+
+
+def test_single_samples_are_filtered_by_equation_12():
+    time, rate = noisy_robot()
+    as_printed = np.where(np.abs(rate) < 0.3 * DEGREE, 0.0, rate)
+    assert np.array_equal(filtered_singly(Threshold(0.3 * DEGREE, 0.0), time, rate), as_printed)
+
+
+def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_little():
+    """0.3 deg/s is 0.72 sigma of a sample at 100 Hz, which 47 % exceed, and 3.2 sigma of the mean of 20, which 0.13 % exceed."""
+    time = np.arange(20001) * INTERVAL
+    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
+    passed = {window: (filter_rates(Threshold(window=window), time, rate) != 0.0).mean() for window in (0.0, 0.2)}
+    assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
+
+
+def test_the_mean_over_the_window_decides():
+    time = np.arange(100) * INTERVAL
+    rate = np.where(np.arange(100) < 50, 0.0, 1.0 * DEGREE)
+    kept = filtered_singly(Threshold(0.3 * DEGREE, 0.2), time, rate)
+    assert np.flatnonzero(kept)[0] == 50 + 6 - 1  # six of twenty samples at 1 deg/s have a mean of 0.3 deg/s
+
+
+def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
+    time = np.arange(500) * INTERVAL
+    rate = 5.0 * DEGREE * np.sin(2 * np.pi * 10.0 * time)  # two whole periods in the window
+    assert (filtered_singly(Threshold(), time, rate)[20:] == 0.0).all()
+    seen = filtered_singly(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
+    assert np.array_equal(seen[20:], rate[20:])
+
+
+def test_the_rest_test_takes_noise_for_rest():
+    time = np.arange(20001) * INTERVAL
+    rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
+    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate) != 0.0).mean() < 0.01
+
+
+def test_a_cleared_window_knows_nothing_of_before():
+    threshold = ThresholdFilter(Threshold(window=10.0))
+    for index in range(50):
+        threshold.filter(index * INTERVAL, 1.0)
+    threshold.clear()
+    assert threshold.filter(0.6, 0.001) == 0.0
+
+
+def test_what_the_filter_takes_away_is_counted():
+    integrator, time = HeadingIntegrator(), np.arange(1001) * INTERVAL
+    slow = np.full(1001, 0.2 * DEGREE)
+    added(integrator, time, slow, filter_rates(Threshold(), time, slow))
+    assert integrator.heading == 0.0 and integrator.deleted == pytest.approx(2.0 * DEGREE)
+
+
+def test_rest_adds_no_variance():
+    integrator = HeadingIntegrator()
+    integrator.use(XV3500, np.zeros((0, 0)))
+    added(integrator, np.arange(1001) * INTERVAL, np.full(1001, 1e-4), np.zeros(1001))
+    assert integrator.variance == 0.0
+
+
+S, B = 0.02, 0.002
+UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
+
+
+def test_the_variance_is_that_of_many_runs_with_known_truth():
+    """White noise, and a scale factor error and a bias that are off by what their covariance says, over 60 s of driving."""
+    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
+    time, generator, ends = np.arange(6001) * INTERVAL, np.random.default_rng(0), []
+    true = ROBOT.rate_at(time)
+    for _ in range(400):
+        s, b = np.array([S, B]) + generator.multivariate_normal([0.0, 0.0], UNCERTAIN)
+        output = (1 + s) * true + b + simulate_noise(XV3500, len(time), INTERVAL, generator)
+        ends.append(integrate(time, compensate(model, output).rate)[[1500, 6000]] - ROBOT.heading_at(time)[[1500, 6000]])
+    sensitivity = rate_sensitivity(model, true, true, np.full(len(time), 25.0))
+    deviation = integrate_with_deviation(time, true + 1e-9, true + 1e-9, sensitivity, covariance(model), XV3500)[1]
+    ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
+    assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)  # to first order in s, 2 % here
+
+
+def test_the_integrator_gives_the_variance_of_the_batch():
+    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
+    time, rate = (values[:3000] for values in noisy_robot())
+    kept = filter_rates(Threshold(), time, rate)
+    sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
+    integrator = HeadingIntegrator()
+    integrator.use(XV3500, covariance(model))
+    _, headings = added(integrator, time, rate, kept, sensitivity)
+    heading, deviation = integrate_with_deviation(time, rate, kept, sensitivity, covariance(model), XV3500)
+    assert headings == pytest.approx(heading, abs=1e-12)
+    assert math.sqrt(integrator.variance) == pytest.approx(deviation[-1], rel=1e-9)
+
+
+def test_nothing_is_integrated_over_a_gap_and_the_variance_says_so():
+    integrator = HeadingIntegrator(maximum_gap=1.0)
+    said, _ = added(integrator, [0.0, 1.0, 4.0, 5.0], [0.1, 0.1, 0.2, 0.2])
+    assert said == ['', '', 'no samples for 3.000 s', '']
+    assert integrator.heading == pytest.approx(0.3) and integrator.variance == pytest.approx((0.2 * 3.0) ** 2)
+
+
+def test_a_stamp_that_jumps_back_begins_anew():
+    integrator = HeadingIntegrator()
+    said, _ = added(integrator, [5.0, 5.5, 2.0, 2.5], [0.1] * 4)
+    assert said == ['', '', 'the stamp jumps back by 3.500 s', ''] and integrator.heading == pytest.approx(0.1)
+
+
+def test_a_new_calibration_makes_neither_heading_nor_variance_jump():
+    """REP-105: the heading is continuous."""
+    integrator = HeadingIntegrator()
+    integrator.use(XV3500, np.array(UNCERTAIN))
+    sensitivity = -np.array([np.full(101, 0.5), np.ones(101)])
+    added(integrator, np.arange(101) * INTERVAL, np.full(101, 0.5), None, sensitivity)
+    before = integrator.heading, integrator.variance
+    integrator.use(Noise(1e-3), np.zeros((0, 0)))
+    assert (integrator.heading, integrator.variance) == pytest.approx(before)
+    integrator.add(1.01, 0.5, 0.5, NONE)
+    assert integrator.variance == pytest.approx(before[1] + 1e-6 * INTERVAL)
+
+
+def test_a_reset_knows_the_direction_exactly():
+    integrator = HeadingIntegrator()
+    integrator.use(XV3500, np.zeros((0, 0)))
+    added(integrator, np.arange(101) * INTERVAL, np.ones(101))
+    integrator.reset()
+    assert (integrator.heading, integrator.variance, integrator.deleted) == (0.0, 0.0, 0.0)
