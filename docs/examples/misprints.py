@@ -29,6 +29,11 @@ def by_trapezoids(time: np.ndarray, rate: np.ndarray, motion: Motion) -> tuple[f
     return 1.0 / scale - 1.0, -offset / scale
 
 
+def percent(found_over_true: float) -> float:
+    """Return an error in percent, rounded, and without a sign where it is zero."""
+    return round(100.0 * (found_over_true - 1.0), 2) + 0.0
+
+
 def rectangle_rule() -> None:
     """Errors of the four ways on motions without noise."""
     print('error of s and of b, in % of the true value')
@@ -38,7 +43,7 @@ def rectangle_rule() -> None:
         found = {way: (fit.scale_factor_error, fit.bias) for way, fit in fits.items()}
         found['by_trapezoids'] = by_trapezoids(time, rate, motion)
         for way, (s, b) in found.items():
-            print(f'{name:9} {sample_rate:4.0f} Hz  {way:15} {100 * (s / S - 1):7.2f} {100 * (b / B - 1):7.2f}')
+            print(f'{name:9} {sample_rate:4.0f} Hz  {way:15} {percent(s / S):7.2f} {percent(b / B):7.2f}')
 
 
 def exchanged_columns() -> None:

@@ -1,0 +1,128 @@
+"""
+What the documents say is so: links lead somewhere, tables agree with the code, commands are understood, models can be read.
+
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from gyro_calibration.command_line import main
+from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.model import POLYNOMIAL, read_model
+from gyro_calibration.protocols import PLANNED, PROTOCOLS
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst', *sorted((ROOT / 'docs').glob('*.md'))]
+LINK = re.compile(r'\[[^\]]*\]\(([^)\s]+)\)')
+FILE = re.compile(r'`((?:docs|config|launch|test|benchmarks|gyro_calibration)/[\w./]+\.\w+|[A-Z]+\.(?:md|rst)|Makefile|setup\.py)`')
+COMMAND = re.compile(r'^ +gyro_calibration (.+?)(?: +#.*)?$', re.MULTILINE)
+each_document = pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: path.name)
+
+
+def anchors(document):
+    """Return the anchors of the headings of a Markdown file."""
+    titles = re.findall(r'^#+ (.+)$', document.read_text(), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', title.lower()).replace(' ', '-') for title in titles}
+
+
+@each_document
+def test_every_relative_link_leads_somewhere(document):
+    for target in LINK.findall(document.read_text()):
+        path, _, anchor = target.partition('#')
+        if '://' in target:
+            continue
+        assert (document.parent / path).exists(), target
+        assert not anchor or anchor in anchors(document.parent / path if path else document), target
+
+
+@each_document
+def test_every_file_that_is_named_exists(document):
+    missing = [name for name in FILE.findall(document.read_text()) if not (ROOT / name).exists() and not (document.parent / name).exists()]
+    assert not missing
+
+
+@each_document
+def test_every_command_names_a_verb_and_options_that_exist(document, capsys):
+    for command in COMMAND.findall(document.read_text().replace('\\\n', ' ')):
+        verb, *words = shlex.split(command)
+        with pytest.raises(SystemExit) as end:
+            main([verb, '--help'])
+        usage = capsys.readouterr().out
+        assert end.value.code == 0, command
+        assert not [word for word in words if word.startswith('--') and word not in usage], command
+
+
+def test_every_document_has_no_line_beyond_140_columns_outside_tables():
+    long = [(document.name, line) for document in DOCUMENTS for line in document.read_text().splitlines()
+            if len(line) > 140 and not line.startswith('|')]
+    assert not long
+
+
+@pytest.fixture(params=['driver_node', 'compensation_node'])
+def parameters(request):
+    """Return the table of parameters of a node; skip where ROS 2 is missing."""
+    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
+    from gyro_calibration import compensation_node, driver_node
+    return {'driver_node': driver_node, 'compensation_node': compensation_node}[request.param].PARAMETERS
+
+
+def number(value):
+    """Return a number as people write it: a float shows that it is one."""
+    text = f'{value:.5g}' if isinstance(value, float) else str(value)
+    return f'{text}.0' if isinstance(value, float) and text.isdigit() else text
+
+
+def row(parameter):
+    """Return a parameter as a row of the table in docs/on_a_robot.md."""
+    default = parameter.default
+    if isinstance(default, str):
+        text = f'`{default}`' if default else 'empty'
+    elif isinstance(default, bool):
+        text = str(default).lower()
+    elif isinstance(default, (int, float)):
+        text = number(default)
+    else:
+        text = f'`[{", ".join(default)}]`'
+    limits = ' to '.join(map(number, parameter.range or ()))
+    return f'| `{parameter.name}` | {text} | {parameter.unit} | {limits} | {"yes" if parameter.dynamic else ""} | {parameter.description} |'
+
+
+def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
+    table = '\n'.join(map(row, parameters))
+    assert table in (ROOT / 'docs/on_a_robot.md').read_text(), f'put this table there:\n{table}'
+
+
+def test_the_configuration_holds_every_parameter_with_its_default(parameters):
+    yaml = pytest.importorskip('yaml')
+    files = [yaml.safe_load((ROOT / 'config' / name).read_text()) for name in ('driver.yaml', 'compensation.yaml')]
+    configured = [values['ros__parameters'] for file in files for values in file.values()]
+    wanted = {parameter.name: list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+              for parameter in parameters}
+    assert wanted in configured
+
+
+def test_the_models_in_the_documents_can_be_read(tmp_path):
+    texts = re.findall(r'```yaml\n(.*?)```', (ROOT / 'docs/error_model.md').read_text(), re.DOTALL)
+    models = []
+    for number, text in enumerate(texts):
+        path = tmp_path / f'{number}.yaml'
+        path.write_text(text)
+        models.append(read_model(path))
+    assert len(models) >= 3
+    full = models[-1]
+    assert full.covariance is not None and full.self_calibration is not None and full.gyro and full.origin and full.noise.rate_random_walk
+
+
+@pytest.mark.parametrize('effect', [*CATALOGUE, POLYNOMIAL])
+def test_the_error_model_describes_every_effect(effect):
+    assert f'`{effect}`' in (ROOT / 'docs/error_model.md').read_text()
+
+
+@pytest.mark.parametrize('document', ['README.md', 'docs/wire_formats.md'])
+def test_every_wire_format_is_in_the_tables(document):
+    text = (ROOT / document).read_text()
+    assert not [name for name in PROTOCOLS if not re.search(rf'^\| `{name}` \|', text, re.MULTILINE)]
+    assert not [name for name in PLANNED if not re.search(rf'^\| `{name}` .*planned', text, re.MULTILINE)]
