@@ -274,7 +274,8 @@ def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Esti
         rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
     inverse = np.linalg.pinv(regular, rcond=1e-14)
     resting = inverse @ (weighted.T @ data.resting)
-    covariance = rate_variance * inverse + resting @ resting.T
+    # the variance is estimated too, so that the values have Student's distribution, which is wider
+    covariance = freedom / (freedom - 2) * rate_variance * inverse + resting @ resting.T
     log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
     return _Estimate(values, covariance, residual, rate_variance, -0.5 * (freedom * math.log(rate_variance) + log_determinants))
 
@@ -475,10 +476,8 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     _refuse_samples(time, rate, limits)
     blocks = np.array([block.mean() for block in np.array_split(rate, 10)])
     within = math.sqrt(np.mean([block.var(ddof=1) for block in np.array_split(rate, 10)]) / (len(rate) / 10))
-    largest = float(np.abs(blocks - np.median(blocks)).max())
-    if largest > max(_CHANCE * within, 0.05 * DEGREE):
-        raise CalibrationRefused(f'the gyro was moved: its mean changed by {largest / DEGREE:.2f} deg/s within the rest; '
-                                 'keep it still and run again')
+    _refuse_change(np.abs(blocks - np.median(blocks)), np.full(10, within))
+    _refuse_change(*_steps(blocks, within))
     bias, deviation = float(rate.mean()), math.sqrt(blocks.var(ddof=1) / 10.0 + _wander(noise))
     if abs(bias) > limits.bias:
         raise CalibrationRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
@@ -486,6 +485,21 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     if noise is not None and noise.angle_random_walk:
         _refuse_shaking(time, rate, noise)
     return bias, deviation
+
+
+def _steps(blocks: Array, within: float) -> tuple[Array, Array]:
+    """Return how far the mean after each block is from the mean before, and the standard deviation of that, shape (n - 1,) each."""
+    first = np.arange(1, len(blocks))
+    last = len(blocks) - first
+    sums = np.cumsum(blocks)
+    return np.abs((sums[-1] - sums[:-1]) / last - sums[:-1] / first), within * np.sqrt(1.0 / first + 1.0 / last)
+
+
+def _refuse_change(changes: Array, deviations: Array) -> None:
+    beyond = np.where(changes > np.maximum(_CHANCE * deviations, 0.05 * DEGREE), changes, 0.0).max()
+    if beyond:
+        raise CalibrationRefused(f'the gyro was moved: its mean changed by {beyond / DEGREE:.2f} deg/s within the rest; '
+                                 'keep it still and run again')
 
 
 def _refuse_shaking(time: Array, rate: Array, noise: Noise) -> None:

@@ -132,6 +132,7 @@ def test_the_likelihood_is_unbiased(reference):
 
 @pytest.mark.parametrize('reference', ['profile', 'encoder'])
 def test_the_95_percent_intervals_cover_the_truth(reference):
+    """Measured over 600 runs: 93 to 95 %, as the number of blocks leaves Student's distribution some 34 degrees of freedom."""
     errors, deviations, _ = honest(reference)
     covered = (np.abs(errors) < 1.96 * deviations).mean(axis=0)
     assert (covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / RUNS)).all() and (covered <= 0.995).all(), covered
@@ -256,7 +257,8 @@ def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():
 NOT_RESTING = {
     'turned once': (np.where((TIME > 5) & (TIME < 6), 0.1, 0.0), 'the gyro was moved'),
     'a slow turn that begins midway': (np.where(TIME > 10, 1.0 * DEGREE, 0.0), 'the gyro was moved'),
-    'a slower turn that begins midway': (np.where(TIME > 10, 0.6 * DEGREE, 0.0), 'the gyro was moved'),
+    'a turn of 0.3 deg/s that begins midway': (np.where(TIME > 10, 0.3 * DEGREE, 0.0), 'the gyro was moved'),
+    'a turn of 0.3 deg/s that ends midway': (np.where(TIME < 10, 0.3 * DEGREE, 0.0), 'the gyro was moved'),
     'shaken': (0.2 * np.sin(2 * np.pi * 7.0 * TIME), 'stop the robot and its motors'),
     'turning steadily': (np.full(len(TIME), 15 * DEGREE), 'beyond 10 deg/s'),
 }
@@ -266,6 +268,12 @@ NOT_RESTING = {
 def test_a_bias_is_not_taken_in_motion(true, reason):
     with pytest.raises(CalibrationRefused, match=reason):
         calibrate_bias(TIME, run(0, true), noise=XV3500)
+
+
+def test_an_honest_rest_is_not_refused():
+    flicker = Noise(XV3500.angle_random_walk, 100 * DEGREE / 3600)
+    rests = (simulate_noise(flicker, len(TIME), 0.01, np.random.default_rng(seed)) for seed in range(200))
+    assert all(abs(calibrate_bias(TIME, rest, noise=flicker)[0]) < 0.1 * DEGREE for rest in rests)
 
 
 @pytest.mark.parametrize('count, rate, reason', [(40, None, 'only 40 samples'), (500, 0.0, 'dead')])
