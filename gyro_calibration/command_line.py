@@ -27,7 +27,8 @@ from gyro_calibration.compensation import compensate, covariance, quadratic_form
 from gyro_calibration.emulator import Emulator, emulate
 from gyro_calibration.heading import Threshold, filter_rates, integrate_with_deviation
 from gyro_calibration.log import DEGREE, Array, Log, LogError, read_log, write_log
-from gyro_calibration.model import GyroModel, ModelError, read_model, with_self_calibration, write_model
+from gyro_calibration.model import GyroModel, with_self_calibration
+from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.motion import NAMED, Motion, MotionError, from_headings, from_rates, read_motion
 from gyro_calibration.protocols import PLANNED, PROTOCOLS, Protocol, Sample, Settings, find
 from gyro_calibration.self_calibration import METHODS, CalibrationRefused, record, self_calibrate

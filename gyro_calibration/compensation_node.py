@@ -27,15 +27,8 @@ from std_srvs.srv import Trigger
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import (
-    GyroModel,
-    ModelError,
-    SelfCalibration,
-    read_model,
-    same_effects,
-    with_self_calibration,
-    write_model,
-)
+from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, with_self_calibration
+from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.motion import CALIBRATION, Motion, MotionError, read_motion
 from gyro_calibration.node import (
     LATCHED_QUALITY,

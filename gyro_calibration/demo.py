@@ -31,7 +31,8 @@ from tqdm import tqdm
 from gyro_calibration.emulator import Emulator
 from gyro_calibration.heading import Threshold, filter_rates, integrate
 from gyro_calibration.log import DEGREE, Array, Log, write_log
-from gyro_calibration.model import GyroModel, read_model
+from gyro_calibration.model import GyroModel
+from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION, Motion, turns
 from gyro_calibration.node import SENSOR_QUALITY
 from gyro_calibration.noise import simulate_noise

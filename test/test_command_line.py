@@ -11,7 +11,7 @@ import pytest
 
 from gyro_calibration.command_line import main
 from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.model import read_model
+from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.protocols import find
 

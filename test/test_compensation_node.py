@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import read_model
+from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION, from_rates
 from gyro_calibration.self_calibration import fit_likelihood
 

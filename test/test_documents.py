@@ -11,7 +11,7 @@ import pytest
 
 from gyro_calibration.command_line import main
 from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.model import POLYNOMIAL, read_model
+from gyro_calibration.model_file import POLYNOMIAL, read_model
 from gyro_calibration.protocols import PLANNED, PROTOCOLS
 
 ROOT = Path(__file__).parents[1]

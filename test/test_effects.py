@@ -17,7 +17,8 @@ from gyro_calibration.effects import (
     rate_temperature_polynomial,
 )
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term, read_model, write_model
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.simulation import simulate
 

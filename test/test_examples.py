@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gyro_calibration.log import read_log
-from gyro_calibration.model import read_model
+from gyro_calibration.model_file import read_model
 
 FOLDER = Path(__file__).parents[1] / 'docs/examples'
 QUICK = {'three_methods.py': ['2']}  # runs instead of 200

@@ -12,16 +12,8 @@ import pytest
 import yaml
 
 from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
-from gyro_calibration.model import (
-    GyroModel,
-    ModelError,
-    SelfCalibration,
-    Term,
-    read_model,
-    same_effects,
-    with_self_calibration,
-    write_model,
-)
+from gyro_calibration.model import GyroModel, SelfCalibration, Term, same_effects, with_self_calibration
+from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.noise import Noise
 
 TERMS = (Term(CATALOGUE['bias'], (0.01,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)), Term(CATALOGUE['sine_response'], (0.2, 1.0)),
@@ -205,3 +197,17 @@ def test_self_calibration_is_eq_3_of_hong_and_park():
 def test_models_compensate_alike_whatever_their_self_calibration():
     assert same_effects(FULL, with_self_calibration(FULL, None))
     assert not same_effects(FULL, GyroModel(TERMS[:3]))
+
+
+def test_a_person_may_give_the_standard_deviations_of_a_self_calibration_alone(tmp_path):
+    path = tmp_path / 'model.yaml'
+    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, standard_deviations: {bias: 0.003}}')
+    assert read_model(path).self_calibration.standard_deviations == (0.0, pytest.approx(0.003))
+
+
+def test_a_written_self_calibration_shows_its_standard_deviations(tmp_path):
+    calibration = SelfCalibration(0.1, 0.2, ((4e-6, 1e-9), (1e-9, 9e-6)), '2026-01-01T00:00:00+00:00', 21.0, 'likelihood')
+    write_model(tmp_path / 'model.yaml', GyroModel(self_calibration=calibration))
+    assert read_model(tmp_path / 'model.yaml').self_calibration == calibration
+    shown = yaml.safe_load((tmp_path / 'model.yaml').read_text())['self_calibration']['standard_deviations']
+    assert shown == {'scale_factor_error': pytest.approx(0.002), 'bias': pytest.approx(0.003)}

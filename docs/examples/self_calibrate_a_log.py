@@ -13,7 +13,8 @@ import sys
 import numpy as np
 
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model import GyroModel, Term, with_self_calibration, write_model
+from gyro_calibration.model import GyroModel, Term, with_self_calibration
+from gyro_calibration.model_file import write_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
 from gyro_calibration.self_calibration import CalibrationRefused, record, self_calibrate

@@ -11,7 +11,8 @@ import math
 import sys
 
 from gyro_calibration.effects import polynomial_from_matrix, polynomial_to_matrix
-from gyro_calibration.model import GyroModel, Term, read_model, write_model
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.noise import Noise
 
 DEGREE = math.radians(1.0)

@@ -1,0 +1,240 @@
+"""A gyro's model as a YAML file that a person can read and write; what is wrong with one is said in a sentence with its place."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gyro_calibration.effects import CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.files import write_atomically
+from gyro_calibration.log import Array
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.noise import Noise
+
+FORMAT = 'gyro_calibration/model'
+VERSION = 1
+POLYNOMIAL = 'rate_temperature_polynomial'
+
+
+class ModelError(ValueError):
+    """A file is not a model; the message names file, place and remedy."""
+
+
+def read_model(path: str | Path) -> GyroModel:
+    """
+    Read a model file.
+
+    Raises
+    ------
+    ModelError : missing, empty, truncated, of a newer version, or no model; names file, place and remedy
+
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except FileNotFoundError:
+        raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        place = f'line {error.problem_mark.line + 1}: ' if getattr(error, 'problem_mark', None) else ''
+        raise ModelError(f'{path}: {place}cannot be read as YAML; restore the file or calibrate again') from error
+    try:
+        return _from_content(content)
+    except _PlaceError as error:
+        raise ModelError(f'{path}: {error}') from None
+
+
+_SHORT = reprlib.Repr()  # a few lines of YAML can unfold to gigabytes
+_SHORT.maxlevel = 3
+
+
+class _PlaceError(ValueError):
+    def __init__(self, place: str, given: Any, wanted: str):
+        super().__init__(f'{place} is {_SHORT.repr(given)}; wanted {wanted}')
+
+
+def _from_content(content: Any) -> GyroModel:
+    top = _mapping('the file', content)
+    if top.get('format', FORMAT) != FORMAT:
+        raise _PlaceError('format', top['format'], f'{FORMAT}: this is not a model file')
+    version = top.get('version', VERSION)
+    if not isinstance(version, int) or version > VERSION:
+        raise _PlaceError('version', version, f'at most {VERSION}: install a newer gyro_calibration')
+    if 'effects' not in top:
+        raise _PlaceError('effects', None, 'the effects with their values, such as {bias: {bias: 0.01}}')
+    terms = tuple(_term(name, values) for name, values in _mapping('effects', top['effects'] or {}).items())
+    valid = _mapping('valid', top.get('valid', {}))
+    temperature_range = _range('valid.temperature', valid.get('temperature'))
+    middle = sum(temperature_range) / 2.0 if all(map(math.isfinite, temperature_range)) else 25.0
+    noise = {name: _number(f'noise.{name}', value, low=0.0) for name, value in _mapping('noise', top.get('noise', {})).items()}
+    _only('noise', noise, Noise.__dataclass_fields__)
+    return GyroModel(
+        terms, _covariance(top.get('covariance'), sum(len(term.effect.coefficients) for term in terms)),
+        _range('valid.rate', valid.get('rate')), temperature_range,
+        _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
+        {str(key): _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
+        _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')))
+
+
+def _mapping(place: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise _PlaceError(place, value, 'names with values (see docs/error_model.md), or calibrate again')
+    return value
+
+
+#: Beyond this no value of a gyro lies, and its square still is a number.
+_LARGEST = 1e100
+
+
+def _text(place: str, value: Any) -> str:
+    if isinstance(value, (list, dict, set)):
+        raise _PlaceError(place, value, 'a text')
+    return str(value)
+
+
+def _number(place: str, value: Any, low: float = -math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST or value < low:
+        least = f' of at least {low:g}' if low > -math.inf else ''
+        raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
+    return float(value)
+
+
+def _only(place: str, given: Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]) -> None:
+    for name in given:
+        if name not in known:
+            raise _PlaceError(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
+
+
+def _range(place: str, value: Any) -> tuple[float, float]:
+    if value is None:
+        return (-math.inf, math.inf)
+    if not isinstance(value, list) or len(value) != 2:
+        raise _PlaceError(place, value, '[lowest, highest]')
+    low, high = (_number(f'{place}[{index}]', item) for index, item in enumerate(value))
+    if low > high:
+        raise _PlaceError(place, value, '[lowest, highest] in this order')
+    return low, high
+
+
+def _matrix(place: str, value: Any, size: int) -> Array:
+    if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1 for row in value] != [size] * size:
+        raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a coefficient')
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
+    matrix = np.array(numbers).reshape(size, size)
+    smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + 1e-9 * np.abs(matrix).max(initial=0.0))], default=0.0)
+    if not np.allclose(matrix, matrix.T) or smallest < 0.0:
+        raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
+    return matrix
+
+
+def _covariance(value: Any, size: int) -> Array | None:
+    return None if value is None else _matrix('covariance', value, size)
+
+
+def _term(name: str, values: Any) -> Term:
+    place = f'effects.{name}'
+    given = _mapping(place, values)
+    if name == POLYNOMIAL:
+        return _polynomial(place, given)
+    if name not in CATALOGUE:
+        raise _PlaceError(place, given, f'an effect that this version knows: {", ".join([*CATALOGUE, POLYNOMIAL])}')
+    return Term(CATALOGUE[name], _values(place, CATALOGUE[name], given))
+
+
+def _values(place: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float, ...]:
+    _only(place, given, [parameter.name for parameter in effect.parameters])
+    values = []
+    for parameter in effect.parameters:
+        value = _number(f'{place}.{parameter.name}', given.get(parameter.name, parameter.default))
+        low, high = parameter.bounds
+        if not low <= value <= high:
+            raise _PlaceError(f'{place}.{parameter.name}', value, f'{low:g} to {high:g} {parameter.unit}')
+        values.append(value)
+    return tuple(values)
+
+
+def _polynomial(place: str, given: Mapping[str, Any]) -> Term:
+    """Read a polynomial: the paper's matrix, or orders [rate, temperature] with named values."""
+    if 'matrix_dps' in given:
+        _only(place, given, ['matrix_dps'])
+        return _polynomial_from_matrix(f'{place}.matrix_dps', given['matrix_dps'])
+    orders = given.get('orders')
+    if not isinstance(orders, list) or len(orders) != 2 or not all(type(order) is int and 0 <= order <= 20 for order in orders):
+        raise _PlaceError(f'{place}.orders', orders, 'the orders in rate and temperature, such as [3, 2], or matrix_dps')
+    effect = rate_temperature_polynomial(*orders)
+    return Term(effect, _values(place, effect, {name: value for name, value in given.items() if name != 'orders'}))
+
+
+def _polynomial_from_matrix(place: str, rows: Any) -> Term:
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        raise _PlaceError(place, rows, 'rows of finite numbers')
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(rows)]
+    try:
+        return Term(*polynomial_from_matrix(numbers))
+    except ValueError as error:
+        raise _PlaceError(place, rows, str(error)) from None
+
+
+def _self_calibration(value: Any) -> SelfCalibration | None:
+    if value is None:
+        return None
+    place, given = 'self_calibration', _mapping('self_calibration', value)
+    _only(place, given, [*SelfCalibration.__dataclass_fields__, 'standard_deviations'])
+    temperature = given.get('temperature')
+    return SelfCalibration(
+        _number(f'{place}.scale_factor_error', given.get('scale_factor_error'), low=-0.9),
+        _number(f'{place}.bias', given.get('bias')),
+        _calibration_covariance(place, given),
+        _text(f'{place}.time', given.get('time', '')),
+        None if temperature is None else _number(f'{place}.temperature', temperature),
+        _text(f'{place}.method', given.get('method', '')))
+
+
+def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Read the covariance of (s, b), or else their standard deviations."""
+    if 'covariance' in given:
+        (a, b), (_, c) = _matrix(f'{place}.covariance', given['covariance'], 2).tolist()
+        return (a, b), (b, c)
+    named = _mapping(f'{place}.standard_deviations', given.get('standard_deviations', {}))
+    _only(f'{place}.standard_deviations', named, ('scale_factor_error', 'bias'))
+    s, b = (_number(f'{place}.standard_deviations.{name}', named.get(name, 0.0), low=0.0) for name in ('scale_factor_error', 'bias'))
+    return (s * s, 0.0), (0.0, b * b)
+
+
+def write_model(path: str | Path, model: GyroModel) -> None:
+    """Write a model file; it is complete or not there."""
+    write_atomically(path, yaml.safe_dump(_to_content(model), sort_keys=False, allow_unicode=True).encode())
+
+
+def _to_content(model: GyroModel) -> dict[str, Any]:
+    content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
+    content['effects'] = {term.effect.name: _term_content(term) for term in model.terms}
+    if model.covariance is not None:
+        content['covariance'] = model.covariance.tolist()
+    ranges = {'rate': model.rate_range, 'temperature': model.temperature_range}
+    content['valid'] = {name: list(values) for name, values in ranges.items() if all(map(math.isfinite, values))}
+    content['reference_temperature'] = model.reference_temperature
+    content['noise'] = dict(vars(model.noise))
+    content['gyro'] = dict(model.gyro)
+    content['origin'] = dict(model.origin)
+    if model.self_calibration is not None:
+        content['self_calibration'] = _self_calibration_content(model.self_calibration)
+    return content
+
+
+def _self_calibration_content(calibration: SelfCalibration) -> dict[str, Any]:
+    rows = [list(row) for row in calibration.covariance]
+    deviations = dict(zip(('scale_factor_error', 'bias'), calibration.standard_deviations))
+    return {**vars(calibration), 'covariance': rows, 'standard_deviations': deviations}
+
+
+def _term_content(term: Term) -> dict[str, Any]:
+    named = {parameter.name: value for parameter, value in zip(term.effect.parameters, term.values)}
+    if term.effect.name != POLYNOMIAL:
+        return named
+    temperature_order, rate_order = (int(text) for text in term.effect.coefficients[-1].name[1:].split('w'))
+    return {'orders': [rate_order, temperature_order], **named}
