@@ -147,7 +147,7 @@ class CompensationNode(Node):
         for name, callback in (('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
                                ('cancel_calibration', self._on_cancel), ('reset_heading', self._on_reset)):
             self.create_service(Trigger, name, callback, callback_group=group)
-        self._drive_timer = self.create_timer(0.05, self._drive)
+        self._drive_timer = self.create_timer(0.02, self._drive)
         self._drive_timer.cancel()  # it runs only while the robot is driven, for a wake-up costs as much as a sample
         self.create_timer(0.2, self._watch)
         self.create_timer(1.0, self._diagnose)
