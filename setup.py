@@ -13,7 +13,6 @@ jazzy = {
     'ros-rclpy[fastrtps]': '7.1.6',
     'ros-sensor-msgs': '5.3.6',
     'ros-geometry-msgs': '5.3.6',
-    'ros-nav-msgs': '5.3.6',
     'ros-std-msgs': '5.3.6',
     'ros-std-srvs': '5.3.6',
     'ros-diagnostic-msgs': '5.3.6',

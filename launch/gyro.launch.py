@@ -18,7 +18,7 @@ DRIVER = {
     'protocol': 'wire format of the gyro, for example kvh_dsp3000',
 }
 COMPENSATION = {
-    'model_file': 'model of the gyro, as `gyro_calibration fit` writes it',
+    'model_file': 'model of the gyro, see docs/error_model.md',
     'calibration_file': 'where the last self-calibration is kept',
     'profile_file': 'motion profile of the self-calibration',
 }

@@ -79,7 +79,7 @@ def test_colcon_installs_data_and_executables(source, tmp_path, options):
     prefix = tmp_path / 'install/gyro_calibration'
     assert not {file for file in expected_data() if not (prefix / file).is_file()}
     setup = f'. {tmp_path}/install/local_setup.sh && {prefix}/lib/gyro_calibration/gyro_calibration --help'
-    assert 'fit' in run('sh', '-c', setup, folder=tmp_path)
+    assert 'self-calibrate' in run('sh', '-c', setup, folder=tmp_path)
 
 
 def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
