@@ -97,6 +97,10 @@ def _positive(text: str) -> float:
     return value
 
 
+def _not_negative(text: str) -> float:
+    return 0.0 if float(text) == 0.0 else _positive(text)
+
+
 def _read_log(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, with its output in rad/s and, if it has a rate, its time."""
     log = read_log(given.log, None if given.sensitivity is None else given.sensitivity * DEGREE, given.rate)
@@ -119,45 +123,65 @@ def _add_compensate(verbs: Any) -> argparse.ArgumentParser:
     _add_log(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
-    parser.add_argument('--threshold', type=float, default=0.0, metavar='DPS',
+    parser.add_argument('--threshold', type=_not_negative, default=0.0, metavar='DPS',
                         help='a robot that turns slower stands, as 0.3 in the node; default: 0, off')
-    parser.add_argument('--window', type=float, default=0.2, metavar='S', help='of the threshold filter; 0 decides on single samples')
+    parser.add_argument('--window', type=_not_negative, default=0.2, metavar='S', help='of the threshold filter; 0 is single samples')
     return parser
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model), _read_log(given)
-    result = compensate(model, log.output, log.temperature)
-    temperature = model.reference_temperature if log.temperature is None else log.temperature
-    sensitivity = rate_sensitivity(model, log.output, result.rate, temperature)
-    variance = quadratic_form(covariance(model), sensitivity)
-    if log.time is not None:
-        variance = variance + model.noise.rate_variance(float(np.median(np.diff(log.time))))
-    columns = {'rate_rad_s': result.rate, 'rate_std_rad_s': np.sqrt(variance)}
-    if log.time is not None:
+    known = np.isfinite(log.output)
+    if not known.any():
+        raise CalibrationRefused(f'{given.log}: no output of the gyro is a number; record again')
+    time, temperature = (None if each is None else each[known] for each in (log.time, log.temperature))
+    columns = _compensated_columns(given, model, time, log.output[known], temperature)
+    write_log(given.out, log, {name: _at(known, values) for name, values in columns.items()})
+    return _compensated_answer(given, log, columns)
+
+
+def _compensated_columns(given: argparse.Namespace, model: GyroModel, time: Array | None, output: Array,
+                         temperature: Array | None) -> dict[str, Array]:
+    result, uncertainty = compensate(model, output, temperature), covariance(model)
+    sensitivity = rate_sensitivity(model, output, result.rate, result.temperature)
+    variance = quadratic_form(uncertainty, sensitivity)
+    columns = {'rate_rad_s': result.rate}
+    if time is not None:
+        variance = variance + model.noise.rate_variance(float(np.median(np.diff(time))))
         threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-        columns['rate_rad_s'] = filter_rates(threshold, log.time, result.rate)
+        columns['rate_rad_s'] = filter_rates(threshold, time, result.rate)
         columns['heading_rad'], columns['heading_std_rad'] = integrate_with_deviation(
-            log.time, result.rate, columns['rate_rad_s'], sensitivity, covariance(model), model.noise)
-    columns['temperature_clipped'] = np.broadcast_to(result.temperature_clipped, len(log))
+            time, result.rate, columns['rate_rad_s'], sensitivity, uncertainty, model.noise)
+    columns['rate_std_rad_s'] = np.sqrt(np.broadcast_to(variance, output.shape))
+    columns['temperature_clipped'] = np.broadcast_to(result.temperature_clipped, output.shape)
     columns['beyond_range'] = result.beyond_range
-    write_log(given.out, log, columns)
-    return _compensated(given, log, columns)
+    return columns
 
 
-def _compensated(given: argparse.Namespace, log: Log, columns: dict[str, Array]) -> Answer:
-    data: dict[str, Any] = {'out': given.out, 'rows': len(log), 'temperature_known': log.temperature is not None}
+def _at(known: Array, values: Array) -> Array:
+    """Return the values at the rows where the output is known, and nan at the others."""
+    whole = np.full(len(known), np.nan)
+    whole[known] = values
+    return whole
+
+
+def _compensated_answer(given: argparse.Namespace, log: Log, columns: dict[str, Array]) -> Answer:
+    data: dict[str, Any] = {'out': given.out, 'rows': len(log), 'rows_without_output': len(log) - len(columns['rate_rad_s']),
+                            'temperature_known': log.temperature is not None}
     data.update({name: int(columns[name].sum()) for name in ('temperature_clipped', 'beyond_range')})
     lines = [f'{len(log)} rows compensated by {given.model}, written to {given.out}.']
     if 'heading_rad' in columns:
-        data.update(heading_rad=float(columns['heading_rad'][-1]), heading_std_rad=float(columns['heading_std_rad'][-1]))
-        lines.append(f'Heading at the end: {data["heading_rad"] / DEGREE:.2f} +- {data["heading_std_rad"] / DEGREE:.2f} deg.')
+        heading, deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
+        data.update(heading_rad=heading, heading_std_rad=None if math.isnan(deviation) else deviation)
+        known = '' if math.isnan(deviation) else f' +- {deviation / DEGREE:.2f}'
+        lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if log.temperature is None:
         lines.append('The log holds no temperature: the model was used at its reference temperature.')
-    if data['temperature_clipped']:
-        lines.append(f'{data["temperature_clipped"]} rows are outside the calibrated temperatures; the nearest end was used.')
-    if data['beyond_range']:
-        lines.append(f'{data["beyond_range"]} rows are beyond the calibrated rates; the correction is extrapolated.')
+    for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
+                        ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),
+                        ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated.')):
+        if data[name]:
+            lines.append(f'{data[name]} {words}')
     return Answer('\n'.join(lines), data)
 
 
@@ -179,7 +203,7 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
     log = _read_log(given)
     motion = read_motion(given.profile) if given.profile else _reference(given, log)
     time = _timed(given, log) - log.time[0]
-    run = time <= motion.duration + 1.0
+    run = np.isfinite(log.output) & (time <= motion.duration + 1.0)
     rates = compensate(with_self_calibration(model, None), log.output, log.temperature).rate
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise)
     temperature = None if log.temperature is None else float(log.temperature[run].mean())
@@ -231,6 +255,8 @@ def _simulate(given: argparse.Namespace) -> Answer:
 
 def _simulated(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
+    if given.motion not in NAMED and not Path(given.motion).exists():
+        raise UsageError(f'{given.motion}: there is no such motion; name a file, or one of {", ".join(NAMED)}')
     motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
     return simulate(read_model(given.model), motion, given.sample_rate, np.random.default_rng(seed), given.temperature), seed
 

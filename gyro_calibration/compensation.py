@@ -21,6 +21,7 @@ class Compensated:
     ----------
     modelled : rate after the model and before the self-calibration, rad/s; what a self-calibration is made from
     rate : rad/s
+    temperature : that was used, degC
     temperature_clipped : the temperature is outside the calibrated range, and its nearest end was used
     beyond_range : the output is outside the calibrated range of rates
 
@@ -28,6 +29,7 @@ class Compensated:
 
     modelled: Number
     rate: Number
+    temperature: Number
     temperature_clipped: Number
     beyond_range: Number
 
@@ -48,7 +50,7 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     modelled = model.rate(output, used)
     slowest, fastest = model.rate_range
     rate = (model.self_calibration or _NONE).correct(modelled)
-    return Compensated(modelled, rate, used != given, (output < slowest) | (output > fastest))
+    return Compensated(modelled, rate, used, used != given, (output < slowest) | (output > fastest))
 
 
 def _clip(value: Number, low: float, high: float) -> Number:
@@ -75,10 +77,11 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
 
 
 def covariance(model: GyroModel) -> np.ndarray:
-    """Return the covariance of the uncertain values of a model in the order of `rate_sensitivity`, shape (m, m)."""
+    """Return the covariance of the uncertain values of a model in the order of `rate_sensitivity`, shape (m, m); nan is not known."""
     blocks = [] if model.covariance is None else [model.covariance]
     if model.self_calibration is not None:
-        blocks.append(np.array(model.self_calibration.covariance))
+        known = model.self_calibration.covariance
+        blocks.append(np.full((2, 2), np.nan) if known is None else np.array(known))
     size = sum(map(len, blocks))
     whole, start = np.zeros((size, size)), 0
     for block in blocks:

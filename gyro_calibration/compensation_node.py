@@ -236,11 +236,11 @@ class CompensationNode(Node):
         result = compensate(self._model, output, temperature)
         self._counts['temperature_clipped'] += int(result.temperature_clipped)
         self._counts['beyond_range'] += int(result.beyond_range)
-        if self._advance(time, float(result.rate), output, temperature):
+        if self._advance(time, float(result.rate), output, result.temperature):
             self._collect(time, float(result.modelled), temperature)
             self._publish(message.header)
 
-    def _advance(self, time: float, rate: float, output: float, temperature: float | None) -> bool:
+    def _advance(self, time: float, rate: float, output: float, temperature: float) -> bool:
         """Take the heading on to this sample; return whether the sample counts."""
         if time == self._last_time:
             self._counts['stamps_ignored'] += 1
@@ -253,8 +253,7 @@ class CompensationNode(Node):
             self._filter.clear()
         self._last_time, self._last_heard = time, self._now()
         self._rate = self._filter.filter(time, rate)
-        degc = self._model.reference_temperature if temperature is None else temperature
-        self._sensitivity = rate_sensitivity(self._model, output, rate, degc)
+        self._sensitivity = rate_sensitivity(self._model, output, rate, temperature)
         self._note(self._heading.add(time, rate, self._rate, self._sensitivity))
         return True
 
@@ -264,7 +263,7 @@ class CompensationNode(Node):
             return
         self._counts['restarts'] += 1
         self._events = f'{restarted}: integration began anew'
-        if self._run:
+        if self._run and self._run.times:
             self._run.end(f"{restarted}: look at the gyro's line and run again")
 
     def _collect(self, time: float, modelled: float, temperature: float | None) -> None:
@@ -284,10 +283,13 @@ class CompensationNode(Node):
 
     def _set_covariances(self, imu: Imu) -> None:
         """Set both covariances; all zeros, unknown, where the noise of the gyro is not known or its model could not be read."""
-        noise = self._model.noise
+        noise, variances = self._model.noise, (0.0, 0.0)
         known = noise.angle_random_walk > 0.0 and not self._problem and self._interval < math.inf
-        rate_variance = noise.rate_variance(self._interval) + float(quadratic_form(self._covariance, self._sensitivity)) if known else 0.0
-        for matrix, variance in ((imu.angular_velocity_covariance, rate_variance), (imu.orientation_covariance, self._heading.variance)):
+        if known:
+            calibration = float(quadratic_form(self._covariance, self._sensitivity))
+            variances = (noise.rate_variance(self._interval) + calibration, self._heading.variance)
+            known = math.isfinite(sum(variances))  # a calibration whose covariance is not known gives nan
+        for matrix, variance in zip((imu.angular_velocity_covariance, imu.orientation_covariance), variances):
             matrix[0] = matrix[4] = UNMEASURED_VARIANCE if known else 0.0
             matrix[8] = variance if known else 0.0
 
@@ -345,7 +347,7 @@ class CompensationNode(Node):
         """Return the last calibration with the bias of a run at rest (Ojeda et al., eq. 16)."""
         bias, deviation = calibrate_bias(times, rates, self._limits(), self._model.noise)
         last = self._model.self_calibration or SelfCalibration()
-        variances = ((last.covariance[0][0], 0.0), (0.0, deviation ** 2))
+        variances = last.covariance and ((last.covariance[0][0], 0.0), (0.0, deviation ** 2))
         return SelfCalibration(last.scale_factor_error, bias, variances, when, temperature, 'rest')
 
     def _answer(self, response: Trigger.Response, success: bool, message: str) -> Trigger.Response:

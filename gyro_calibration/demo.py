@@ -40,6 +40,7 @@ from gyro_calibration.picture import draw_headings
 from gyro_calibration.protocols import Sample, find
 
 PROTOCOL = 'kvh_dsp3000'
+NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
 INTERVAL = 0.01  # s between samples
 ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20), (4, 0), (1, 0)])
@@ -99,7 +100,7 @@ class Client:
         """Subscribe; the robot hears ``cmd_vel`` from now on."""
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
-        self._node = rclpy.create_node('demonstration')
+        self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
         self._node.create_subscription(Imu, 'imu/data_raw', lambda m: self.raw.append((_seconds(m), m.angular_velocity.z)), SENSOR_QUALITY)
         self._node.create_subscription(Imu, 'imu/data', lambda m: self.headings.append((_seconds(m), _yaw(m))), SENSOR_QUALITY)
         self._node.create_subscription(Twist, 'cmd_vel', lambda m: setattr(robot, 'command', m.angular.z), 10)
@@ -154,7 +155,7 @@ def _yaw(message: Imu) -> float:
 def _process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, '--log-level', 'error'])
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, '-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error'])
     try:
         yield
     finally:

@@ -38,7 +38,7 @@ class SelfCalibration:
     ----------
     scale_factor_error : s, 1
     bias : b, rad/s
-    covariance : of (s, b), shape (2, 2)
+    covariance : of (s, b), shape (2, 2); None where it is not known
     time : when, ISO 8601
     temperature : at which, degC; None where it was not known
     method : likelihood, heading, rate or rest
@@ -47,7 +47,7 @@ class SelfCalibration:
 
     scale_factor_error: float = 0.0
     bias: float = 0.0
-    covariance: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+    covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
     time: str = ''
     temperature: float | None = None
     method: str = ''
@@ -64,7 +64,9 @@ class SelfCalibration:
 
     @property
     def standard_deviations(self) -> tuple[float, float]:
-        """Return those of s and b, 1 and rad/s."""
+        """Return those of s and b, 1 and rad/s; nan where they are not known."""
+        if self.covariance is None:
+            return math.nan, math.nan
         return math.sqrt(self.covariance[0][0]), math.sqrt(self.covariance[1][1])
 
     def correct(self, rate: Number) -> Number:
@@ -72,18 +74,19 @@ class SelfCalibration:
         return self.scale * rate + self.offset
 
     def figures(self) -> dict[str, Any]:
-        """Return what there is to know, by name, in SI."""
-        scale_deviation, bias_deviation = self.standard_deviations
+        """Return what there is to know, by name, in SI; None for what is not known."""
+        scale_deviation, bias_deviation = (None if math.isnan(value) else value for value in self.standard_deviations)
         return {'scale_factor_error': self.scale_factor_error, 'scale_factor_error_standard_deviation': scale_deviation,
                 'bias': self.bias, 'bias_standard_deviation': bias_deviation, 's_bar': self.scale, 'b_bar': self.offset,
                 'calibration_time': self.time, 'calibration_temperature': self.temperature, 'method': self.method}
 
     def __str__(self) -> str:
         """Return a sentence for people."""
-        scale_deviation, bias_deviation = self.standard_deviations
+        known = self.covariance is not None
+        scale, bias = (f' +- {deviation:.{digits}f}' if known else '' for deviation, digits in zip(
+            (100 * self.standard_deviations[0], self.standard_deviations[1] / DEGREE), (3, 4)))
         temperature = '' if self.temperature is None else f' at {self.temperature:.1f} degC'
-        return (f'scale factor error {100 * self.scale_factor_error:.3f} +- {100 * scale_deviation:.3f} %, '
-                f'bias {self.bias / DEGREE:.4f} +- {bias_deviation / DEGREE:.4f} deg/s '
+        return (f'scale factor error {100 * self.scale_factor_error:.3f}{scale} %, bias {self.bias / DEGREE:.4f}{bias} deg/s '
                 f'(s_bar {self.scale:.6f}, b_bar {self.offset:.6f} rad/s){temperature}')
 
 

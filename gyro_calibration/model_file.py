@@ -194,14 +194,17 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
         _text(f'{place}.method', given.get('method', '')))
 
 
-def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Read the covariance of (s, b), or else their standard deviations."""
+def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Read the covariance of (s, b), or else their standard deviations; without both it is not known."""
     if 'covariance' in given:
         (a, b), (_, c) = _matrix(f'{place}.covariance', given['covariance'], 2).tolist()
         return (a, b), (b, c)
-    named = _mapping(f'{place}.standard_deviations', given.get('standard_deviations', {}))
-    _only(f'{place}.standard_deviations', named, ('scale_factor_error', 'bias'))
-    s, b = (_number(f'{place}.standard_deviations.{name}', named.get(name, 0.0), low=0.0) for name in ('scale_factor_error', 'bias'))
+    if 'standard_deviations' not in given:
+        return None
+    place, names = f'{place}.standard_deviations', ('scale_factor_error', 'bias')
+    named = _mapping(place, given['standard_deviations'])
+    _only(place, named, names)
+    s, b = (_number(f'{place}.{name}', named.get(name), low=0.0) for name in names)
     return (s * s, 0.0), (0.0, b * b)
 
 
@@ -227,9 +230,11 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
 
 
 def _self_calibration_content(calibration: SelfCalibration) -> dict[str, Any]:
-    rows = [list(row) for row in calibration.covariance]
-    deviations = dict(zip(('scale_factor_error', 'bias'), calibration.standard_deviations))
-    return {**vars(calibration), 'covariance': rows, 'standard_deviations': deviations}
+    content = dict(vars(calibration))
+    if content.pop('covariance') is not None:
+        content['covariance'] = [list(row) for row in calibration.covariance]
+        content['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'), calibration.standard_deviations))
+    return content
 
 
 def _term_content(term: Term) -> dict[str, Any]:

@@ -511,5 +511,6 @@ def _refuse_shaking(time: Array, rate: Array, noise: Noise) -> None:
 
 def record(fit: Fit, method: str, time: str, temperature: float | None) -> SelfCalibration:
     """Return what a model keeps of a fit."""
-    (a, b), (_, c) = np.nan_to_num(fit.covariance).tolist()
-    return SelfCalibration(fit.scale_factor_error, fit.bias, ((a, b), (b, c)), time, temperature, method)
+    (a, b), (_, c) = fit.covariance.tolist()
+    covariance = None if math.isnan(a) else ((a, b), (b, c))
+    return SelfCalibration(fit.scale_factor_error, fit.bias, covariance, time, temperature, method)

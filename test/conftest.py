@@ -3,6 +3,8 @@ Fixtures for tests with real ROS 2 processes: kept on this machine, apart from e
 
 """
 
+import contextlib
+import fcntl
 import os
 import random
 import shutil
@@ -90,7 +92,20 @@ def data():
 def ros_domain(monkeypatch):
     """Keep the ROS traffic of a test apart from all others; skip where ROS 2 is missing."""
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(random.SystemRandom().randint(1, 101)))
+    with _free_domain() as number:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
+        yield number
+
+
+@contextlib.contextmanager
+def _free_domain():
+    """Give a domain that no other run of these tests on this machine uses meanwhile: each holds the lock of its own."""
+    for number in random.SystemRandom().sample(range(1, 102), 101):
+        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock, contextlib.suppress(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield number
+            return
+    pytest.fail('all ROS domains from 1 to 101 are taken by other runs of these tests')
 
 
 class NodeProcess:

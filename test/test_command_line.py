@@ -103,7 +103,7 @@ def test_what_the_data_do_not_allow_ends_with_1_and_one_sentence(run, tmp_path):
 @pytest.mark.parametrize('words, said', [
     (['compensate', 'missing.csv', '--model', 'MODEL', '--out', 'x.csv'], 'missing.csv: cannot be read'),
     (['compensate', 'LOG', '--model', 'missing.yaml', '--out', 'x.csv'], 'missing.yaml: there is no such file'),
-    (['simulate', '--model', 'MODEL', '--motion', 'waltz', '--out', 'x.csv'], 'waltz: cannot be read as a motion profile'),
+    (['simulate', '--model', 'MODEL', '--motion', 'waltz', '--out', 'x.csv'], 'waltz: there is no such motion'),
     (['emulate', '--protocol', 'morse', '--model', 'MODEL'], "protocol 'morse' is not known"),
     (['emulate', '--protocol', 'razor', '--model', 'MODEL'], 'razor is planned'),
     (['dance'], 'invalid choice'),
@@ -164,3 +164,20 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
     assert (folder / 'heading.png').read_bytes().startswith(b'\x89PNG')
     assert 'Hong and Park' in (folder / 'table.md').read_text()
     assert len(read_log(folder / 'log.csv')) > 4000
+
+
+def test_rows_without_output_are_said_and_do_not_spoil_the_heading(run, model, tmp_path):
+    rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]  # 0.002 rad/s, the bias
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},{row}\n' for i, row in enumerate(rows)))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model, '--out', tmp_path / 'out.csv', '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['rows_without_output'] == 5 and abs(answer['heading_rad']) < 1e-12
+    assert read_log(tmp_path / 'out.csv').others['rate_rad_s'][22] == 'nan'
+
+
+def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_path):
+    code, text, _ = run('self-calibrate', log, '--method', 'rate', '--out', tmp_path / 'new.yaml')
+    assert code == 0 and '+-' not in text
+    assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
+    assert run('compensate', log, '--model', tmp_path / 'new.yaml', '--out', tmp_path / 'out.csv')[0] == 0
+    assert read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1] == 'nan'

@@ -201,8 +201,9 @@ def test_models_compensate_alike_whatever_their_self_calibration():
 
 def test_a_person_may_give_the_standard_deviations_of_a_self_calibration_alone(tmp_path):
     path = tmp_path / 'model.yaml'
-    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, standard_deviations: {bias: 0.003}}')
-    assert read_model(path).self_calibration.standard_deviations == (0.0, pytest.approx(0.003))
+    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, standard_deviations: '
+                    '{bias: 0.003, scale_factor_error: 0.002}}')
+    assert read_model(path).self_calibration.standard_deviations == pytest.approx((0.002, 0.003))
 
 
 def test_a_written_self_calibration_shows_its_standard_deviations(tmp_path):

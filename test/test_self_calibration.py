@@ -160,7 +160,7 @@ def lagging(constant):
     return np.array(rates[::10])
 
 
-SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (4, 30), (4, -30), (1, 0)], ramp=0.7).rate_at(TIME)
+SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)], ramp=0.7).rate_at(TIME)
 ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1), 'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
           'ramps of 0.7 instead of 0.5 s': (SOFT, 0.5)}
 
