@@ -155,7 +155,8 @@ def _yaw(message: Imu) -> float:
 def _process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, '-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error'])
+    quiet = ['-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error']
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, *quiet])
     try:
         yield
     finally:
