@@ -108,17 +108,26 @@ class _Pairing:
         return self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
 
     def coarse_offset(self, largest: float) -> float:
-        """Return the offset, s, at which the two headings fit best by plain least squares."""
+        """Return the offset, s, at which most increments fit; a slip does not count more than the blocks that it is in."""
         offsets = np.arange(-round(largest / 0.02), round(largest / 0.02) + 1) * 0.02
         return float(min(offsets, key=lambda offset: (self._misfit(offset), abs(offset))))
 
     def _misfit(self, offset: float) -> float:
-        known = self._known(offset)
-        if len(known) < 10:
+        data = self.increments(offset)
+        if len(data.turned) < 10:
             return math.inf
-        known = known - known.mean(axis=0)
-        q = np.linalg.lstsq(known[:, :2], known[:, 3], rcond=None)[0]
-        return float(np.mean((known[:, 3] - known[:, :2] @ q) ** 2))
+        return float(np.mean(np.abs(_robust_residual(data.columns[:, :2], data.turned, 3))))
+
+
+def _robust_residual(columns: Array, turned: Array, passes: int) -> Array:
+    """Return what is left of a fit in which large residuals count by their size, not by its square (Huber)."""
+    weights = np.ones(len(turned))
+    for _ in range(passes):
+        weighted = weights[:, None] * columns
+        residual = turned - columns @ np.linalg.lstsq(weighted.T @ columns, weighted.T @ turned, rcond=1e-14)[0]
+        size = np.abs(residual)
+        weights = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-12))
+    return residual
 
 
 def _encoder_step(heading: Array) -> float:
@@ -273,18 +282,19 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
     scale, bias = estimate.values[:2]
     return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
-               math.sqrt(estimate.rate_variance * noise.ratio) / abs(_away_from_zero(scale)), _worst_stretch(noise, estimate))
+               math.sqrt(estimate.rate_variance * noise.ratio) / abs(_away_from_zero(scale)), _worst_stretch(noise, data))
 
 
-def _worst_stretch(noise: _Covariance, estimate: _Estimate) -> tuple[float, float]:
+def _worst_stretch(noise: _Covariance, data: _Increments) -> tuple[float, float]:
     """
     Return the largest stretch of the run that turned otherwise than the profile beyond chance, rad, and its size in standard deviations.
 
-    All stretches of a few lengths are looked at; the scale is the median's, so that the stretch does not hide itself.
+    All stretches of a few lengths are looked at. Fit and scale are robust, so that a slip does not hide itself.
 
     """
-    whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(estimate.residual))])
-    turned = np.concatenate([[0.0], np.cumsum(estimate.residual)])
+    residual = _robust_residual(data.columns, data.turned, 20)
+    whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(residual))])
+    turned = np.concatenate([[0.0], np.cumsum(residual)])
     scale = max(float(np.median(np.abs(np.diff(whitened)))) / 0.6745, 1e-15)
     worst = (0.0, 0.0)
     for length in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000):
