@@ -1,0 +1,271 @@
+"""
+What the nodes cost: the compensation node beside a bare relay of the same messages, and the driver on a gyro.
+
+    python benchmarks/node_latency.py
+
+This process publishes ``imu/data_raw`` and waits for ``imu/data``, now from the compensation node, now from a relay that publishes each
+message as it comes. The two alternate in blocks, so that whatever else the machine does meets both; a row shows the medians of the blocks
+and the median of their ratios. Latency is counted from before the publish here until the message is taken here, so both hops are in it.
+The relay publishes one message a sample, the node three: corrected rates, yaw rate and heading. All three have a subscriber.
+
+Then the driver reads an emulated DSP-3000 on a pseudo-terminal. It takes 80 s in all, needs two idle cores, and nothing leaves the machine.
+
+"""
+
+import itertools
+import math
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from sensor_msgs.msg import Imu, Temperature
+from std_msgs.msg import Float64
+
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, rate_temperature_polynomial
+from gyro_calibration.emulator import Emulator
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model_file import write_model
+from gyro_calibration.node import SENSOR_QUALITY
+from gyro_calibration.noise import Noise
+from gyro_calibration.protocols import Sample, find
+
+RATES = (100, 1000)  # Hz
+ROUNDS = 4
+BLOCK = 4.0  # s
+COMMANDS = {
+    'relay': [sys.executable, __file__, 'relay'],
+    'node': [sys.executable, '-m', 'gyro_calibration.compensation_node'],
+    'driver': [sys.executable, '-m', 'gyro_calibration.driver_node'],
+}
+COMPARED = ('relay', 'node')
+
+
+@dataclass(frozen=True)
+class Block:
+    """
+    What one subject did at one rate.
+
+    Attributes
+    ----------
+    latencies : of the messages that came back, ms
+    sent : number of messages
+    load : processor time of the subject's process, % of a core
+
+    """
+
+    latencies: list[float]
+    sent: int
+    load: float
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages never came back."""
+        return self.sent - len(self.latencies)
+
+
+def relay() -> None:
+    """Publish each message as it comes, run as most nodes in Python are."""
+    rclpy.init(args=sys.argv)
+    node = rclpy.create_node('relay')
+    publisher = node.create_publisher(Imu, 'imu/data', SENSOR_QUALITY)
+    node.create_subscription(Imu, 'imu/data_raw', publisher.publish, SENSOR_QUALITY)
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
+
+
+def model() -> GyroModel:
+    """Return the model of a good fibre-optic gyro from a rate table, with all that the node can be asked to compute."""
+    polynomial = rate_temperature_polynomial(3, 2)
+    coefficients = 1e-4 * np.random.default_rng(1).standard_normal(len(polynomial.coefficients))
+    terms = (Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(polynomial, (0.0, 1.7, 20.0, 30.0, *coefficients.tolist())))
+    noise = Noise(angle_random_walk=2.4e-5, bias_instability=5e-6, rate_random_walk=1e-7)
+    return GyroModel(terms, 1e-12 * np.eye(2 + len(coefficients)), (-100 * DEGREE, 100 * DEGREE), (-10.0, 50.0), noise=noise,
+                     self_calibration=SelfCalibration(0.002, 1e-4, ((1e-8, 0.0), (0.0, 1e-12))))
+
+
+@contextmanager
+def running(name: str, folder: Path, **parameters: object) -> Iterator[int]:
+    """Run a subject in a namespace of its name, and give its process number."""
+    given = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
+    with open(folder / f'{name}.txt', 'wb') as output:
+        process = subprocess.Popen([*COMMANDS[name], '--ros-args', '-r', f'__ns:=/{name}', *given],
+                                   stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+    try:
+        yield process.pid
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def processor_time(process: int) -> float:
+    """Return what a process has used so far, s; by the clock of clock_getcpuclockid(3), which is finer than the ticks in /proc."""
+    return time.clock_gettime(~process << 3 | 2)
+
+
+class Probe:
+    """Sends samples to a subject and notes when they come back."""
+
+    def __init__(self, subject: str, process: int):
+        self._subject, self._process = subject, process
+        self._node = rclpy.create_node('probe', namespace=subject)
+        self._imu = self._node.create_publisher(Imu, 'imu/data_raw', SENSOR_QUALITY)
+        self._temperature = self._node.create_publisher(Temperature, 'imu/temperature', SENSOR_QUALITY)
+        self._subscription = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QUALITY).handle
+        self._wait_set = implementation.WaitSet(1, 0, 0, 0, 0, 0, self._node.context.handle)
+        self._listen_idly()
+        self._message = Imu()
+        self._begin = 0
+        self._latencies: list[float] = []
+
+    def _listen_idly(self) -> None:
+        """Have the other messages sent as well, but take no time here to read them: nobody serves these subscriptions."""
+        self._listener = rclpy.create_node('listener', namespace=self._subject)
+        for topic in ('yaw_rate', 'heading'):
+            self._listener.create_subscription(Float64, topic, print, SENSOR_QUALITY)
+
+    def wait_for_subject(self) -> None:
+        """
+        Send samples until they come back.
+
+        Raises
+        ------
+        TimeoutError : nothing came back within 20 s
+
+        """
+        deadline = time.monotonic() + 20.0
+        while len(self._latencies) < 50:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f'the {self._subject} does not answer: is the package installed for {sys.executable}?')
+            self._send(0.0)
+            self._serve_until(time.monotonic() + 0.02)
+
+    def measure(self, rate: int) -> Block:
+        """Send the samples of one block, half of them at rest and half in motion."""
+        self._latencies, self._begin = [], time.monotonic_ns()
+        self._send_temperature()
+        begin, used, count = time.monotonic(), processor_time(self._process), round(BLOCK * rate)
+        for index in range(count):
+            self._serve_until(begin + index / rate)
+            self._send(max(0.0, math.sin(math.pi * index / rate)))
+        self._serve_until(begin + BLOCK)
+        load = 100.0 * (processor_time(self._process) - used) / (time.monotonic() - begin)
+        late = time.monotonic() + 1.0
+        while len(self._latencies) < count and time.monotonic() < late:
+            self._serve_until(time.monotonic() + 0.01)
+        return Block(self._latencies, count, load)
+
+    def _serve_until(self, due: float) -> None:
+        # Waiting as `rclpy.wait_for_message` does it: an executor would need as much time here as the relay needs in all.
+        while (left := due - time.monotonic()) > 0.0:
+            self._wait_set.clear_entities()
+            self._wait_set.add_subscription(self._subscription)
+            self._wait_set.wait(round(1e9 * left))
+            while taken := self._subscription.take_message(Imu, False):
+                self._receive(taken[0])
+
+    def _stamp(self, message: Imu | Temperature) -> None:
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.monotonic_ns(), 1_000_000_000)
+
+    def _send(self, rate: float) -> None:
+        self._message.angular_velocity.z = rate
+        self._stamp(self._message)
+        self._imu.publish(self._message)
+
+    def _send_temperature(self) -> None:
+        message = Temperature(temperature=31.0)
+        self._stamp(message)
+        self._temperature.publish(message)
+
+    def _receive(self, message: Imu) -> None:
+        sent = 1_000_000_000 * message.header.stamp.sec + message.header.stamp.nanosec
+        if sent >= self._begin:
+            self._latencies.append(1e-6 * (time.monotonic_ns() - sent))
+
+
+def compare(folder: Path) -> dict[str, dict[int, list[Block]]]:
+    """Return the blocks of relay and node, by subject and rate."""
+    write_model(folder / 'model.yaml', model())
+    parameters = {'relay': {}, 'node': {'model_file': folder / 'model.yaml', 'calibration_file': folder / 'calibration.yaml'}}
+    blocks = {name: {rate: [] for rate in RATES} for name in COMPARED}
+    with ExitStack() as stack:
+        probes = {name: Probe(name, stack.enter_context(running(name, folder, **parameters[name]))) for name in COMPARED}
+        for probe in probes.values():
+            probe.wait_for_subject()
+        for turn, rate in itertools.product(range(ROUNDS), RATES):
+            for name in COMPARED[::-1] if turn % 2 else COMPARED:
+                blocks[name][rate].append(probes[name].measure(rate))
+    return blocks
+
+
+def driver_load(rate: int, folder: Path) -> float:
+    """Return the load of the driver, % of a core, at a rate of the gyro."""
+    samples = (Sample(0.5, None, index / rate) for index in itertools.count())
+    with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro, running('driver', folder, port=gyro.path) as process:
+        while not gyro.sent_bytes:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        begin, used = time.monotonic(), processor_time(process)
+        time.sleep(BLOCK)
+        return 100.0 * (processor_time(process) - used) / (time.monotonic() - begin)
+
+
+FIGURES = {
+    'median latency, ms': lambda block: statistics.median(block.latencies),
+    '99th percentile of the latency, ms': lambda block: float(np.percentile(block.latencies, 99)),
+    'load, % of a core': lambda block: block.load,
+}
+
+
+def table(blocks: dict[str, dict[int, list[Block]]]) -> Iterator[str]:
+    """Yield the lines of the comparison in Markdown."""
+    yield '| rate | figure | relay | compensation_node | ratio |'
+    yield '|---:|:---|---:|---:|---:|'
+    for rate in RATES:
+        for title, figure in FIGURES.items():
+            relays, nodes = ([figure(block) for block in blocks[name][rate]] for name in COMPARED)
+            ratio = statistics.median(node / relay for relay, node in zip(relays, nodes))
+            yield f'| {rate} Hz | {title} | {statistics.median(relays):.2f} | {statistics.median(nodes):.2f} | {ratio:.2f} |'
+        lost = ' | '.join(_lost(blocks[name][rate]) for name in COMPARED)
+        yield f'| {rate} Hz | lost messages | {lost} | |'
+
+
+def _lost(blocks: list[Block]) -> str:
+    return f'{sum(block.lost for block in blocks)} of {sum(block.sent for block in blocks)}'
+
+
+def main() -> None:
+    """Measure and print, apart from all other ROS 2 programs."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+        os.environ.update(ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                          FASTDDS_BUILTIN_TRANSPORTS='UDPv4', ROS_LOG_DIR=folder)
+        rclpy.init()
+        try:
+            print(f'{os.cpu_count()} cores, of which others used {os.getloadavg()[0]:.1f} in the minute before\n')
+            print('\n'.join(table(compare(Path(folder)))))
+            for rate in RATES:
+                print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, Path(folder)):.1f} % of a core')
+        finally:
+            rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    relay() if sys.argv[1:2] == ['relay'] else main()
