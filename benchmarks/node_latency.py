@@ -259,7 +259,7 @@ def main() -> None:
                           FASTDDS_BUILTIN_TRANSPORTS='UDPv4', ROS_LOG_DIR=folder)
         rclpy.init()
         try:
-            print(f'{os.cpu_count()} cores, of which others used {os.getloadavg()[0]:.1f} in the minute before\n')
+            print(f'{os.cpu_count()} cores; load average of the minute before: {os.getloadavg()[0]:.1f}\n')
             print('\n'.join(table(compare(Path(folder)))))
             for rate in RATES:
                 print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, Path(folder)):.1f} % of a core')
