@@ -16,14 +16,13 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 test demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
 
-.PHONY: test types demo build clean
+.PHONY: test demo build clean
 
-# ruff does not keep pytest from running, so that one run says everything
+# what ruff and mypy find does not keep pytest from running, so that one run says everything
 test: $(INSTALLED)
-	@$(BIN)/python -m ruff check --quiet --output-format concise .; checked=$$?; $(BIN)/python -m pytest && exit $$checked
-
-types: $(INSTALLED)
-	@$(BIN)/python -m mypy --ignore-missing-imports gyro_calibration
+	@$(BIN)/python -m ruff check --quiet --output-format concise .; style=$$?; \
+	$(BIN)/python -m mypy --no-error-summary gyro_calibration; types=$$?; \
+	$(BIN)/python -m pytest && exit $$((style + types))
 
 demo: $(INSTALLED)
 	@$(BIN)/gyro_calibration demo --out demo

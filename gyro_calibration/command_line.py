@@ -102,11 +102,15 @@ def _not_negative(text: str) -> float:
 
 
 def _read_log(given: argparse.Namespace) -> Log:
-    """Read the log that a verb was given, with its output in rad/s and, if it has a rate, its time."""
+    """Read the log that a verb was given, as its options say."""
     log = read_log(given.log, None if given.sensitivity is None else given.sensitivity * DEGREE, given.rate)
+    return replace(log, output=-_output(given, log)) if given.invert else log
+
+
+def _output(given: argparse.Namespace, log: Log) -> Array:
     if log.output is None:
         raise UsageError(f'{given.log}: holds gyro_counts alone; say with --sensitivity how many deg/s a count is')
-    return replace(log, output=-log.output) if given.invert else log
+    return log.output
 
 
 def _timed(given: argparse.Namespace, log: Log) -> Array:
@@ -131,11 +135,12 @@ def _add_compensate(verbs: Any) -> argparse.ArgumentParser:
 
 def _compensate(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model), _read_log(given)
-    known = np.isfinite(log.output)
+    output = _output(given, log)
+    known = np.isfinite(output)
     if not known.any():
         raise CalibrationRefused(f'{given.log}: no output of the gyro is a number; record again')
     time, temperature = (None if each is None else each[known] for each in (log.time, log.temperature))
-    columns = _compensated_columns(given, model, time, log.output[known], temperature)
+    columns = _compensated_columns(given, model, time, output[known], temperature)
     write_log(given.out, log, {name: _at(known, values) for name, values in columns.items()})
     return _compensated_answer(given, log, columns)
 
@@ -201,10 +206,11 @@ def _add_self_calibrate(verbs: Any) -> argparse.ArgumentParser:
 def _self_calibrate(given: argparse.Namespace) -> Answer:
     model = read_model(given.model) if given.model else GyroModel()
     log = _read_log(given)
-    motion = read_motion(given.profile) if given.profile else _reference(given, log)
-    time = _timed(given, log) - log.time[0]
-    run = np.isfinite(log.output) & (time <= motion.duration + 1.0)
-    rates = compensate(with_self_calibration(model, None), log.output, log.temperature).rate
+    time, output = _timed(given, log), _output(given, log)
+    motion, begin = (read_motion(given.profile), time[0]) if given.profile else _reference(given, log, time)
+    time = time - begin
+    run = np.isfinite(output) & (time >= -1.0) & (time <= motion.duration + 1.0)
+    rates = compensate(with_self_calibration(model, None), output, log.temperature).rate
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise)
     temperature = None if log.temperature is None else float(log.temperature[run].mean())
     calibration = record(fit, given.method, datetime.now(timezone.utc).isoformat(timespec='seconds'), temperature)
@@ -217,14 +223,14 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
 
 
-def _reference(given: argparse.Namespace, log: Log) -> Motion:
-    """Return the motion that the reference of a log shows."""
+def _reference(given: argparse.Namespace, log: Log, time: Array) -> tuple[Motion, float]:
+    """Return the motion that the reference of a log shows, and when by the log's time it begins, s."""
     for values, motion in ((log.reference_heading, from_headings), (log.reference_rate, from_rates)):
         if values is not None:
-            known, time = np.isfinite(values), _timed(given, log) - log.time[0]
+            known = np.isfinite(values)
             if known.sum() < 2:
                 raise CalibrationRefused(f'{given.log}: the reference is lost nearly everywhere; give the motion by --profile')
-            return motion(time[known], values[known])
+            return motion(time[known], values[known]), float(time[known][0])
     raise UsageError(f'{given.log}: holds no reference; give the motion by --profile')
 
 
@@ -248,9 +254,10 @@ def _add_simulate(verbs: Any) -> argparse.ArgumentParser:
 
 def _simulate(given: argparse.Namespace) -> Answer:
     log, seed = _simulated(given)
+    duration = float(_timed(given, log)[-1])
     write_log(given.out, replace(log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
-    data = {'out': given.out, 'rows': len(log), 'duration_s': float(log.time[-1]), 'seed': seed}
-    return Answer(f'{len(log)} samples over {log.time[-1]:g} s, seed {seed}, written to {given.out}.', data)
+    data = {'out': given.out, 'rows': len(log), 'duration_s': duration, 'seed': seed}
+    return Answer(f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.', data)
 
 
 def _simulated(given: argparse.Namespace) -> tuple[Log, int]:
@@ -286,8 +293,8 @@ def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since the answer of this verb is what goes on until it ends."""
     protocol, settings = _wire(given)
     log = _read_log(given) if given.log else _simulated(given)[0]
-    _timed(given, log)
-    emulator = Emulator(protocol, _samples(log, given.repeat), settings, given.speed, given.link, given.wait)
+    samples = _samples(_timed(given, log), _output(given, log), log.temperature, given.repeat)
+    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
     try:
         emulate(emulator, lambda path: print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else path, flush=True))
@@ -310,10 +317,11 @@ def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     return protocol, settings
 
 
-def _samples(log: Log, again: bool) -> Iterator[Sample]:
-    """Give the samples of a log, and all of them again and again where that is wanted."""
-    times, outputs = log.time - log.time[0], log.output.tolist()
-    temperatures = repeat(None) if log.temperature is None else log.temperature.tolist()
+def _samples(time: Array, output: Array, temperature: Array | None, again: bool) -> Iterator[Sample]:
+    """Give the samples of a log that have an output, and all of them again and again where that is wanted."""
+    known = np.isfinite(output)
+    times, outputs = time[known] - time[known][0], output[known].tolist()
+    temperatures = repeat(None) if temperature is None else temperature[known].tolist()
     length = float(times[-1] + np.median(np.diff(times)))
     for start in chain([0.0], (length * number for number in range(1, sys.maxsize if again else 1))):
         yield from (Sample(output, temperature, start + time) for time, output, temperature in zip(times.tolist(), outputs, temperatures))

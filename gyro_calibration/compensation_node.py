@@ -383,7 +383,7 @@ class CompensationNode(Node):
 
     def _drive(self) -> None:
         """Command what the profile wants now; the robot moves only while samples come."""
-        if not self._run or not self._run.times:
+        if not self._run or not self._run.motion or not self._run.times:
             return
         now = self._run.elapsed + self._now() - self._run.heard
         command = Twist()
@@ -411,7 +411,7 @@ class CompensationNode(Node):
     def _show_state(self) -> None:
         """Publish the latched state of the calibration."""
         level, message = self._state()
-        values = {'calibrated': self._model.self_calibration is not None, 'running': self._run is not None}
+        values: dict[str, object] = {'calibrated': self._model.self_calibration is not None, 'running': self._run is not None}
         if self._run:
             values['progress'] = f'{min(self._run.elapsed / self._run.duration, 1.0):.2f}'
         if self._model.self_calibration:

@@ -74,6 +74,10 @@ class Robot:
     command: float = 0.0
     truth: list[tuple[float, float]] = field(default_factory=list)
 
+    def obey(self, message: Twist) -> None:
+        """Turn from now on as commanded."""
+        self.command = message.angular.z
+
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
         rate, heading, begin = 0.0, 0.0, time.monotonic()
@@ -101,15 +105,21 @@ class Client:
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', lambda m: self.raw.append((_seconds(m), m.angular_velocity.z)), SENSOR_QUALITY)
-        self._node.create_subscription(Imu, 'imu/data', lambda m: self.headings.append((_seconds(m), _yaw(m))), SENSOR_QUALITY)
-        self._node.create_subscription(Twist, 'cmd_vel', lambda m: setattr(robot, 'command', m.angular.z), 10)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._hear_raw, SENSOR_QUALITY)
+        self._node.create_subscription(Imu, 'imu/data', self._hear_heading, SENSOR_QUALITY)
+        self._node.create_subscription(Twist, 'cmd_vel', robot.obey, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
+
+    def _hear_raw(self, message: Imu) -> None:
+        self.raw.append((_seconds(message), message.angular_velocity.z))
+
+    def _hear_heading(self, message: Imu) -> None:
+        self.headings.append((_seconds(message), _yaw(message)))
 
     def _spin(self) -> None:
         while not self._stop.is_set():

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gyro_calibration.files import write_atomically
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0

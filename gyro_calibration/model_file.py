@@ -40,7 +40,8 @@ def read_model(path: str | Path) -> GyroModel:
     except FileNotFoundError:
         raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        place = f'line {error.problem_mark.line + 1}: ' if getattr(error, 'problem_mark', None) else ''
+        mark = getattr(error, 'problem_mark', None)
+        place = f'line {mark.line + 1}: ' if mark else ''
         raise ModelError(f'{path}: {place}cannot be read as YAML; restore the file or calibrate again') from error
     try:
         return _from_content(content)
@@ -231,8 +232,9 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
 
 def _self_calibration_content(calibration: SelfCalibration) -> dict[str, Any]:
     content = dict(vars(calibration))
-    if content.pop('covariance') is not None:
-        content['covariance'] = [list(row) for row in calibration.covariance]
+    covariance = content.pop('covariance')
+    if covariance is not None:
+        content['covariance'] = [list(row) for row in covariance]
         content['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'), calibration.standard_deviations))
     return content
 

@@ -181,3 +181,15 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_pat
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
     assert run('compensate', log, '--model', tmp_path / 'new.yaml', '--out', tmp_path / 'out.csv')[0] == 0
     assert read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1] == 'nan'
+
+
+def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run, log, tmp_path):
+    lines = log.read_text().splitlines()
+    header = next(line for line in lines if not line.startswith('#')).split(',')
+    rows = [line.split(',') for line in lines if not line.startswith('#')][1:]
+    for row in rows[:300]:
+        for name in ('reference_heading_rad', 'reference_rate_rad_s'):
+            row[header.index(name)] = 'nan'
+    (tmp_path / 'lost.csv').write_text('\n'.join(','.join(row) for row in [header, *rows]) + '\n')
+    answer = json.loads(run('self-calibrate', tmp_path / 'lost.csv', '--json')[1])
+    assert answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6) and abs(answer['time_offset_s']) < 1e-3
