@@ -97,14 +97,22 @@ def ros_domain(monkeypatch):
         yield number
 
 
+def _is_mine(lock):
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def _free_domain():
     """Give a domain that no other run of these tests on this machine uses meanwhile: each holds the lock of its own."""
     for number in random.SystemRandom().sample(range(1, 102), 101):
-        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock, contextlib.suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield number
-            return
+        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock:
+            if _is_mine(lock):
+                yield number
+                return
     pytest.fail('all ROS domains from 1 to 101 are taken by other runs of these tests')
 
 
