@@ -62,12 +62,12 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     """
     Return what the rate changes by for each uncertain value of the model, shape (m, ...).
 
-    First the coefficients of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
+    First the fitted values of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
     `covariance`.
 
     """
     channels, calibration = Channels(rate, output, temperature), model.self_calibration
-    rows = [] if model.covariance is None else [column for term in model.terms for column in term.columns(channels)]
+    rows = [] if model.covariance is None else [row for term in model.terms for row in term.sensitivity(channels)]
     if calibration is not None:
         rows += [rate, 1.0]
     sensitivity = np.empty((len(rows), *np.shape(rate)))

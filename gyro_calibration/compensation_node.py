@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter
-from gyro_calibration.log import DEGREE
+from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, with_self_calibration
 from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.motion import CALIBRATION, Motion, MotionError, read_motion
@@ -41,7 +41,7 @@ from gyro_calibration.node import (
     diagnostic,
     run,
 )
-from gyro_calibration.self_calibration import CalibrationRefused, Limits, calibrate_bias, record, self_calibrate
+from gyro_calibration.self_calibration import Limits, calibrate_bias, record, self_calibrate
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
@@ -325,9 +325,9 @@ class CompensationNode(Node):
         try:
             reason = await run.answer
             if reason:
-                raise CalibrationRefused(reason)
+                raise DataRefused(reason)
             success, message = True, self._finish(run)
-        except CalibrationRefused as error:
+        except DataRefused as error:
             message = f'refused: {error}'
         except Exception as error:  # whatever happens, the robot stops, the caller hears of it and the node lives
             message = f'failed, and nothing was changed: {error!r}'

@@ -36,7 +36,12 @@ class Channels:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A coefficient or a shape parameter: its name, unit, the value taken where none is given, and its bounds."""
+    """
+    A coefficient or a shape parameter: its name, unit, the value taken where none is given, and its bounds.
+
+    A shape with a default is a convention, such as a temperature to count from; one without is a property of the gyro, and is fitted.
+
+    """
 
     name: str
     unit: str
@@ -95,10 +100,59 @@ def _sine_response(channels: Channels, k: float) -> Sequence[Number]:
     return (np.sin(k * channels.rate) / k - channels.rate,)
 
 
+SCALE_FACTOR_ASYMMETRY = Effect(
+    'scale_factor_asymmetry', 'The scale factor differs between the two senses of rotation.',
+    frozenset({'rate'}), (Parameter('scale_factor_asymmetry', '1'),), lambda channels: (abs(channels.rate),))
+
+
+QUADRATIC_NONLINEARITY = Effect(
+    'quadratic_nonlinearity', 'The output has a part that grows with the square of the rate.',
+    frozenset({'rate'}), (Parameter('quadratic_nonlinearity', 's/rad'),), lambda channels: (channels.rate * channels.rate,))
+
+
+CUBIC_NONLINEARITY = Effect(
+    'cubic_nonlinearity', 'The scale factor falls or grows with the square of the rate.',
+    frozenset({'rate'}), (Parameter('cubic_nonlinearity', 's²/rad²'),),
+    lambda channels: (channels.rate * channels.rate * channels.rate,))
+
+
 SINE_RESPONSE = Effect(
     'sine_response', 'An open-loop fibre-optic gyro answers with the sine of its Sagnac phase.',
     frozenset({'rate'}), (Parameter('amplitude', '1', default=1.0),), _sine_response,
     (Parameter('k', 's', bounds=(1e-6, 1e3)),))
+
+
+#: From where the effects of temperature count, degC.
+_REFERENCE_TEMPERATURE = Parameter('reference_temperature', 'degC', 25.0)
+
+
+def _bias_temperature(channels: Channels, reference: float) -> Sequence[Number]:
+    return (channels.temperature - reference + 0.0 * channels.rate,)
+
+
+BIAS_TEMPERATURE = Effect(
+    'bias_temperature', 'The bias changes in proportion to the temperature.',
+    frozenset({'temperature'}), (Parameter('bias_temperature', 'rad/s/K'),), _bias_temperature, (_REFERENCE_TEMPERATURE,))
+
+
+def _bias_temperature_quadratic(channels: Channels, reference: float) -> Sequence[Number]:
+    return ((channels.temperature - reference) * (channels.temperature - reference) + 0.0 * channels.rate,)
+
+
+BIAS_TEMPERATURE_QUADRATIC = Effect(
+    'bias_temperature_quadratic', 'The bias is curved over temperature.',
+    frozenset({'temperature'}), (Parameter('bias_temperature_quadratic', 'rad/s/K²'),), _bias_temperature_quadratic,
+    (_REFERENCE_TEMPERATURE,))
+
+
+def _scale_factor_temperature(channels: Channels, reference: float) -> Sequence[Number]:
+    return ((channels.temperature - reference) * channels.rate,)
+
+
+SCALE_FACTOR_TEMPERATURE = Effect(
+    'scale_factor_temperature', 'The scale factor changes in proportion to the temperature.',
+    frozenset({'rate', 'temperature'}), (Parameter('scale_factor_temperature', '1/K'),), _scale_factor_temperature,
+    (_REFERENCE_TEMPERATURE,))
 
 
 def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effect:
@@ -137,7 +191,9 @@ def _powers(value: Number, order: int) -> list[Number]:
     return powers
 
 
-CATALOGUE = {effect.name: effect for effect in (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE)}
+CATALOGUE = {effect.name: effect for effect in (
+    BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY, SINE_RESPONSE,
+    BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
 
 
 def polynomial_from_matrix(matrix: Any) -> tuple[Effect, tuple[float, ...]]:

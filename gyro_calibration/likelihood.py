@@ -14,12 +14,8 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
 
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import Array
+from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.motion import Motion
-
-
-class CalibrationRefused(ValueError):
-    """The data do not allow a calibration; the message says why and what would."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +257,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
 
     Raises
     ------
-    CalibrationRefused : gyro and motion hardly overlap
+    DataRefused : gyro and motion hardly overlap
 
     """
     pairing = _Pairing(time, rate, motion)
@@ -269,7 +265,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     for _ in range(6):
         data = pairing.increments(offset)
         if len(data.turned) < 10:
-            raise CalibrationRefused('the samples cover less than ten blocks of the profile: record the whole motion')
+            raise DataRefused('the samples cover less than ten blocks of the profile: record the whole motion')
         noises, estimates, weights = _estimates(data)
         noise, estimate = noises[weights.argmax()], estimates[weights.argmax()]
         if pairing.sampled:

@@ -49,6 +49,10 @@ class LogError(ValueError):
     """A file is not a log; the message names file, row and column."""
 
 
+class DataRefused(ValueError):
+    """The data do not allow an answer; the message says why and what would."""
+
+
 @dataclass(frozen=True)
 class Log:
     """

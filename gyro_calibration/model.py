@@ -28,6 +28,22 @@ class Term:
         coefficients = self.values[len(self.effect.shapes):]
         return sum(value * column for value, column in zip(coefficients, self.columns(channels)))
 
+    @property
+    def fitted(self) -> tuple[int, ...]:
+        """Return the places of the values that a fit finds: those of the parameters without a default."""
+        return tuple(place for place, parameter in enumerate(self.effect.parameters) if parameter.default is None)
+
+    def sensitivity(self, channels: Channels) -> list[Number]:
+        """Return what the error changes by for each fitted value: its column, or for a shape the derivative."""
+        columns, shapes = self.columns(channels), len(self.effect.shapes)
+        return [self._derivative(place, channels) if place < shapes else columns[place - shapes] for place in self.fitted]
+
+    def _derivative(self, place: int, channels: Channels) -> Number:
+        step = 1e-5 * abs(self.values[place])
+        below, above = (replace(self, values=(*self.values[:place], self.values[place] + change, *self.values[place + 1:]))
+                        for change in (-step, step))
+        return (above.error(channels) - below.error(channels)) / (2.0 * step)
+
 
 @dataclass(frozen=True)
 class SelfCalibration:
@@ -98,7 +114,7 @@ class GyroModel:
     Attributes
     ----------
     terms : its effects
-    covariance : of all coefficients in the order of the terms, shape (m, m), or None where it is not known
+    covariance : of all fitted values in the order of the terms, shape (m, m), or None where it is not known
     rate_range, temperature_range : what the values were fitted on, rad/s and degC
     noise : its noise figures
     gyro : name, serial_number, technology, as text

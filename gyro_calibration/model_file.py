@@ -74,7 +74,7 @@ def _from_content(content: Any) -> GyroModel:
     noise = {name: _number(f'noise.{name}', value, low=0.0) for name, value in _mapping('noise', top.get('noise', {})).items()}
     _only('noise', noise, Noise.__dataclass_fields__)
     return GyroModel(
-        terms, _covariance(top.get('covariance'), sum(len(term.effect.coefficients) for term in terms)),
+        terms, _covariance(top.get('covariance'), sum(len(term.fitted) for term in terms)),
         _range('valid.rate', valid.get('rate')), temperature_range,
         _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
         {str(key): _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
@@ -123,7 +123,7 @@ def _range(place: str, value: Any) -> tuple[float, float]:
 
 def _matrix(place: str, value: Any, size: int) -> Array:
     if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1 for row in value] != [size] * size:
-        raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a coefficient')
+        raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a fitted value')
     numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
     matrix = np.array(numbers).reshape(size, size)
     smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + 1e-9 * np.abs(matrix).max(initial=0.0))], default=0.0)

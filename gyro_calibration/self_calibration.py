@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyro_calibration.likelihood import CHANCE, CalibrationRefused, Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.likelihood import CHANCE, Fit, fit_likelihood
+from gyro_calibration.log import DEGREE, Array, DataRefused
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import Motion
 from gyro_calibration.noise import ALLAN_FLOOR, Noise
@@ -85,7 +85,7 @@ def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
 
 def _solve(matrix: Array, vector: Array) -> Array:
     if not np.linalg.cond(matrix) < 1e12:
-        raise CalibrationRefused('the gyro did not change its rate, so scale and bias cannot be parted: turn both ways, with stops')
+        raise DataRefused('the gyro did not change its rate, so scale and bias cannot be parted: turn both ways, with stops')
     return np.linalg.solve(matrix, vector)
 
 
@@ -110,7 +110,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
 
     Raises
     ------
-    CalibrationRefused : with the reason and the remedy
+    DataRefused : with the reason and the remedy
 
     """
     limits = limits or Limits()
@@ -132,48 +132,48 @@ def _wander(noise: Noise | None) -> float:
 
 def _refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
     if len(time) < limits.samples:
-        raise CalibrationRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: look at the gyro\'s line and rate')
+        raise DataRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: look at the gyro\'s line and rate')
     if not np.isfinite(rate).all():
-        raise CalibrationRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: leave them out, or mend the line')
+        raise DataRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: leave them out, or mend the line')
     gap = float(np.diff(time).max())
     if gap > limits.gap:
-        raise CalibrationRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be missing: mend the line and run again')
+        raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be missing: mend the line and run again')
     if np.ptp(rate) == 0.0:
-        raise CalibrationRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: the gyro is dead or not powered')
+        raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: the gyro is dead or not powered')
 
 
 def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
     if not np.isfinite(motion.heading).all():
-        raise CalibrationRefused('the reference was lost somewhere in the profile: leave those points out, or run again')
+        raise DataRefused('the reference was lost somewhere in the profile: leave those points out, or run again')
     points = np.arange(0.0, motion.duration, 0.05)
     spread = float(np.std(motion.rate_at(points)))
     if spread < limits.rate_spread:
-        raise CalibrationRefused(f'the profile turns at one speed (its rate varies by {spread / DEGREE:.2f} deg/s): scale and bias '
+        raise DataRefused(f'the profile turns at one speed (its rate varies by {spread / DEGREE:.2f} deg/s): scale and bias '
                                  'cannot be parted; turn both ways, with stops')
     if time[-1] - time[0] < 0.9 * motion.duration - 2.0 * limits.time_offset:
         covered = time[-1] - time[0]
-        raise CalibrationRefused(f'the samples cover {covered:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
+        raise DataRefused(f'the samples cover {covered:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
 
 
 def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
     s, b = fit.scale_factor_error, fit.bias
     if abs(1.0 + s) < 0.5:
-        raise CalibrationRefused(f'the gyro saw {100 * (1 + s):.0f} % of the profile\'s turns: did the robot move, and is the gyro alive?')
+        raise DataRefused(f'the gyro saw {100 * (1 + s):.0f} % of the profile\'s turns: did the robot move, and is the gyro alive?')
     if s < -1.5:
-        raise CalibrationRefused(f'the gyro turns the other way than the profile (scale {1 + s:.2f}): set the driver\'s parameter invert')
+        raise DataRefused(f'the gyro turns the other way than the profile (scale {1 + s:.2f}): set the driver\'s parameter invert')
     turned, size = fit.residual
     if turned > limits.residual:
-        raise CalibrationRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile '
+        raise DataRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile '
                                  f'({size:.0f} standard deviations): a slip or a bump; run again on free ground')
     deviation = math.sqrt(fit.covariance[0, 0])
     if abs(s) > limits.scale_factor_error + 3.0 * np.nan_to_num(deviation):
-        raise CalibrationRefused(f'a scale factor error of {100 * s:.0f} % is beyond {100 * limits.scale_factor_error:.0f} %: look at the '
+        raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond {100 * limits.scale_factor_error:.0f} %: look at the '
                                  'sensitivity and at the profile\'s unit')
     if abs(b) > limits.bias:
-        raise CalibrationRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
+        raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
                                  'was the robot turned by hand?')
     if deviation > limits.scale_standard_deviation:
-        raise CalibrationRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
+        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
                                  f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often, '
                                  'and check that the profile is the one that was driven')
 
@@ -192,7 +192,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
 
     Raises
     ------
-    CalibrationRefused : too few samples, a dead gyro, motion, or a mean that is no bias
+    DataRefused : too few samples, a dead gyro, motion, or a mean that is no bias
 
     """
     limits = limits or Limits()
@@ -203,7 +203,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     _refuse_change(*_steps(blocks, within))
     bias, deviation = float(rate.mean()), math.sqrt(blocks.var(ddof=1) / 10.0 + _wander(noise))
     if abs(bias) > limits.bias:
-        raise CalibrationRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
+        raise DataRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
                                  'the gyro turns, or is broken')
     if noise is not None and noise.angle_random_walk:
         _refuse_shaking(time, rate, noise)
@@ -221,14 +221,14 @@ def _steps(blocks: Array, within: float) -> tuple[Array, Array]:
 def _refuse_change(changes: Array, deviations: Array) -> None:
     beyond = np.where(changes > np.maximum(CHANCE * deviations, 0.05 * DEGREE), changes, 0.0).max()
     if beyond:
-        raise CalibrationRefused(f'the gyro was moved: its mean changed by {beyond / DEGREE:.2f} deg/s within the rest; '
+        raise DataRefused(f'the gyro was moved: its mean changed by {beyond / DEGREE:.2f} deg/s within the rest; '
                                  'keep it still and run again')
 
 
 def _refuse_shaking(time: Array, rate: Array, noise: Noise) -> None:
     expected = math.sqrt(noise.rate_variance(float(np.median(np.diff(time)))))
     if rate.std() > 3.0 * expected:
-        raise CalibrationRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives {expected / DEGREE:.2f} deg/s: '
+        raise DataRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives {expected / DEGREE:.2f} deg/s: '
                                  'stop the robot and its motors, and run again')
 
 

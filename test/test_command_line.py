@@ -9,13 +9,14 @@ import sys
 import numpy as np
 import pytest
 
+from gyro_calibration import verbs
 from gyro_calibration.command_line import main
 from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.protocols import find
 
-VERBS = ('compensate', 'self-calibrate', 'simulate', 'emulate', 'demo')
+VERBS = [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS]
 GYRO = 'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: -0.1}}'
 NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
 

@@ -31,11 +31,18 @@ GYROS = {
     'bias, large': [('bias', (-3.0,))],
     'scale_factor_error, -10 %': [('scale_factor_error', (-0.1,))],
     'scale_factor_error, +20 %': [('scale_factor_error', (0.2,))],
+    'scale_factor_asymmetry': [('scale_factor_asymmetry', (0.01,))],
+    'quadratic_nonlinearity': [('quadratic_nonlinearity', (0.02,))],
+    'cubic_nonlinearity': [('cubic_nonlinearity', (-0.02,))],
+    'bias_temperature': [('bias_temperature', (25.0, 1e-3))],
+    'bias_temperature_quadratic': [('bias_temperature_quadratic', (25.0, 1e-4))],
+    'scale_factor_temperature': [('scale_factor_temperature', (25.0, 2e-3))],
     'sine_response': [('sine_response', (0.5, 1.0))],
     'sine_response, -10 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (-0.1,)), ('bias', (0.01,))],
     'sine_response, +20 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (0.2,)), ('bias', (0.01,))],
     'rate_temperature_polynomial': [],
-    'all': [('bias', (0.02,)), ('scale_factor_error', (0.0373,)), ('sine_response', (0.1, 1.0))],
+    'all': [('bias', (0.02,)), ('scale_factor_error', (0.0373,)), ('sine_response', (0.1, 1.0)),
+            ('scale_factor_asymmetry', (0.003,)), ('bias_temperature', (30.0, 1e-3)), ('scale_factor_temperature', (30.0, 1e-3))],
 }
 
 

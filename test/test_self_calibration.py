@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.log import DEGREE, DataRefused, read_log
 from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turns
 from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
 from gyro_calibration.self_calibration import (
-    CalibrationRefused,
     Limits,
     calibrate_bias,
     fit_heading,
@@ -105,7 +104,7 @@ def honest(reference):
         motion = CALIBRATION if reference == 'profile' else sampled(CALIBRATION, 20.0, STEP, generator.uniform(0.0, STEP))
         try:
             fit = self_calibrate(TIME, rate, motion)
-        except CalibrationRefused:
+        except DataRefused:
             refused += 1
             continue
         errors.append((fit.scale_factor_error - XV3500_S, fit.bias - XV3500_B))
@@ -192,7 +191,7 @@ def test_a_slip_or_bump_is_refused(degrees):
     for seed in range(20):
         try:
             self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION)
-        except CalibrationRefused as error:
+        except DataRefused as error:
             refused += 'slip or a bump' in str(error)
     assert refused >= 19
 
@@ -226,14 +225,14 @@ REFUSED = {
 
 @pytest.mark.parametrize('time, rate, motion, reason', REFUSED.values(), ids=REFUSED)
 def test_what_cannot_be_believed_is_refused_with_its_reason(time, rate, motion, reason):
-    with pytest.raises(CalibrationRefused) as refused:
+    with pytest.raises(DataRefused) as refused:
         self_calibrate(time, rate, motion)
     assert reason in str(refused.value) and '\n' not in str(refused.value)
 
 
 @pytest.mark.parametrize('method', ['heading', 'rate', 'likelihood'])
 def test_no_method_calibrates_by_a_dead_gyro(method):
-    with pytest.raises(CalibrationRefused):
+    with pytest.raises(DataRefused):
         self_calibrate(TIME, np.where(TIME > 19.9, 1e-9, 0.0), CALIBRATION, method)
 
 
@@ -266,7 +265,7 @@ NOT_RESTING = {
 
 @pytest.mark.parametrize('true, reason', NOT_RESTING.values(), ids=NOT_RESTING)
 def test_a_bias_is_not_taken_in_motion(true, reason):
-    with pytest.raises(CalibrationRefused, match=reason):
+    with pytest.raises(DataRefused, match=reason):
         calibrate_bias(TIME, run(0, true), noise=XV3500)
 
 
@@ -278,7 +277,7 @@ def test_an_honest_rest_is_not_refused():
 
 @pytest.mark.parametrize('count, rate, reason', [(40, None, 'only 40 samples'), (500, 0.0, 'dead')])
 def test_a_bias_is_not_taken_from_a_dead_gyro_or_a_few_samples(count, rate, reason):
-    with pytest.raises(CalibrationRefused, match=reason):
+    with pytest.raises(DataRefused, match=reason):
         calibrate_bias(TIME[:count], run(0, np.zeros(count)) if rate is None else np.full(count, rate))
 
 

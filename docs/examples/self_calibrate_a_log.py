@@ -13,11 +13,12 @@ import sys
 import numpy as np
 
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.log import DataRefused
 from gyro_calibration.model import GyroModel, Term, with_self_calibration
 from gyro_calibration.model_file import write_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import CalibrationRefused, record, self_calibrate
+from gyro_calibration.self_calibration import record, self_calibrate
 from gyro_calibration.simulation import simulate
 
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
@@ -29,7 +30,7 @@ def main(path='model.yaml'):
     model = GyroModel(noise=NOISE)  # nothing is known of this gyro but its noise
     try:
         fit = self_calibrate(log.time, log.output, CALIBRATION, noise=model.noise)
-    except CalibrationRefused as reason:
+    except DataRefused as reason:
         sys.exit(f'refused: {reason}')
     calibration = record(fit, 'likelihood', '2025-01-01T00:00:00+00:00', temperature=None)
     write_model(path, with_self_calibration(model, calibration))

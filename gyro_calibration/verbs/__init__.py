@@ -1,0 +1,11 @@
+"""
+What the program can do: one file a verb.
+
+Each has a function ``add`` that describes the verb to argparse, and a function from its arguments to an `Answer`. Units that people use are
+converted here, at the rim.
+
+"""
+
+from gyro_calibration.verbs import compensate, demo, emulate, self_calibrate, simulate
+
+VERBS = (compensate, self_calibrate, simulate, emulate, demo)

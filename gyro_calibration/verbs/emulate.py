@@ -1,0 +1,76 @@
+"""The verb emulate: a gyro on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Iterator
+from itertools import chain, repeat
+from typing import Any
+
+import numpy as np
+
+from gyro_calibration.emulator import Emulator, emulate
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.protocols import PLANNED, PROTOCOLS, Protocol, Sample, Settings, find
+from gyro_calibration.verbs.simulate import add_motion, simulated
+from gyro_calibration.verbs.verb import UsageError, output_of, positive, read, time_of, verb
+
+
+def add(verbs: Any) -> argparse.ArgumentParser:
+    parser = verb(verbs, 'emulate', _emulate, 'be a gyro on a pseudo-terminal, from a model and a motion or from a log; prints its path',
+                   '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
+    parser.add_argument('--protocol', required=True, metavar='NAME', help=f'one of {", ".join(PROTOCOLS)}; later {", ".join(PLANNED)}')
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument('--log', metavar='LOG', help='send a recording')
+    source.add_argument('--model', metavar='MODEL.yaml', help='send what a simulated gyro says')
+    add_motion(parser, default='rest')
+    parser.add_argument('--rate', type=positive, metavar='HZ', help='the log was taken at this rate; for logs without a usable time_s')
+    parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count of the wire format; default: its own')
+    parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc', help='of the protocol csv; default: %(default)s')
+    parser.add_argument('--link', metavar='PATH', help='a link to the pseudo-terminal, whose own name changes')
+    parser.add_argument('--speed', type=positive, default=1.0, help='times real time; default: 1')
+    parser.add_argument('--wait', action='store_true', help='begin when a program has opened the port')
+    parser.add_argument('--repeat', action='store_true', help='begin again at the end')
+    parser.set_defaults(invert=False)
+    return parser
+
+
+def _emulate(given: argparse.Namespace) -> None:
+    """Print the path at once, since the answer of this verb is what goes on until it ends."""
+    protocol, settings = _wire(given)
+    log = read(given) if given.log else simulated(given)[0]
+    samples = _samples(time_of(given, log), output_of(given, log), log.temperature, given.repeat)
+    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
+    _handle_signals(lambda *_: emulator.stop())
+    try:
+        emulate(emulator, lambda path: print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else path, flush=True))
+    finally:
+        _handle_signals(signal.SIG_IGN)  # launch sends a second one, which must not hit a program that is about to end
+
+
+def _handle_signals(handler: Any) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
+    sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
+    try:
+        protocol, settings = find(given.protocol), Settings(sensitivity=sensitivity, columns=tuple(given.columns.split(',')))
+        protocol.check(settings)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    return protocol, settings
+
+
+def _samples(time: Array, output: Array, temperature: Array | None, again: bool) -> Iterator[Sample]:
+    """Give the samples of a log that have an output, and all of them again and again where that is wanted."""
+    known = np.isfinite(output)
+    times, outputs = time[known] - time[known][0], output[known].tolist()
+    temperatures = repeat(None) if temperature is None else temperature[known].tolist()
+    length = float(times[-1] + np.median(np.diff(times)))
+    for start in chain([0.0], (length * number for number in range(1, sys.maxsize if again else 1))):
+        yield from (Sample(output, temperature, start + time) for time, output, temperature in zip(times.tolist(), outputs, temperatures))

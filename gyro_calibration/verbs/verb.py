@@ -1,0 +1,67 @@
+"""What the verbs share: their answer, their options for logs, and what they say of a wrong use."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gyro_calibration.log import DEGREE, Array, Log, read_log
+
+
+class UsageError(ValueError):
+    """The program was called in a way that cannot work; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a verb found: plain words for people, and the same as data."""
+
+    text: str
+    data: dict[str, Any]
+
+
+def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None], summary: str,
+          example: str) -> argparse.ArgumentParser:
+    parser = verbs.add_parser(name, help=summary, description=f'{summary[0].upper()}{summary[1:]}.',
+                              epilog=f'example: gyro_calibration {name} {example}')
+    parser.set_defaults(verb=function, name=name)
+    return parser
+
+
+def add_log(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz')
+    parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this rate; for logs without a usable time_s')
+    parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count, for logs that hold gyro_counts alone')
+    parser.add_argument('--invert', action='store_true', help='the gyro counts clockwise turns positive')
+
+
+def positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    return value
+
+
+def not_negative(text: str) -> float:
+    return 0.0 if float(text) == 0.0 else positive(text)
+
+
+def read(given: argparse.Namespace) -> Log:
+    """Read the log that a verb was given, as its options say."""
+    log = read_log(given.log, None if given.sensitivity is None else given.sensitivity * DEGREE, given.rate)
+    return replace(log, output=-output_of(given, log)) if given.invert else log
+
+
+def output_of(given: argparse.Namespace, log: Log) -> Array:
+    if log.output is None:
+        raise UsageError(f'{given.log}: holds gyro_counts alone; say with --sensitivity how many deg/s a count is')
+    return log.output
+
+
+def time_of(given: argparse.Namespace, log: Log) -> Array:
+    if log.time is None:
+        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; say with --rate how many samples a second it holds')
+    return log.time
