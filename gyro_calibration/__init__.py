@@ -10,8 +10,9 @@ Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Ot
 command line), where the name says so: ``gyro_dps``.
 
 Reading order: `log`, `effects`, `noise`, `model`, `model_file`, `motion`, `simulation`, `compensation`, `heading`,
-`likelihood`, `self_calibration`; then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then `verbs`,
-`command_line`.
+`likelihood`, `self_calibration`;
+`dwells`;
+then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then `verbs`, `command_line`.
 
 """
 
