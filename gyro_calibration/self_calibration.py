@@ -138,6 +138,11 @@ def _refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
     gap = float(np.diff(time).max())
     if gap > limits.gap:
         raise DataRefused(f'no samples came for {gap:.2f} s; at most {limits.gap:g} s may be missing: mend the line and run again')
+    refuse_dead(rate)
+
+
+def refuse_dead(rate: Array) -> None:
+    """Refuse samples of one value."""
     if np.ptp(rate) == 0.0:
         raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: the gyro is dead or not powered')
 
@@ -155,12 +160,17 @@ def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
         raise DataRefused(f'the samples cover {covered:.1f} s of the profile\'s {motion.duration:.1f} s: record the whole motion')
 
 
+def refuse_scale(s: float, reference: str, remedy: str) -> None:
+    """Refuse a gyro that saw next to nothing of what the reference turned, or all of it the other way, with what puts its sign right."""
+    if abs(1.0 + s) < 0.5:
+        raise DataRefused(f'the gyro saw {100 * (1 + s):.0f} % of the {reference}\'s turns: did the robot move, and is the gyro alive?')
+    if s < -1.5:
+        raise DataRefused(f'the gyro turns the other way than the {reference} (scale {1 + s:.2f}): {remedy}')
+
+
 def _refuse_fit(fit: Fit, motion: Motion, limits: Limits) -> None:
     s, b = fit.scale_factor_error, fit.bias
-    if abs(1.0 + s) < 0.5:
-        raise DataRefused(f'the gyro saw {100 * (1 + s):.0f} % of the profile\'s turns: did the robot move, and is the gyro alive?')
-    if s < -1.5:
-        raise DataRefused(f'the gyro turns the other way than the profile (scale {1 + s:.2f}): set the driver\'s parameter invert')
+    refuse_scale(s, 'profile', 'set the driver\'s parameter invert')
     turned, size = fit.residual
     if turned > limits.residual:
         raise DataRefused(f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile '
