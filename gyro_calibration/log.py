@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from gyro_calibration.files import write_atomically
 
 Array = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0

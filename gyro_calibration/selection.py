@@ -1,0 +1,252 @@
+"""
+Which effects a gyro has: chosen by what predicts sweeps that were left out, each choice with its reason.
+
+An effect is taken where the error of left-out sweeps falls with it and its evidence is beyond chance, with regard to how many effects
+were tried. Where two effects explain the data alike, the one that the physics of the instrument gives decides, if the instrument is known.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from gyro_calibration.calibration import Calibration, Scatter, find_scatter, fit_effects
+from gyro_calibration.dwells import Dwells
+from gyro_calibration.effects import BIAS, CATALOGUE, CUBIC_NONLINEARITY, SCALE_FACTOR_ERROR, SINE_RESPONSE, Channels, Effect
+from gyro_calibration.log import DataRefused
+
+#: How often an effect is taken that is not there, in one calibration.
+FALSE_ALARM_RATE = 0.01
+#: Two causes count as parted from so many standard deviations on: then the wrong one is taken in one of thirty thousand calibrations.
+PARTED = 4.0
+#: Of effects that look alike, the one that the physics of an instrument gives.
+TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY, 'mems': CUBIC_NONLINEARITY}
+_TWINS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
+#: An effect that is of no use without another one.
+_NEEDS = {'bias_temperature_quadratic': 'bias_temperature'}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    Why an effect was taken or not.
+
+    Attributes
+    ----------
+    effect : its name
+    taken : whether it is in the model
+    without, with_it : error of left-out sweeps, rad/s; nan where a fit was not possible
+    chance : how likely so much evidence is by chance alone; nan as before
+    reason : one sentence
+
+    """
+
+    effect: str
+    taken: bool
+    without: float
+    with_it: float
+    chance: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Twins:
+    """
+    Two effects that explain the same.
+
+    Attributes
+    ----------
+    taken, other : their names
+    sigmas : by how many standard deviations the data prefer the one that was taken; negative where they prefer the other
+    rate : two dwells each way at this rate would part them, rad/s; None where no rate below three times the fastest would
+    reason : why it was taken, one sentence
+
+    """
+
+    taken: str
+    other: str
+    sigmas: float
+    rate: float | None
+    reason: str
+
+    @property
+    def parted(self) -> bool:
+        """Tell whether the data part them."""
+        return abs(self.sigmas) >= PARTED
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A calibration with the effects that the data support, why each was taken or not, and what looks alike."""
+
+    calibration: Calibration
+    choices: tuple[Choice, ...]
+    twins: tuple[Twins, ...]
+
+
+def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
+    """
+    Fit the effects that the dwells support.
+
+    Parameters
+    ----------
+    dwells : of a rate table or a log
+    technology : one of `TECHNOLOGIES`, what the instrument is; it decides where causes tie
+
+    Raises
+    ------
+    DataRefused : too few dwells for anything
+
+    """
+    scatter = find_scatter(dwells)
+    base = _base(dwells, scatter)
+    candidates = [effect for effect in CATALOGUE.values() if effect not in base.effects]
+    best = _grow(base, candidates, scatter)
+    best = _prune(best, base.effects, len(candidates), scatter)
+    best, twins = _part(best, technology, scatter)
+    return Selection(best, tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in CATALOGUE.values()), twins)
+
+
+def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
+    """Fit bias and scale factor error, or what of them can be seen."""
+    for effects in ((BIAS, SCALE_FACTOR_ERROR), (BIAS,), (SCALE_FACTOR_ERROR,)):
+        fit = _try(dwells, effects, scatter)
+        if fit is not None:
+            return fit
+    raise DataRefused(f'{len(dwells)} dwells show neither a bias nor a scale factor; rest, and turn both ways at several speeds')
+
+
+def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibration | None:
+    try:
+        return fit_effects(dwells, effects, scatter)
+    except DataRefused:
+        return None
+
+
+def chance(smaller: Calibration, larger: Calibration) -> float:
+    """Return how likely it is that the larger model fits so much better by chance (F test on the misfits)."""
+    freedom = smaller.freedom - larger.freedom
+    if larger.freedom < 1 or freedom < 1:
+        return 1.0
+    spread = max(larger.misfit / larger.freedom, 1.0)
+    return float(fisher.sf((smaller.misfit - larger.misfit) / freedom / spread, freedom, larger.freedom))
+
+
+def _supported(smaller: Calibration, larger: Calibration, tried: int) -> bool:
+    """Tell whether left-out sweeps are predicted better, and the evidence is beyond chance."""
+    predicts = larger.predicted_misfit().mean() < smaller.predicted_misfit().mean()
+    return bool(predicts and chance(smaller, larger) < FALSE_ALARM_RATE / tried)
+
+
+def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter) -> Calibration:
+    """Add the effect that predicts left-out sweeps best, again and again."""
+    while True:
+        tried = [_try(fit.dwells, (*fit.effects, effect), scatter) for effect in candidates if _may_join(effect, fit.effects)]
+        better = [each for each in tried if each is not None and _supported(fit, each, len(candidates))]
+        if not better:
+            return fit
+        fit = min(better, key=lambda each: float(each.predicted_misfit().mean()))
+
+
+def _may_join(effect: Effect, effects: Sequence[Effect]) -> bool:
+    names = {each.name for each in effects}
+    has_twin = any(effect in pair and any(each in effects for each in pair) for pair in _TWINS)
+    return effect.name not in names and not has_twin and _NEEDS.get(effect.name, effect.name) in names | {effect.name}
+
+
+def _prune(fit: Calibration, base: Sequence[Effect], tried: int, scatter: Scatter) -> Calibration:
+    """Take away what is of no use any more beside effects that came later."""
+    for effect in fit.effects:
+        rest = tuple(each for each in fit.effects if each is not effect)
+        if effect in base or effect.name in {_NEEDS.get(each.name) for each in rest}:
+            continue
+        smaller = _try(fit.dwells, rest, scatter)
+        if smaller is not None and not _supported(smaller, fit, tried):
+            return _prune(smaller, base, tried, scatter)
+    return fit
+
+
+# twins
+
+def _part(fit: Calibration, technology: str | None, scatter: Scatter) -> tuple[Calibration, tuple[Twins, ...]]:
+    """Decide between effects that explain the same."""
+    found = []
+    for pair in _TWINS:
+        for taken, other in (pair, pair[::-1]):
+            swapped = None
+            if taken in fit.effects:
+                swapped = _try(fit.dwells, tuple(other if each is taken else each for each in fit.effects), scatter)
+            if swapped is not None:
+                fit, twins = _decide((fit, taken), (swapped, other), technology)
+                found.append(twins)
+                break
+    return fit, tuple(found)
+
+
+def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect], technology: str | None) -> tuple[Calibration, Twins]:
+    (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
+    sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
+    reason = f'it fits better by {sigmas:.1f} standard deviations'
+    if sigmas < PARTED and technology is None:
+        reason += ', which is too little to be sure'
+    if sigmas < PARTED and technology is not None:
+        physical = TECHNOLOGIES[technology]
+        if physical is other:
+            (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
+        reason = f'the data hardly part them ({abs(sigmas):.1f} standard deviations), and it is what the physics of {technology} gives'
+    return fit, Twins(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
+
+
+def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
+    """Return the slowest rate, beyond those that were measured, at which two dwells each way would part two fits, rad/s."""
+    fastest = float(np.abs(fit.dwells.rate).max())
+    for rate in fastest * np.arange(1.05, 3.0, 0.05):
+        if _separation(fit, swapped, rate) >= PARTED + 1.0:
+            return float(rate)
+    return None
+
+
+def _separation(fit: Calibration, swapped: Calibration, rate: float) -> float:
+    """Return by how many standard deviations two fits differ in two dwells each way at a rate."""
+    total = 0.0
+    for way in (rate, -rate):
+        channels = Channels(way, way, fit.model.reference_temperature)
+        difference = fit.model.error(channels) - swapped.model.error(channels)
+        row = np.array([value for term in fit.model.terms for value in term.sensitivity(channels)])
+        uncertain = 0.0 if fit.model.covariance is None else float(row @ fit.model.covariance @ row)
+        total += difference ** 2 / (uncertain + float(np.nanmedian(fit.deviation)) ** 2 / 2.0)
+    return math.sqrt(total)
+
+
+# reasons
+
+def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins], scatter: Scatter) -> Choice:
+    """Return what a fit with the effect has over one without it, everything else being as it was chosen."""
+    taken = effect in fit.effects
+    rest = tuple(each for each in fit.effects if each is not effect)
+    if taken and not rest:
+        return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan, 'nothing else can be seen')
+    try:
+        other = fit_effects(fit.dwells, rest if taken else (*rest, effect), scatter)
+    except DataRefused as error:
+        return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
+    smaller, larger = (other, fit) if taken else (fit, other)
+    reason = _reason(effect, taken, _supported(smaller, larger, tried), twins)
+    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, chance(smaller, larger), reason)
+
+
+def _reason(effect: Effect, taken: bool, supported: bool, twins: Sequence[Twins]) -> str:
+    for pair in twins:
+        if effect.name == pair.other:
+            return f'explains the same as {pair.taken}, which was taken: {pair.reason}'
+    if taken:
+        return 'predicts left-out sweeps better' if supported else 'belongs to every model'
+    needed = _NEEDS.get(effect.name)
+    if supported and needed:
+        return f'is of no use without {needed}'
+    return 'no better than chance'
