@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyro_calibration.effects import Channels, Number
-from gyro_calibration.model import GyroModel, SelfCalibration
-
-_NONE = SelfCalibration()
+from gyro_calibration.effects import Channels
+from gyro_calibration.log import CACHED, Array, Number
+from gyro_calibration.model import GyroModel
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,30 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
     """
     given = model.reference_temperature if temperature is None else temperature
+    return _by_blocks(model, output, given) if isinstance(output, np.ndarray) else _compensated(model, output, given)
+
+
+def _compensated(model: GyroModel, output: Number, given: Number) -> Compensated:
     low, high = model.temperature_range
     used = _clip(given, low, high)
     modelled = model.rate(output, used)
     slowest, fastest = model.rate_range
-    rate = (model.self_calibration or _NONE).correct(modelled)
+    rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     return Compensated(modelled, rate, used, used != given, (output < slowest) | (output > fastest))
+
+
+def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
+    """Compensate what the cache holds at a time; only what is returned goes through memory."""
+    modelled, clipped, beyond = np.empty(len(output)), np.empty(len(output), bool), np.empty(len(output), bool)
+    rate = modelled if model.self_calibration is None else np.empty(len(output))
+    for begin in range(0, len(output), CACHED):
+        block = slice(begin, begin + CACHED)
+        part = _compensated(model, output[block], given[block] if isinstance(given, np.ndarray) else given)
+        modelled[block], clipped[block], beyond[block] = part.modelled, part.temperature_clipped, part.beyond_range
+        if rate is not modelled:
+            rate[block] = part.rate
+    used = _clip(given, *model.temperature_range) if clipped.any() else given
+    return Compensated(modelled, rate, used, clipped, beyond)
 
 
 def _clip(value: Number, low: float, high: float) -> Number:

@@ -63,6 +63,7 @@ class Effect:
     columns : (channels, *shapes) -> one column a coefficient
     shapes : what the columns depend on, other than the channels
     shown_by : what to do so that data show it, apart from what looks like it
+    nested : (channels, shapes, coefficients) -> the sum of the columns times the coefficients, where there is a shorter way to it
 
     """
 
@@ -73,11 +74,19 @@ class Effect:
     columns: Callable[..., Sequence[Number]]
     shapes: tuple[Parameter, ...] = ()
     shown_by: str = ''
+    nested: Callable[[Channels, Sequence[float], Sequence[float]], Number] | None = None
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Shapes, then coefficients: the order of a term's values."""
         return self.shapes + self.coefficients
+
+    def error(self, channels: Channels, values: Sequence[float]) -> Number:
+        """Return what the effect adds to the output, rad/s, with these values of its parameters."""
+        shapes, coefficients = values[:len(self.shapes)], values[len(self.shapes):]
+        if self.nested is not None:
+            return self.nested(channels, shapes, coefficients)
+        return sum(value * column for value, column in zip(coefficients, self.columns(channels, *shapes)))
 
 
 def _bias(channels: Channels) -> Sequence[Number]:
@@ -175,20 +184,28 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
     rate_order, temperature_order : p and q of the paper, not negative
 
     """
-    powers = [(j, i) for j in range(temperature_order + 1) for i in range(rate_order + 1)]
+    names = [f't{j}w{i}' for j in range(temperature_order + 1) for i in range(rate_order + 1)]
 
-    def columns(channels: Channels, output_centre: float, output_scale: float, temperature_centre: float,
-                temperature_scale: float) -> Sequence[Number]:
-        output = _powers((channels.output - output_centre) / output_scale, rate_order)
-        temperature = _powers((channels.temperature - temperature_centre) / temperature_scale, temperature_order)
-        return [temperature[j] * output[i] for j, i in powers]
+    def scaled(channels: Channels, output_centre: float, output_scale: float, temperature_centre: float,
+               temperature_scale: float) -> tuple[Number, Number]:
+        return (channels.output - output_centre) / output_scale, (channels.temperature - temperature_centre) / temperature_scale
+
+    def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
+        output, temperature = scaled(channels, *shapes)
+        outputs = _powers(output, rate_order)
+        return [of_temperature * of_output for of_temperature in _powers(temperature, temperature_order) for of_output in outputs]
+
+    def nested(channels: Channels, shapes: Sequence[float], coefficients: Sequence[float]) -> Number:
+        output, temperature = scaled(channels, *shapes)
+        width = rate_order + 1
+        return _horner([_horner(coefficients[begin:begin + width], output) for begin in range(0, len(coefficients), width)], temperature)
 
     return Effect(
         'rate_temperature_polynomial', 'The scale factor is not linear, and bias and scale factor change with temperature.',
         frozenset({'output', 'temperature'} if temperature_order else {'output'}),
-        tuple(Parameter(f't{j}w{i}', 'rad/s') for j, i in powers), columns,
+        tuple(Parameter(name, 'rad/s') for name in names), columns,
         (Parameter('output_centre', 'rad/s', 0.0), Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
-         Parameter('temperature_centre', 'degC', 0.0), Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))))
+         Parameter('temperature_centre', 'degC', 0.0), Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))), nested=nested)
 
 
 def _powers(value: Number, order: int) -> list[Number]:
@@ -196,6 +213,18 @@ def _powers(value: Number, order: int) -> list[Number]:
     for _ in range(order):
         powers.append(powers[-1] * value)
     return powers
+
+
+def _horner(coefficients: Sequence[Number], value: Number) -> Number:
+    """Return the sum of coefficients times `_powers`, by Horner's rule and in place: one new array, whatever the order."""
+    if len(coefficients) == 1:
+        return coefficients[0] * (value * 0.0 + 1.0)
+    total = coefficients[-1] * value
+    total += coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        total *= value
+        total += coefficient
+    return total
 
 
 CATALOGUE = {effect.name: effect for effect in (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import CACHED, DEGREE, Array
 from gyro_calibration.noise import Noise
 
 
@@ -159,9 +159,18 @@ class HeadingIntegrator:
         return f'no samples for {interval:.3f} s'
 
 
-def integrate(time: Array, rate: Array) -> Array:
-    """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at 0."""
-    return np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1]))])
+def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
+    """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at `begin`."""
+    heading = np.empty(len(time))
+    heading[:1] = begin
+    for first in range(1, len(time), CACHED):
+        end = min(first + CACHED, len(time))
+        turned = np.add(rate[first:end], rate[first - 1:end - 1], out=heading[first:end])
+        turned *= time[first:end] - time[first - 1:end - 1]
+        turned *= 0.5
+        turned[0] += heading[first - 1]
+        np.cumsum(turned, out=turned)
+    return heading
 
 
 def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:

@@ -28,6 +28,9 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 
+#: So many samples of a dozen columns stay in the cache of a processor, which is three times as fast as to go through memory for each step.
+CACHED = 1 << 14
+
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
     'time_s': ('time', 1.0),

@@ -25,8 +25,7 @@ class Term:
 
     def error(self, channels: Channels) -> Number:
         """Return what the effect adds to the output, rad/s."""
-        coefficients = self.values[len(self.effect.shapes):]
-        return sum(value * column for value, column in zip(coefficients, self.columns(channels)))
+        return self.effect.error(channels, self.values)
 
     @property
     def fitted(self) -> tuple[int, ...]:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, polynomial_from_matrix
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, Channels, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.log import CACHED
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 
 WARM = Term(*polynomial_from_matrix([[0.1], [0.0]]))  # the bias is 0.1 deg/s a degC
@@ -45,6 +46,32 @@ def test_without_a_temperature_the_reference_temperature_is_taken():
 def test_outputs_beyond_the_calibrated_rates_are_marked():
     assert compensate(MODEL, np.array([-2.1, -2.0, 0.0, 2.0, 2.1])).beyond_range.tolist() == [True, False, False, False, True]
     assert not compensate(GyroModel(), 1e6).beyond_range
+
+
+@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('given', [None, 31.0, 'all', 'clipped'])
+def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, given):
+    model = GyroModel((WARM, *MODEL.terms), None, (-0.5, 0.5), (10.0, 40.0), self_calibration=calibration)
+    count, generator = 2 * CACHED + 77, np.random.default_rng(0)
+    output = generator.normal(size=count)
+    temperature = {'all': generator.uniform(20.0, 30.0, count), 'clipped': generator.uniform(0.0, 50.0, count)}.get(given, given)
+    whole = compensate(model, output, temperature)
+    cuts = [0, 1, 500, CACHED + 3, count]
+    for first, end in zip(cuts, cuts[1:]):
+        here = temperature[first:end] if isinstance(temperature, np.ndarray) else temperature
+        piece = compensate(model, output[first:end], here)
+        for name in ('modelled', 'rate', 'temperature', 'temperature_clipped', 'beyond_range'):
+            of_whole = np.broadcast_to(getattr(whole, name), count)[first:end]
+            assert np.array_equal(of_whole, np.broadcast_to(getattr(piece, name), end - first)), name
+
+
+@pytest.mark.parametrize('orders', [(0, 0), (0, 2), (1, 0), (1, 1), (3, 2), (5, 3)])
+def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
+    effect, generator = rate_temperature_polynomial(*orders), np.random.default_rng(0)
+    shapes, coefficients = (0.1, 1.7, 35.0, 10.0), generator.normal(size=len(effect.coefficients))
+    channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50), generator.uniform(10.0, 50.0, 50))
+    error = effect.error(channels, (*shapes, *coefficients.tolist()))
+    assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)), rel=1e-12, abs=1e-13)
 
 
 @pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])

@@ -1,0 +1,143 @@
+"""
+Samples per second of the compensation of a whole log, beside what numpy offers and beside what the machine allows.
+
+    python benchmarks/compensation.py [--long]
+
+A polynomial of orders (3, 2) over output and temperature, then the integration to the heading, over ten million samples. Beside it:
+numpy's `polyval2d`, and Horner's rule in place on blocks that fit the cache, with nothing else done, which is the floor. All sides take
+turns in one run, and medians count. Then the cost of a sample for logs of 1e4 to 1e7, and of a sample that comes alone, as on the robot.
+With --long, a hundred million samples go through in blocks. Prints tables in Markdown.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time as clock
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from gyro_calibration.compensation import compensate
+from gyro_calibration.effects import rate_temperature_polynomial
+from gyro_calibration.heading import integrate
+from gyro_calibration.model import GyroModel, Term
+
+#: Errors of some 0.01 rad/s, as a fit to a fibre-optic gyro on a rate table gives them.
+C = np.array([[4e-3, 2.1e-2, -6e-4, -1.3e-2], [-8e-4, 3e-3, 2e-4, -5e-4], [5e-5, -2e-4, 3e-5, 1e-4]])
+CENTRE, SCALE, MIDDLE, SPAN = 0.01, 1.1, 43.0, 4.0
+MODEL = GyroModel((Term(rate_temperature_polynomial(3, 2), (CENTRE, SCALE, MIDDLE, SPAN, *C.ravel().tolist())),),
+                  rate_range=(-1.8, 1.8), temperature_range=(37.0, 49.0))
+BLOCK = 1 << 15  # the fastest of 2**11 to 2**16 for the floor
+
+Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def samples(count: int, generator: np.random.Generator, first: int = 0) -> Samples:
+    """Return time, output and temperature of a log."""
+    return np.arange(first, first + count) * 0.01, generator.uniform(-1.75, 1.75, count), generator.uniform(38.0, 48.0, count)
+
+
+def package(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    return integrate(time, compensate(MODEL, output, temperature).rate)
+
+
+def polyval2d(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    rate = output - np.polynomial.polynomial.polyval2d((temperature - MIDDLE) / SPAN, (output - CENTRE) / SCALE, C)
+    return np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1]))])
+
+
+def floor(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    """Return the heading by Horner's rule and trapezoids, nothing checked or marked, no memory taken but for rate and heading."""
+    rate, heading, work = np.empty(len(time)), np.empty(len(time)), np.empty((4, BLOCK))
+    for begin in range(0, len(time), BLOCK):
+        block = slice(begin, min(begin + BLOCK, len(time)))
+        _floor_rate(output[block], temperature[block], rate[block], work[:, :block.stop - begin])
+        _floor_heading(time, rate, heading, max(begin, 1), block.stop, work[0])
+    return heading
+
+
+def _floor_rate(output: np.ndarray, temperature: np.ndarray, rate: np.ndarray, work: np.ndarray) -> None:
+    x, y, total, row = work
+    np.subtract(output, CENTRE, out=x)
+    np.divide(x, SCALE, out=x)
+    np.subtract(temperature, MIDDLE, out=y)
+    np.divide(y, SPAN, out=y)
+    for power, coefficients in zip((2, 1, 0), C[::-1]):
+        into = total if power == 2 else row
+        np.multiply(x, coefficients[3], out=into)
+        for coefficient in coefficients[2:0:-1]:
+            into += coefficient
+            into *= x
+        into += coefficients[0]
+        if power < 2:
+            total *= y
+            total += row
+    np.subtract(output, total, out=rate)
+
+
+def _floor_heading(time: np.ndarray, rate: np.ndarray, heading: np.ndarray, begin: int, end: int, work: np.ndarray) -> None:
+    if begin == 1:
+        heading[0] = 0.0
+    turned, interval = heading[begin:end], work[:end - begin]
+    np.add(rate[begin:end], rate[begin - 1:end - 1], out=turned)
+    np.subtract(time[begin:end], time[begin - 1:end - 1], out=interval)
+    turned *= interval
+    turned *= 0.5
+    turned[0] += heading[begin - 1]
+    np.cumsum(turned, out=turned)
+
+
+SIDES: Mapping[str, Callable[..., np.ndarray]] = {
+    'numpy polyval2d': polyval2d, 'Horner in place, in blocks (floor)': floor, 'compensate, integrate': package}
+
+
+def seconds(work: Callable[[], object]) -> float:
+    begin = clock.perf_counter()
+    work()
+    return clock.perf_counter() - begin
+
+
+def side_by_side(count: int = 10 ** 7, repeats: int = 9) -> str:
+    """Return a table of all sides over the same samples."""
+    log = samples(count, np.random.default_rng(0))
+    wanted = floor(*log)
+    assert all(np.allclose(side(*log), wanted, rtol=0.0, atol=1e-9) for side in SIDES.values())
+    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()] for _ in range(repeats)])  # noqa: B023, it runs at once
+    medians, ratios = np.median(taken, axis=0), np.median(taken / taken[:, 1:2], axis=0)
+    lines = [f'| {count:.0e} samples | million samples/s | time over the floor |', '|:---|---:|---:|']
+    lines += [f'| {name} | {count / median / 1e6:.0f} | {ratio:.2f} |' for name, median, ratio in zip(SIDES, medians, ratios)]
+    return '\n'.join(lines)
+
+
+def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7), total: int = 3 * 10 ** 7) -> str:
+    """Return a table of the cost of a sample in logs of several lengths, and of one that comes alone."""
+    lines = ['| samples in one call | ns a sample |', '|---:|---:|']
+    for count in counts:
+        log = samples(count, np.random.default_rng(0))
+        cost = np.median([seconds(lambda: package(*log)) for _ in range(total // count)]) / count  # noqa: B023, it runs at once
+        lines.append(f'| {count:.0e} | {1e9 * cost:.1f} |')
+    alone = np.median([seconds(lambda: compensate(MODEL, 0.5, 42.0)) for _ in range(10 ** 5)])
+    return '\n'.join(lines + [f'| 1, a float, without integration | {1e9 * alone:.0f} |'])
+
+
+def long_log(count: int = 10 ** 8, block: int = 10 ** 6) -> str:
+    """Return what it takes to compensate and integrate a log that never is in memory as a whole."""
+    generator, heading, taken = np.random.default_rng(0), 0.0, 0.0
+    for first in range(0, count, block):
+        time, output, temperature = samples(block, generator, first)
+        begin = clock.perf_counter()
+        heading = integrate(time, compensate(MODEL, output, temperature).rate, heading)[-1]
+        taken += clock.perf_counter() - begin
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return f'{count:.0e} samples in blocks of {block:.0e}: {1e9 * taken / count:.1f} ns a sample, peak memory {peak:.0f} MiB'
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--long', action='store_true', help='a hundred million samples in blocks, and nothing else')
+    if parser.parse_args().long:
+        print(long_log())
+    else:
+        print(side_by_side(), by_length(), sep='\n\n')
