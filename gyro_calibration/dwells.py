@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
+from scipy.special import digamma, polygamma
 
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
 
@@ -26,8 +27,13 @@ Numbers = NDArray[np.integer[Any]]
 _ROWS_OF_A_SWEEP = 4
 #: Blocks of consecutive dwells, where the order tells no sweeps.
 _BLOCKS = 9
-#: Batches of a dwell, whose scatter gives the deviation of the mean.
-_BATCHES = 12
+#: A dwell is divided into so many batches, whose scatter gives the deviation of the mean: fewer, where they got shorter than a vibration
+#: of the table, or an answer of the gyro's filter, needs to average out, s.
+_FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
+#: Samples that a dwell holds at least.
+_SAMPLES = 24
+#: The reference heading is looked at in blocks, s.
+_BLOCK = 0.1
 
 
 @dataclass(frozen=True)
@@ -66,12 +72,15 @@ class Steadiness:
 
     Attributes
     ----------
-    duration : shorter ones are left out, s
-    margin : cut at both ends at least, s; holds a time offset between gyro and reference away from the means
-    rate : the mean reference over a quarter of a second strays less than this from its middle, rad/s; less where the reference is quieter
-    relative : and less than this part of the rate, 1
+    duration : at least so long after all cuts, s
+    margin : cut at both ends at least, s; a time offset between gyro and reference stays out of the means
+    rate : the reference, smoothed over the margin, strays at most so far from its middle, rad/s; less where it is quieter
+    relative : and this part of the rate, 1
+    heading : a reference heading strays at most so far from a straight line, besides its steps, rad; less where it is straighter
     gap : over longer gaps nobody knows what the reference did, s
+    settling : a gyro takes no longer than this to settle, s
     temperature : a dwell that warms by more than this is divided, K
+    wild : a sample this many robust standard deviations from its neighbours is left out
 
     """
 
@@ -79,8 +88,31 @@ class Steadiness:
     margin: float = 0.25
     rate: float = 0.5 * DEGREE
     relative: float = 0.005
+    heading: float = 0.5 * DEGREE
     gap: float = 1.0
+    settling: float = 3.0
     temperature: float = 1.0
+    wild: float = 6.0
+
+
+class _Samples(NamedTuple):
+    """What of a log can be used: samples with output and reference, the latter a rate or a heading."""
+
+    time: Array
+    output: Array
+    rate: Array | None
+    heading: Array | None
+    temperature: Array | None
+    scale: float = 1.0
+
+    @property
+    def error(self) -> Array:
+        """Return what is steady in a dwell: the output, less what a reference rate explains of it."""
+        return self.output if self.rate is None else self.output - self.scale * self.rate
+
+    @property
+    def interval(self) -> float:
+        return float(np.median(np.diff(self.time)))
 
 
 def dwells(log: Log, name: str = '') -> Dwells:
@@ -224,34 +256,87 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
 
     """
     limits = limits or Steadiness()
-    output = _output(log)
-    time, rate = log.time, log.reference_rate
-    if time is None or rate is None:
-        raise DataRefused('the log holds no reference rate')
-    good = np.flatnonzero(np.isfinite(output) & np.isfinite(rate))
-    time, rate, output = time[good], rate[good], output[good]
-    temperature = None if log.temperature is None else log.temperature[good]
-    parts = [_cut(time, part, limits) for part in _steady(time, rate, limits)]
-    parts = [part for part in parts if part.stop > part.start + _BATCHES and time[part.stop - 1] - time[part.start] >= limits.duration]
-    if not parts:
-        raise DataRefused(f'the reference is nowhere steady to {limits.rate / DEGREE:g} deg/s for {limits.duration:g} s; '
-                          'hold each rate for longer, or use the heading itself with --method likelihood')
-    means = np.array([(rate[part].mean(), output[part].mean()) for part in parts])
-    deviation = np.array([_scatter(output[part] - rate[part]) for part in parts])
-    return Dwells(means[:, 0], means[:, 1], None if temperature is None else np.array([temperature[part].mean() for part in parts]),
-                  deviation, _sweeps(means[:, 0]), tuple(f'{time[part.start]:.1f} to {time[part.stop - 1]:.1f} s' for part in parts))
+    samples, remarks = _usable(log, limits)
+    if samples.rate is not None:
+        stretches = _steady(samples.time, samples.rate, limits)
+    else:
+        stretches = _straight(samples, limits)
+    stretches = [part for part in stretches if samples.time[part.stop - 1] - samples.time[part.start] > limits.duration]
+    samples = samples._replace(scale=_scale(samples, stretches))
+    found = [_Cleaned.of(samples, part, limits) for part in stretches]
+    rows, cuts = _settled(samples, [part.rows for part in found], limits)
+    rows, divided = _divided(samples, rows, limits)
+    rows = [part for part in rows if len(part) >= _SAMPLES and samples.time[part[-1]] - samples.time[part[0]] >= limits.duration]
+    if not rows:
+        raise DataRefused(_nothing_steady(samples, limits))
+    remarks += cuts + divided + _left_out(samples, rows, found) + _lost_samples(samples, rows)
+    return _means(samples, rows, tuple(remarks))
+
+
+def _scale(samples: _Samples, stretches: list[slice]) -> float:
+    """Return roughly how the output goes with the reference: it may run the other way, or count in units of its own."""
+    if samples.rate is not None:
+        rate = np.array([samples.rate[part].mean() for part in stretches])
+    else:
+        assert samples.heading is not None
+        rate = np.array([_slope(samples.time[part], samples.heading[part]) for part in stretches])
+    output = np.array([np.median(samples.output[part]) for part in stretches])
+    # Rests alone tell nothing of it.
+    return _slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
+
+
+def _nothing_steady(samples: _Samples, limits: Steadiness) -> str:
+    steady = (f'to {limits.rate / DEGREE:g} deg/s' if samples.rate is not None
+              else f'to {limits.rate / DEGREE:g} deg/s and straight to {limits.heading / DEGREE:g} deg')
+    return (f'in {samples.time[-1] - samples.time[0]:.0f} s the reference is nowhere steady {steady} for {limits.duration:g} s beside '
+            'the settling; hold each rate for longer, or use the heading itself with --method likelihood')
+
+
+def _usable(log: Log, limits: Steadiness) -> tuple[_Samples, list[str]]:
+    """Return the samples that have output and reference, not too near to where the reference was lost, and what was lost."""
+    output, time = _output(log), log.time
+    use_rate = log.reference_rate is not None and np.isfinite(log.reference_rate).any()
+    reference = log.reference_rate if use_rate else log.reference_heading
+    if time is None or reference is None:
+        raise DataRefused('the log has no time or no reference; to find dwells it needs time_s and one of reference_rate_dps and '
+                          'reference_heading_deg')
+    lost = ~np.isfinite(reference)
+    # A reference that gets lost errs before and after; the tracker loses its markers one by one.
+    reach = 2 * round(0.05 / float(np.median(np.diff(time)))) + 1
+    good = np.flatnonzero(~maximum_filter1d(lost, reach) & np.isfinite(output))
+    if len(good) < _SAMPLES:
+        raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and a reference; look at the columns')
+    samples = _Samples(time[good], output[good], reference[good] if use_rate else None, None if use_rate else reference[good],
+                       None if log.temperature is None else log.temperature[good])
+    return samples, list(_lost_reference(time, lost))
+
+
+def _lost_reference(time: Array, lost: Flags) -> Iterator[str]:
+    places = [f'{time[start]:.2f} s' for start, _ in _runs(lost)]
+    if places:
+        yield f'the reference was lost {_times(len(places))}, {lost.sum()} samples, at {_listed(places)}; they are left out'
+
+
+def _times(count: int) -> str:
+    return 'once' if count == 1 else f'{count} times'
+
+
+def _runs(flags: Flags) -> list[tuple[int, int]]:
+    """Return start and stop of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags, [0]])))
+    return [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2])]
 
 
 def _steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
     """Return the stretches whose reference rate is steady."""
     count = max(3, round(limits.margin / float(np.median(np.diff(time)))))
-    smooth = uniform_filter1d(rate, count, mode='nearest')
+    # A single wild sample of the reference must not break a dwell.
+    smooth = uniform_filter1d(median_filter(rate, 5, mode='nearest'), count, mode='nearest')
     stray = maximum_filter1d(smooth, count, mode='nearest') - minimum_filter1d(smooth, count, mode='nearest')
-    allowed = np.clip(3.0 * np.median(stray), 0.02 * DEGREE, limits.rate)
+    allowed = float(np.clip(3.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
     calm = stray <= allowed + limits.relative * np.abs(smooth)
     calm[1:] &= np.diff(time) <= limits.gap
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], calm, [0]])))
-    return [part for start, stop in zip(edges[::2], edges[1::2]) for part in _level(smooth, int(start), int(stop), allowed, limits)]
+    return [part for start, stop in _runs(calm) for part in _level(smooth, start, stop, allowed, limits)]
 
 
 def _level(smooth: Array, start: int, stop: int, allowed: float, limits: Steadiness) -> Iterator[slice]:
@@ -265,13 +350,344 @@ def _level(smooth: Array, start: int, stop: int, allowed: float, limits: Steadin
     yield slice(start, stop)
 
 
-def _cut(time: Array, part: slice, limits: Steadiness) -> slice:
-    """Cut the margin off both ends."""
-    begin, end = time[part.start] + limits.margin, time[part.stop - 1] - limits.margin
-    return slice(int(np.searchsorted(time, begin)), int(np.searchsorted(time, end, side='right')))
+def heading_step(heading: Array) -> float:
+    """Return the step of an encoder, rad, from the headings that occur; next to nothing where the heading has no steps."""
+    # Rounding in the file splits a step in two sizes, and fast turns leave codes out: neither the smallest nor the middle gap is it.
+    gaps = np.diff(np.unique(heading))
+    gaps = gaps[gaps > 1e-9]
+    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
 
 
-def _scatter(error: Array) -> float:
-    """Return the standard deviation of a mean, by batch means."""
-    batches = np.array([batch.mean() for batch in np.array_split(error, _BATCHES)])
-    return float(batches.std(ddof=1)) / math.sqrt(_BATCHES)
+def _straight(samples: _Samples, limits: Steadiness) -> list[slice]:
+    """Return the stretches whose reference heading is a straight line in time, but for the steps of its encoder."""
+    heading = samples.heading
+    assert heading is not None
+    step = heading_step(heading)
+    first = np.unique(np.floor((samples.time - samples.time[0]) / _BLOCK), return_index=True)[1]
+    counts = np.diff(np.append(first, len(heading)))
+    time, blocks = np.add.reduceat(samples.time, first) / counts, np.add.reduceat(heading, first) / counts
+    tolerance = step + _crookedness(time, blocks, limits)
+    edges = np.append(first, len(heading))
+    parts: list[slice] = []
+    for start, stop in _cones(time, blocks, 2.0 * tolerance, limits.gap):
+        part = _walked(time, blocks, start, stop, tolerance, step)
+        if part.stop - part.start > 4 and not (parts and part.start < parts[-1].stop):
+            parts.append(part)
+    whole = [slice(int(edges[part.start]), int(edges[part.stop])) for part in parts]
+    return [part for part in whole if _holds_its_slope(samples.time[part], heading[part], step, limits)]
+
+
+def _crookedness(time: Array, heading: Array, limits: Steadiness) -> float:
+    """Return by how much the heading strays from a straight line within about a second, mostly, rad; within the limits."""
+    reach = max(1, round(0.5 / _BLOCK))
+    if len(time) <= 2 * reach:
+        return limits.heading
+    chord = 0.5 * (heading[2 * reach:] + heading[:-2 * reach])
+    return float(np.clip(3.0 * np.median(np.abs(heading[reach:-reach] - chord)), 0.02 * DEGREE, limits.heading))
+
+
+def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[tuple[int, int]]:
+    """Divide a heading, from its start, into the longest stretches that a straight line through their first point meets."""
+    start, low, high = 0, -math.inf, math.inf
+    times, headings = time.tolist(), heading.tolist()
+    for place in range(1, len(times)):
+        since = times[place] - times[start]
+        rise = headings[place] - headings[start]
+        low, high = max(low, (rise - tolerance) / since), min(high, (rise + tolerance) / since)
+        if low > high or times[place] - times[place - 1] > gap:
+            yield start, place
+            start, low, high = place, -math.inf, math.inf
+    yield start, len(times)
+
+
+def _walked(time: Array, heading: Array, start: int, stop: int, tolerance: float, step: float) -> slice:
+    """Fit a line to the middle of a stretch, walk from there as far as it holds, and step back from the ramps."""
+    fifth = (stop - start) // 5
+    middle = slice(start + fifth, stop - fifth)
+    if middle.stop - middle.start < 3:
+        return slice(start, start)
+    slope = _slope(time[middle], heading[middle])
+    stray = np.abs(heading - heading[middle].mean() - slope * (time - time[middle].mean()))
+    beyond = np.flatnonzero(stray > tolerance)
+    before, after = beyond[beyond < start + fifth], beyond[beyond >= stop - fifth]
+    begin = 0 if not len(before) else int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step)
+    end = len(time) if not len(after) else int(after[0]) - _step_back(stray[after[0]:], tolerance, step)
+    return slice(begin, max(begin, end))
+
+
+def _step_back(stray: Array, tolerance: float, step: float) -> int:
+    """
+    Return how many blocks of a ramp hide within the tolerance, from how the heading strays beyond.
+
+    On a ramp it strays with the square of time, so the ratio of two strays tells when it began; a short ramp began later.
+
+    """
+    reach = round(0.5 / _BLOCK)
+    if len(stray) <= reach:
+        return 0
+    ratio = math.sqrt(max(1.0, stray[reach] / (tolerance + 0.5 * step)))
+    return math.ceil(min(3.0 / _BLOCK, reach / (ratio - 1.0) if ratio > 1.0 else math.inf))
+
+
+def _holds_its_slope(time: Array, heading: Array, step: float, limits: Steadiness) -> bool:
+    """Tell whether the quarters of a stretch have one slope: a slow swing is straight for a while, but not steady."""
+    quarters = [quarter for quarter in np.array_split(np.arange(len(time)), 4) if len(quarter) > 2]
+    slopes = np.array([_slope(time[quarter], heading[quarter]) for quarter in quarters])
+    blur = 8.0 * step / (time[-1] - time[0])
+    return bool(np.ptp(slopes) <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)
+
+
+def _slope(time: Array, heading: Array) -> float:
+    centred = time - time.mean()
+    return float(centred @ heading / (centred @ centred))
+
+
+class _Cleaned(NamedTuple):
+    """The rows of a stretch, and those that are left out of it."""
+
+    rows: Numbers
+    wild: Numbers
+    stuck: Numbers
+
+    @classmethod
+    def of(cls, samples: _Samples, part: slice, limits: Steadiness) -> _Cleaned:
+        rows = np.arange(part.start, part.stop)
+        stuck = _stuck(samples.output[part])
+        moving = rows[~stuck]
+        wild = _wild(samples.error[moving], limits.wild)
+        return cls(moving[~wild], moving[wild], rows[stuck])
+
+
+def _wild(error: Array, limit: float) -> Flags:
+    """Mark single samples far from their neighbours: neither a drift nor a vibration of the table is wild."""
+    if len(error) < 5:
+        return np.zeros(len(error), dtype=bool)
+    edged = np.pad(error, 2, mode='reflect')
+    apart = error - np.median([edged[:-4], edged[1:-3], edged[3:-1], edged[4:]], axis=0)
+    # An output of few codes agrees with its neighbours mostly: then the code is the measure.
+    spread = max(1.4826 * float(np.median(np.abs(apart))), heading_step(error), 1e-9)
+    return np.abs(apart) > limit * spread
+
+
+def _stuck(output: Array) -> Flags:
+    """Mark the repeats in runs of one value that are longer than the share of repeats in the stretch explains."""
+    repeats = np.concatenate([[False], np.diff(output) == 0.0])
+    share = repeats.mean()
+    # Most samples repeat: a gyro of coarse codes at rest, or a simulation without noise. That cannot be told from a stuck one.
+    if not 0.0 < share < 0.9:
+        return np.zeros(len(output), dtype=bool)
+    longest = math.log(1e-6 / len(output)) / math.log(share)
+    stuck = np.zeros(len(output), dtype=bool)
+    for start, stop in _runs(repeats):
+        stuck[start:stop] = stop - start > longest
+    return stuck
+
+
+def _settled(samples: _Samples, rows: list[Numbers], limits: Steadiness) -> tuple[list[Numbers], list[str]]:
+    """Cut off both ends as far as the gyro still, or already, answers a ramp there, and the margin at least."""
+    time, error = samples.time, samples.error
+    change = np.diff([np.median(samples.output[part]) for part in rows])
+    # Where much time passes between two dwells, what happened there is not the change from one to the other.
+    apart = np.array([time[later[0]] - time[part[-1]] for part, later in zip(rows, rows[1:])])
+    change = np.where(apart < 5.0, change, 0.0)
+    after = _settling(time, error, rows[1:], change, limits)
+    before = _settling(-time[::-1], error[::-1], [(len(time) - 1 - part)[::-1] for part in rows[:-1]], -change, limits)
+    after, before = max(after, limits.margin), max(before, limits.margin)
+    kept = [part[(time[part] >= time[part[0]] + after) & (time[part] <= time[part[-1]] - before)] for part in rows]
+    return kept, [f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away']
+
+
+def _settling(time: Array, error: Array, rows: list[Numbers], change: Array, limits: Steadiness) -> float:
+    """
+    Return for how long after a ramp the output is not yet what it stays at, s.
+
+    Whatever is linear (a filter, a delay) answers in proportion to the change of rate, so all dwells together show an answer that is
+    hidden in the noise of each. Its own scatter later in the dwells is the measure of what is seen.
+
+    """
+    interval = max(0.05, float(np.median(np.diff(time))))
+    lengths = np.array([time[part[-1]] - time[part[0]] for part in rows])
+    if not len(lengths):
+        return 0.0
+    count = int(min(np.quantile(lengths, 0.25), 10.0 * limits.settling) / interval)
+    edges = np.arange(count + 1) * interval
+    used = [(part, step) for part, step, length in zip(rows, change, lengths) if length >= edges[-1]]
+    answer = np.array([_binned(time[part] - time[part[0]], error[part], edges) for part, _ in used])
+    late = slice(count // 2, None)
+    weight = np.array([step for _, step in used])
+    if not weight.any():
+        return 0.0
+    answer = weight @ (answer - answer[:, late].mean(axis=1, keepdims=True)) / (weight @ weight)
+    return max(_last_seen(answer, width) for width in (1, 4)) * interval
+
+
+def _binned(time: Array, values: Array, edges: Array) -> Array:
+    """Return the mean of some values in each bin; bridges gaps."""
+    return np.diff(np.interp(edges, time, _integral(time, values))) / np.diff(edges)
+
+
+def _integral(time: Array, values: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (values[1:] + values[:-1]))])
+
+
+def _last_seen(answer: Array, width: int) -> int:
+    """Return the number of bins until the answer, averaged over some bins, stays within four of its later deviations."""
+    if len(answer) < 8 * width:
+        return 0
+    smooth = uniform_filter1d(answer, width, mode='nearest')
+    # An answer of 20 ppm of the change is not worth a cut, even where no noise hides it.
+    spread = max(float(smooth[len(smooth) // 2:].std()), 2e-5)
+    seen = np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread)
+    return 0 if not len(seen) else int(seen[-1]) + 1 + width // 2
+
+
+def _divided(samples: _Samples, rows: list[Numbers], limits: Steadiness) -> tuple[list[Numbers], list[str]]:
+    """Divide the dwells along which the temperature changes, so that its slope can be seen."""
+    if samples.temperature is None:
+        return rows, []
+    parts = [part for whole in rows for part in np.array_split(whole, _pieces(samples.temperature[whole], limits))]
+    more = len(parts) - len(rows)
+    remark = f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, which makes {more} more'
+    return parts, [remark] if more else []
+
+
+def _pieces(temperature: Array, limits: Steadiness) -> int:
+    if len(temperature) < _SAMPLES:
+        return 1
+    change = float(np.ptp([batch.mean() for batch in np.array_split(temperature, _MOST_BATCHES)]))
+    return max(1, math.ceil(change / limits.temperature))
+
+
+def _left_out(samples: _Samples, rows: list[Numbers], found: list[_Cleaned]) -> list[str]:
+    """Say which wild and stuck samples stand within the dwells."""
+    inside = _inside(samples.time, rows)
+    wild = [row for part in found for row in part.wild if inside[row]]
+    stuck = np.zeros(len(samples.time), dtype=bool)
+    stuck[[row for part in found for row in part.stuck]] = True
+    runs = _runs(stuck & inside)
+    remarks = []
+    if wild:
+        remarks.append(f'{len(wild)} wild samples are left out, at {_listed([f"{samples.time[row]:.2f} s" for row in wild])}')
+    if runs:
+        places = [f'{samples.time[start]:.2f} s ({stop - start} samples)' for start, stop in runs]
+        remarks.append(f'the output was stuck {_times(len(runs))}, at {_listed(places)}; the repeats are left out')
+    return remarks
+
+
+def _inside(time: Array, rows: list[Numbers]) -> Flags:
+    inside = np.zeros(len(time), dtype=bool)
+    for part in rows:
+        inside[part[0]:part[-1] + 1] = True
+    return inside
+
+
+def _lost_samples(samples: _Samples, rows: list[Numbers]) -> list[str]:
+    """Say how many samples are missing within the dwells, where the stamps are regular enough to tell."""
+    steps = np.diff(samples.time) / samples.interval
+    if np.mean(np.abs(steps - 1.0) > 0.25) > 0.1:
+        return ['the stamps are too irregular to count lost samples']
+    gaps = np.flatnonzero((steps > 1.5) & _inside(samples.time, rows)[1:])
+    lost = int(np.sum(np.round(steps[gaps]) - 1))
+    places = [f'{samples.time[gap]:.2f} s' for gap in gaps]
+    return [f'{lost} samples are missing within the dwells, at {_listed(places)}; at a steady rate that does no harm'] if lost else []
+
+
+def _means(samples: _Samples, rows: list[Numbers], remarks: tuple[str, ...]) -> Dwells:
+    """Average each dwell (Ojeda et al., eq. 6)."""
+    time, temperature = samples.time, samples.temperature
+    durations = np.array([time[part[-1]] - time[part[0]] for part in rows])
+    counts = np.clip(durations / _BATCH, _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
+    average = _average_rates if samples.rate is not None else _average_slopes
+    rate, mean, variance, blur = average(samples, rows, counts)
+    # White noise in a mean goes with 1 / duration, so dwells are alike in the product.
+    deviation = np.sqrt(moderated(variance * durations, counts - 1) / durations + blur ** 2)
+    return Dwells(rate, mean, None if temperature is None else np.array([temperature[part].mean() for part in rows]),
+                  np.where(deviation > 0.0, deviation, np.nan), _sweeps(rate),
+                  tuple(f'{time[part[0]]:.1f} to {time[part[-1]]:.1f} s' for part in rows), remarks)
+
+
+def _average_rates(samples: _Samples, rows: list[Numbers], counts: Numbers) -> tuple[Array, Array, Array, Array]:
+    """Average dwells against a rate: rate, output, the variance of the output against it, and nothing else that blurs it."""
+    assert samples.rate is not None
+    rate, output = (np.array([values[part].mean() for part in rows]) for values in (samples.rate, samples.output))
+    variance = [_variance([batch.mean() for batch in np.array_split(samples.error[part], count)]) for part, count in zip(rows, counts)]
+    return rate, output, np.array(variance), np.zeros(len(rows))
+
+
+def _average_slopes(samples: _Samples, rows: list[Numbers], counts: Numbers) -> tuple[Array, Array, Array, Array]:
+    """
+    Average dwells against a heading: rate, output, the variance of the output, and the deviation that the encoder's steps add.
+
+    The rate is the slope of the heading. The output is averaged by the slope of its integral, with the same weights, so that what the
+    table really does besides its steady rate is the same in both.
+
+    """
+    assert samples.heading is not None
+    step = heading_step(samples.heading)
+    times, headings = ([values[part] for part in rows] for values in (samples.time, samples.heading))
+    integrals = [_integral(samples.time[part], samples.output[part]) for part in rows]
+    rate, output = (np.array([_slope(*pair) for pair in zip(times, angles)]) for angles in (headings, integrals))
+    errors = [integral - samples.scale * heading for integral, heading in zip(integrals, headings)]
+    # Both scatters hold too much: what the table does, or the encoder's steps. The smaller one holds less of it.
+    scatters = [np.array([_variance(_batch_slopes(*each)) for each in zip(times, angles, counts)]) for angles in (integrals, errors)]
+    variance = min(scatters, key=lambda scatter: float(np.median(scatter)))
+    blur = abs(samples.scale) * np.array([_blur(heading, step, time[-1] - time[0]) for heading, time in zip(headings, times)])
+    return rate, output, variance, blur
+
+
+def _variance(batches: Sequence[float]) -> float:
+    """Return the variance of the mean of some batches: what is correlated within a batch is counted once."""
+    return float(np.var(batches, ddof=1)) / len(batches)
+
+
+def _batch_slopes(time: Array, angle: Array, count: int) -> list[float]:
+    return [_slope(time[batch], angle[batch]) for batch in np.array_split(np.arange(len(time)), count)]
+
+
+def _blur(heading: Array, step: float, duration: float) -> float:
+    """
+    Return the standard deviation of a heading's slope that the steps of an ideal encoder cause, rad/s.
+
+    Over M steps it is about step / (3 M duration), but that of samples that fall on the steps by chance at least; below a step, 0.6
+    step / duration (by simulation). A heading that stays on one step for the whole dwell is a rest: nothing turns that slowly.
+
+    """
+    if np.ptp(heading) < 0.5 * step:
+        return 0.0
+    steps = abs(heading[-1] - heading[0]) / step
+    return step / duration * math.hypot(0.35 / max(steps, 0.6), 0.4 / math.sqrt(len(heading)))
+
+
+def moderated(variance: Array, freedom: Array) -> Array:
+    """
+    Move each of some variances toward what they have in common, the more the less each knows and the more they agree.
+
+    A variance out of a dozen batches errs by 40 %; weights made of it would be chance, and the smallest ones would rule the fit.
+    Empirical Bayes with an inverse gamma prior (Smyth 2004, sections 3 and 6.2): the scatter of their logarithms beyond that of
+    chance tells the degrees of freedom of the prior.
+
+    Parameters
+    ----------
+    variance : shape (n,)
+    freedom : degrees of freedom of each, shape (n,)
+
+    """
+    known = variance > 0.0
+    if known.sum() < 3:
+        return variance
+    own = freedom[known] / 2.0
+    logarithm = np.log(variance[known]) - digamma(own) + np.log(own)
+    excess = float(logarithm.var(ddof=1) - polygamma(1, own).mean())
+    if excess <= 0.0:
+        return np.full(len(variance), np.average(variance[known], weights=own))
+    prior = 2.0 * _inverse_trigamma(excess)
+    common = math.exp(logarithm.mean() + digamma(prior / 2.0) - math.log(prior / 2.0))
+    return np.where(known, (prior * common + freedom * variance) / (prior + freedom), common)
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Solve trigamma(x) = value by Newton's steps on 1 / trigamma, which is nearly straight (Smyth 2004, appendix)."""
+    x = 0.5 + 1.0 / value
+    for _ in range(20):
+        x += float(polygamma(1, x) * (1.0 - polygamma(1, x) / value) / polygamma(2, x))
+    return x
