@@ -1,0 +1,142 @@
+"""What is found when a source is worked through again: its numbers beside ours, and where it contradicts itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, TypeVar
+
+Item = TypeVar('Item')
+#: Goes through some repetitions, and may show how far it has come.
+Progress = Callable[[Iterable[Item]], Iterable[Item]]
+
+
+def unseen(items: Iterable[Item]) -> Iterable[Item]:
+    """Go through repetitions and show nothing."""
+    return items
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    One published number beside ours, both in the unit of the source.
+
+    Attributes
+    ----------
+    quantity, unit : what it is
+    ours : the number that comes out here
+    published : as it is printed, for its last digit says how exact it is; ``< 2`` is a bound, ``~ 10`` an order of magnitude, and where
+        it is empty the source has no such number
+    place : where the source has it
+    uncertainty : how far ours may be from what endless repetition would give
+    why : in a few words, why ours differs, if it does
+    note : in a few words, what to know in any case
+    own_figures : ours follows from other figures of the source alone, so that a difference is a contradiction within it
+
+    """
+
+    quantity: str
+    unit: str
+    ours: float
+    published: str = ''
+    place: str = ''
+    uncertainty: float = 0.0
+    why: str = ''
+    note: str = ''
+    own_figures: bool = False
+
+    @property
+    def value(self) -> float:
+        """Return the published number; nan where there is none."""
+        return float(self.published.lstrip('<~ ')) if self.published else math.nan
+
+    @property
+    def agrees(self) -> bool:
+        """Tell whether ours is the published number, within its last digit and the uncertainty of ours."""
+        if self.published.startswith('<'):
+            return self.ours + self.uncertainty < self.value
+        if self.published.startswith('~'):
+            return self.ours * self.value > 0.0 and round(math.log10(self.ours / self.value)) == 0
+        return abs(self.ours - self.value) <= 0.5 * 10.0 ** -_decimals(self.published) * (1.0 + 1e-9) + self.uncertainty
+
+    @property
+    def verdict(self) -> str:
+        """Return what the comparison says; empty where nothing is published."""
+        if not self.published:
+            return ''
+        if self.agrees:
+            return 'reproduced'
+        return 'contradicts itself' if self.own_figures else 'differs'
+
+    def data(self) -> dict[str, Any]:
+        """Return all that there is to say, by name."""
+        return {**asdict(self), 'verdict': self.verdict}
+
+    def cells(self) -> tuple[str, ...]:
+        """Return quantity, unit, place, published, ours and verdict as words for people."""
+        ours = _rounded(self.ours, self.uncertainty, self.published)
+        verdict = '; '.join(filter(None, [': '.join(filter(None, [self.verdict, '' if self.agrees else self.why])), self.note]))
+        return self.quantity, self.unit, self.place, self.published or '-', ours, verdict
+
+
+def _rounded(ours: float, uncertainty: float, published: str) -> str:
+    """Return ours with two digits of its uncertainty, or with one digit more than is published."""
+    if uncertainty:
+        digits = max(0, 1 - math.floor(math.log10(uncertainty)))
+        return f'{ours:.{digits}f} +- {uncertainty:.{digits}f}'
+    if not published:
+        return f'{ours:.3g}' if abs(ours) > 1e-6 else '0'
+    return f'{ours + 0.0:.{_decimals(published) + 1}f}'
+
+
+def _decimals(number: str) -> int:
+    return len(number.partition('.')[2])
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """
+    What does not hold in a source, shown by numbers that were just computed.
+
+    Attributes
+    ----------
+    numbers : by name, in the units that the sentence says
+    pattern : the sentence, with the numbers' names in braces
+
+    """
+
+    numbers: Mapping[str, float]
+    pattern: str
+
+    @property
+    def sentence(self) -> str:
+        """Return the sentence with its numbers."""
+        return self.pattern.format(**self.numbers)
+
+    def data(self) -> dict[str, Any]:
+        """Return sentence and numbers."""
+        return {'sentence': self.sentence, 'numbers': dict(self.numbers)}
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """
+    What became of a source.
+
+    Attributes
+    ----------
+    title : authors, title and year
+    assumed : what the source does not say and was chosen here, one sentence each
+
+    """
+
+    title: str
+    assumed: tuple[str, ...]
+    comparisons: tuple[Comparison, ...]
+    contradictions: tuple[Contradiction, ...]
+
+    def data(self) -> dict[str, Any]:
+        """Return everything by name."""
+        return {'title': self.title, 'assumed': list(self.assumed), 'comparisons': [each.data() for each in self.comparisons],
+                'contradictions': [each.data() for each in self.contradictions]}
