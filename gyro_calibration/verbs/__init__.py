@@ -6,6 +6,6 @@ converted here, at the rim.
 
 """
 
-from gyro_calibration.verbs import compensate, demo, emulate, reproduce, self_calibrate, simulate
+from gyro_calibration.verbs import allan, compensate, demo, emulate, reproduce, self_calibrate, simulate
 
-VERBS = (compensate, self_calibrate, simulate, emulate, reproduce, demo)
+VERBS = (compensate, self_calibrate, allan, simulate, emulate, reproduce, demo)
