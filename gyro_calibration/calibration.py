@@ -350,7 +350,7 @@ def _calibration(dwells: Dwells, terms: tuple[Term, ...], whitener: _Whitener) -
     left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
     left_out[kept], deviation[kept] = _left_out(orthogonal, whitened, whitener), whitener.deviation
     misfit = float(whitened @ whitened)
-    model = _model(used, terms, _covariance(triangle, lengths, misfit, freedom))
+    model = _model(used, terms, _covariance(used, terms, whitener, misfit, freedom))
     return Calibration(model, dwells, whitener.scatter, error_of(dwells, terms), left_out, deviation, float(np.linalg.cond(triangle)),
                        freedom, misfit)
 
@@ -365,13 +365,30 @@ def _left_out(orthogonal: Array, whitened: Array, whitener: _Whitener) -> Array:
     return left_out
 
 
-def _covariance(triangle: Array, lengths: Array, misfit: float, freedom: int) -> Array | None:
+def _covariance(dwells: Dwells, terms: Sequence[Term], whitener: _Whitener, misfit: float, freedom: int) -> Array | None:
     """Return the covariance, wider by Student's factor and where the effects leave more than the scatter; None with no dwell to spare."""
     if freedom == 0:
         return None
+    alone = replace(whitener.scatter, sweep_bias=0.0, sweep_scale=0.0)
+    covariance, without_sweeps = (_inverse(*_factor(dwells, terms, each)[1:]) for each in (whitener, _Whitener(dwells, alone)))
+    share = np.clip(1.0 - np.diag(without_sweeps) / np.diag(covariance), 0.0, 1.0)
+    # Satterthwaite (1946): the part that sweeps have in common is known from few values, the other from many
+    freedoms = 1.0 / (share ** 2 / _sweep_freedom(dwells) + (1.0 - share) ** 2 / freedom)
+    widened = student.ppf(0.975, freedoms) / 1.959964 * math.sqrt(max(misfit / freedom, 1.0))
+    return covariance * np.outer(widened, widened)
+
+
+def _sweep_freedom(dwells: Dwells) -> float:
+    """Return the number of sweeps, less what of the surface differs from sweep to sweep as their biases do."""
+    sweeps, surface = _sweeps(dwells), _surface(dwells)
+    shared = sum(float(np.sum(surface[rows].sum(axis=0) ** 2)) / rows.sum() for rows in sweeps)
+    return max(len(sweeps) - shared, 1.0)
+
+
+def _inverse(triangle: Array, lengths: Array) -> Array:
+    """Return the covariance of the values from R of their whitened columns."""
     inverse = solve_triangular(triangle, np.eye(len(lengths))) / lengths[:, None]
-    widened = float(student.ppf(0.975, freedom)) / 1.959964 * math.sqrt(max(misfit / freedom, 1.0))
-    return inverse @ inverse.T * widened ** 2
+    return inverse @ inverse.T
 
 
 def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
