@@ -9,9 +9,15 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.allan import AllanChart, NoiseFit
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.calibration import Calibration
+from gyro_calibration.dwells import Dwells
+from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.model import GyroModel
+from gyro_calibration.turn import TurnErrors
 
 _STYLES = ('-', '--', '-.', ':')
+#: Grey shades from light to dark; neither end vanishes on paper or in ink.
+_GREYS = ('0.78', '0.0')
 
 
 def draw_headings(path: str | Path, time: Array, true: Array, headings: Mapping[str, Array]) -> None:
@@ -90,3 +96,155 @@ def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
     """Write the symbol at the place where IEEE Std 952 reads the figure, or at the end of the line that comes nearest to it."""
     at = int(np.argmin(np.abs(np.log(times / {'N': 1.0, 'K': 3.0}.get(symbol, times[len(times) // 2])))))
     axes.annotate(symbol, (times[at], line[at]), xytext=(0, 6), textcoords='offset points', fontsize=13, weight='bold', ha='center')
+
+
+# rate tables
+
+def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[float, float], temperature_range: tuple[float, float],
+                       dwells: Dwells | None = None) -> None:
+    """
+    Draw the error that a model takes off, over output and temperature (as figure 6 of Ojeda et al.).
+
+    Parameters
+    ----------
+    path : the ending says which format, .png or .svg
+    model : of the gyro
+    rate_range : of the output, rad/s
+    temperature_range : degC; where it is not finite, a single curve is drawn at the model's reference temperature
+    dwells : measured errors, drawn as dots
+
+    """
+    output = np.linspace(*rate_range, 161)
+    thermal = bool(np.isfinite(temperature_range).all() and temperature_range[0] < temperature_range[1])
+    figure, panels = _panels(1, 2 if thermal else 1, (11, 5) if thermal else (7, 5))
+    if thermal:
+        _draw_contours(panels[0, 0], model, output, np.linspace(*temperature_range, 81), dwells)
+    temperatures = np.linspace(*temperature_range, 4) if thermal else np.array([model.reference_temperature])
+    axes = panels[0, -1]
+    if dwells is not None:
+        axes.plot(dwells.output / DEGREE, (dwells.output - dwells.rate) / DEGREE, '.', color='0.6', markersize=3, label='measured')
+    for temperature, style in zip(temperatures, _STYLES):
+        error = output - model.rate(output, np.full(len(output), temperature))
+        axes.plot(output / DEGREE, error / DEGREE, style, color='black', label=f'model at {temperature:.1f} °C' if thermal else 'model')
+    axes.set(xlabel='gyro output [deg/s]', ylabel='error: output less rate [deg/s]', title='Error over the output')
+    axes.legend(loc='best')
+    axes.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array, dwells: Dwells | None) -> None:
+    across, up = np.meshgrid(output, temperature)
+    error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
+    levels = _levels(error)
+    axes.contourf(across / DEGREE, up, error, levels=levels, cmap='Greys', alpha=0.45, extend='both')
+    lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
+    if dwells is not None and dwells.temperature is not None:
+        axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
+    for text in axes.clabel(lines, fontsize=9):
+        text.set_clip_on(False)  # a label at the edge is read all the same
+        text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
+    axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title='Error of the model [deg/s]; dots: dwells'
+             if dwells is not None else 'Error of the model [deg/s]')
+
+
+def _levels(error: Array) -> Array:
+    """Return about ten round levels."""
+    from matplotlib.ticker import MaxNLocator
+    low, high = float(error.min()), float(error.max())
+    return np.asarray(MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, high if high > low else low + 1e-6))
+
+
+def draw_residuals(path: str | Path, calibration: Calibration) -> None:
+    """
+    Draw the errors of dwells before and after a model, by rate and by temperature (as figures 5 and 7 of Ojeda et al.).
+
+    Parameters
+    ----------
+    path : the ending says which format, .png or .svg
+    calibration : with the dwells, what the model leaves of their errors, and which are outlying
+
+    """
+    dwells, kept = calibration.dwells, calibration.scatter.kept
+    rate = dwells.rate / DEGREE
+    columns = [(rate, 'rate [deg/s]', dwells.temperature, 'temperature [°C]')]
+    if dwells.temperature is not None:
+        columns.append((dwells.temperature, 'temperature [°C]', rate, 'rate [deg/s]'))
+    rows = [(dwells.output - dwells.rate, 'output less rate [deg/s]', 'Before', ''),
+            (calibration.residual, 'residual [deg/s]', 'After', f', left-out sweeps {_rms(calibration.left_out[kept]):.3g} deg/s')]
+    figure, panels = _panels(2, len(columns), (5.5 * len(columns) + 0.5, 8))
+    for column, (across, label, shade, shade_label) in enumerate(columns):
+        for row, (error, name, when, more) in enumerate(rows):
+            axes = panels[row, column]
+            dots = _draw_errors(axes, across, error / DEGREE, kept, shade)
+            axes.set(xlabel=label, ylabel=name, title=f'{when}: rms {_rms(error[kept]):.3g} deg/s' + more)
+        if shade is not None:
+            figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom', aspect=40, shrink=0.9)
+    _save(figure, path)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values ** 2))) / DEGREE
+
+
+def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None) -> Any:
+    """Draw errors as dots in a shade, on the scale of those that are kept; what is beyond is drawn at the edge."""
+    dots = axes.scatter(across[kept], error[kept], c='black' if shade is None else shade[kept], cmap=_shades(), s=7, linewidths=0)
+    low, high = float(error[kept].min()), float(error[kept].max())
+    margin = 0.12 * (high - low) or 1e-3
+    axes.set_ylim(low - margin, high + margin)
+    if not kept.all():
+        axes.plot(across[~kept], np.clip(error[~kept], low - 0.6 * margin, high + 0.6 * margin), 'x', color='black', markersize=8,
+                  label=f'outlying, not fitted ({np.count_nonzero(~kept)})')
+        axes.legend(loc='best')
+    axes.axhline(0.0, color='black', linewidth=0.5)
+    axes.grid(alpha=0.3)
+    return dots
+
+
+def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> None:
+    """
+    Draw the errors of full turns with a static bias only and with the model, each on its own scale (figures 8 and 9 of Ojeda et al.).
+
+    Parameters
+    ----------
+    path : the ending says which format, .png or .svg
+    errors : of turns
+    slowest : of the turns, rad/s
+
+    """
+    figure, panels = _panels(2, 1, (8.5, 8))
+    temperature = errors.temperature
+    for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled), ('static bias only', 'the model and its static bias')):
+        dots = axes.scatter(errors.rate / DEGREE, error / DEGREE, c='black' if temperature is None else temperature, cmap=_shades(), s=9,
+                            linewidths=0)
+        limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
+        axes.axvspan(-slowest / DEGREE, slowest / DEGREE, facecolor='none', edgecolor='0.7', hatch='///', linewidth=0)
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        axes.set(xlabel='rate [deg/s]', ylabel='error [deg per turn]', ylim=(-limit, limit),
+                 title=f'Error of a turn of 360 deg with {words}: largest {np.abs(error).max() / DEGREE:.3g} deg')
+        percent = axes.secondary_yaxis('right', functions=(lambda degrees: degrees / 3.6, lambda percents: percents * 3.6))
+        percent.set_ylabel('error [% of a turn]')
+        axes.grid(alpha=0.3)
+    figure.supxlabel(f'hatched: slower than {slowest / DEGREE:g} deg/s, left out', fontsize=9)
+    if temperature is not None:
+        figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
+    _save(figure, path)
+
+
+def _panels(rows: int, columns: int, inches: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure and its panels, shape (rows, columns)."""
+    import matplotlib  # not needed on a robot, and slow to load
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+    return pyplot.subplots(rows, columns, figsize=inches, layout='constrained', squeeze=False)
+
+
+def _shades() -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+    return LinearSegmentedColormap.from_list('greys', _GREYS)
+
+
+def _save(figure: Any, path: str | Path) -> None:
+    from matplotlib import pyplot
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

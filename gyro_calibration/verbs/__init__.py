@@ -6,6 +6,6 @@ converted here, at the rim.
 
 """
 
-from gyro_calibration.verbs import allan, compensate, demo, emulate, reproduce, self_calibrate, simulate
+from gyro_calibration.verbs import allan, compensate, demo, emulate, reproduce, self_calibrate, simulate, turn
 
-VERBS = (compensate, self_calibrate, allan, simulate, emulate, reproduce, demo)
+VERBS = (compensate, self_calibrate, allan, turn, simulate, emulate, reproduce, demo)

@@ -1,0 +1,187 @@
+"""
+What a gyro's error makes of a full turn of 360 degrees (Ojeda et al., section 4).
+
+A rate that is wrong by so many rad/s makes a turn wrong by so many rad a turn, the more the slower the turn is. Two errors are compared:
+with nothing but the bias that a rest before the mission gives, and with a model and then the bias that is left at rest.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gyro_calibration.calibration import Calibration, fit_effects, take
+from gyro_calibration.compensation import compensate
+from gyro_calibration.dwells import Dwells, Numbers
+from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
+
+#: Slower turns take so long that their error says more of the bias than of the gyro's scale; as published.
+SLOWEST = 5.0 * DEGREE
+#: A dwell that turns slower than this is a rest.
+AT_REST = 0.1 * DEGREE
+
+
+@dataclass(frozen=True)
+class TurnErrors:
+    """
+    Errors of full turns, counter-clockwise positive as the heading is, each array of shape (n,).
+
+    Attributes
+    ----------
+    rate : true rate of the turn, rad/s
+    temperature : degC; None where the log holds none
+    static : with the static bias only, rad per turn
+    modelled : with the model, and the static bias after it, rad per turn
+    sweep : that the turn was measured in
+    place : where it stands in its file
+    remarks : where the static bias comes from, and what has no error, one sentence each
+
+    """
+
+    rate: Array
+    temperature: Array | None
+    static: Array
+    modelled: Array
+    sweep: Numbers
+    place: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rate)
+
+
+def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnErrors:
+    """
+    Return the errors of full turns at the rates and temperatures of some dwells.
+
+    Parameters
+    ----------
+    dwells : without those that are outlying
+    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); nan where there is none, as from `predicted_rates`
+    slowest : of a turn, rad/s
+
+    Raises
+    ------
+    DataRefused : nothing turns as fast as that with a rate by the model, or nothing shows the static bias
+
+    """
+    rests, remark = _rests(dwells)
+    turning, known = np.abs(dwells.rate) >= slowest, np.isfinite(rate)
+    wanted = turning & known
+    if not wanted.any():
+        raise DataRefused(f'none of {len(dwells)} dwells turns at {slowest / DEGREE:g} deg/s or faster and has a rate by the model; '
+                          'record faster turns, or several sweeps')
+    nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
+    # eq. 1 and 2, and eq. 13, 15 and 16
+    static, modelled = (_turned(dwells, error, wanted, nearest) for error in (dwells.output - dwells.rate, rate - dwells.rate))
+    turns = take(dwells, wanted)
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place, (remark, *_unknown(turning & ~known)))
+
+
+def _unknown(lost: Mask) -> Iterator[str]:
+    if lost.any():
+        yield f'{np.count_nonzero(lost)} turns are left out: the other sweeps do not determine the model'
+
+
+def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
+    """Return what errors of a rate, rad/s, less those at rest, add up to in a turn, rad (eq. 14)."""
+    bias = np.array([rest.bias(error) for rest in nearest])
+    return (error[wanted] - bias) * 2.0 * math.pi / np.abs(dwells.rate[wanted])
+
+
+# static bias
+
+@dataclass(frozen=True)
+class _Rest:
+    """The dwells of a sweep that show the static bias, and what each of them counts, shape (k,)."""
+
+    sweep: int
+    temperature: float
+    dwells: Numbers
+    weights: Array
+
+    def bias(self, error: Array) -> float:
+        """Return the error at rest, rad/s, from that of all dwells, shape (n,)."""
+        return float(self.weights @ error[self.dwells])
+
+
+def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
+    """Return what shows the static bias: the rests of the sweeps, or where there is none the slowest turns both ways."""
+    numbers = np.unique(dwells.sweep)
+    for find, words in ((_at_rest, 'the rest'), (_between_turns, 'no rest: the error between the slowest turns both ways')):
+        found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
+        if found:
+            others = len(numbers) - len(found)
+            more = f'; {others} of {len(numbers)} sweeps have none and take that of the nearest temperature' if others else ''
+            return found, f'the static bias is from {words} of each sweep{more}'
+    raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing shows the static bias; '
+                      'record a rest before each sweep')
+
+
+def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
+    """Return the rests of a sweep (eq. 1)."""
+    rows = np.flatnonzero((dwells.sweep == number) & (np.abs(dwells.rate) <= AT_REST))
+    return _rest(dwells, number, rows, np.full(len(rows), 1.0)) if len(rows) else None
+
+
+def _between_turns(dwells: Dwells, number: int) -> _Rest | None:
+    """Return the slowest turn each way of a sweep: the line between their errors passes rest."""
+    ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0)) for way in (1.0, -1.0)]
+    if not all(map(len, ways)):
+        return None
+    rows = np.array([rows[np.argmin(np.abs(dwells.rate[rows]))] for rows in ways])
+    return _rest(dwells, number, rows, np.abs(dwells.rate[rows[::-1]]))
+
+
+def _rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _Rest:
+    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[rows].mean())
+    return _Rest(number, temperature, rows, weights / weights.sum())
+
+
+def _nearest(dwells: Dwells, place: int, rests: list[_Rest]) -> _Rest:
+    """Return the rest of a dwell's own sweep, or else the one nearest in temperature, and in order where no temperature tells."""
+    sweep = int(dwells.sweep[place])
+    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[place])
+    return min(rests, key=lambda rest: (rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
+
+
+# rates by a model
+
+def predicted_rates(calibration: Calibration) -> Array:
+    """
+    Return the rate of each dwell by a model that never saw its sweep, rad/s, shape (n,); nan where the other sweeps do not give one.
+
+    The effects are those of the calibration, their values are fitted anew to the other sweeps. In a single sweep, it is the dwell alone
+    that is left out.
+
+    """
+    dwells, rates = calibration.dwells, np.full(len(calibration.dwells), np.nan)
+    groups = dwells.sweep if len(np.unique(dwells.sweep)) > 1 else np.arange(len(dwells))
+    for number in np.unique(groups):
+        hidden = groups == number
+        scatter = replace(calibration.scatter, kept=calibration.scatter.kept[~hidden])
+        try:
+            model = fit_effects(take(dwells, ~hidden), calibration.effects, scatter).model
+        except DataRefused:
+            continue
+        left_out = take(dwells, hidden)
+        rates[hidden] = compensate(model, left_out.output, left_out.temperature).rate
+    return rates
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large some errors are: root mean square and largest absolute value, rad per turn, and how many they are."""
+
+    rms: float
+    largest: float
+    count: int
+
+
+def size(errors: Array) -> Size:
+    """Return how large some errors are, shape (n,) with n above 0."""
+    return Size(float(np.sqrt(np.mean(errors ** 2))), float(np.abs(errors).max()), len(errors))

@@ -1,0 +1,283 @@
+"""The error of a full turn: by hand, against turns that are simulated and integrated, and as the program tells it."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyro_calibration.calibration import fit_effects, take
+from gyro_calibration.command_line import main
+from gyro_calibration.compensation import compensate
+from gyro_calibration.dwells import Dwells, dwells
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE, rate_temperature_polynomial
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.motion import from_rates
+from gyro_calibration.noise import Noise
+from gyro_calibration.simulation import simulate
+from gyro_calibration.turn import predicted_rates, size, turn_errors
+
+TURN = 2.0 * math.pi
+
+
+def table(rates, errors, temperature=None, sweep=None):
+    """Return the dwells of a rate table from rates and errors in deg/s."""
+    rate = np.array(rates, dtype=float) * DEGREE
+    number = np.zeros(len(rate), dtype=int) if sweep is None else np.array(sweep)
+    degc = None if temperature is None else np.array(temperature, dtype=float)
+    return Dwells(rate, rate + np.array(errors) * DEGREE, degc, np.full(len(rate), np.nan), number,
+                  tuple(f'row {place + 1}' for place in range(len(rate))))
+
+
+def static(found):
+    """Return the errors with the static bias only, deg per turn; the model is one that does nothing."""
+    return turn_errors(found, found.output).static / DEGREE
+
+
+# the published formulas, by hand
+
+HAND = table([0.0, 10.0, -20.0], [0.1, 0.15, 0.06])
+
+
+def test_a_turn_at_10_deg_s_takes_36_s_and_one_at_20_takes_18():
+    assert static(HAND) == pytest.approx([0.05 * 36.0, -0.04 * 18.0])
+
+
+def test_the_static_bias_after_the_model_is_that_of_the_compensated_rest():
+    errors = turn_errors(HAND, HAND.rate + np.array([0.02, 0.03, 0.01]) * DEGREE)
+    assert errors.modelled / DEGREE == pytest.approx([0.01 * 36.0, -0.01 * 18.0])
+
+
+def test_a_bias_changes_nothing_since_a_rest_shows_it():
+    later = replace(HAND, output=HAND.output + 0.7 * DEGREE)
+    assert static(later) == pytest.approx(static(HAND))
+
+
+def test_slow_turns_are_left_out_and_a_rest_is_no_turn():
+    found = table([0.0, 4.9, -4.9, 5.1, -60.0], [0.0] * 5)
+    assert turn_errors(found, found.output).rate / DEGREE == pytest.approx([5.1, -60.0])
+    assert turn_errors(found, found.output, 1.0 * DEGREE).place == ('row 2', 'row 3', 'row 4', 'row 5')
+
+
+def test_every_sweep_has_its_own_rest_and_one_without_takes_that_of_the_nearest_temperature():
+    found = table([0, 10, 0, 10, 10], [0.1, 0.2, 0.5, 0.6, 0.6], [20, 21, 40, 41, 38], [0, 0, 1, 1, 2])
+    errors = turn_errors(found, found.output)
+    assert errors.static / DEGREE == pytest.approx([3.6, 3.6, 3.6])
+    assert '1 of 3 sweeps have none' in errors.remarks[0]
+
+
+def test_without_a_rest_the_error_between_the_slowest_turns_both_ways_stands_for_it_and_it_is_said():
+    rates = np.array([-30.0, -10.0, 6.0, 30.0])
+    errors = turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
+    assert errors.static == pytest.approx(TURN * 0.01 * np.sign(rates))
+    assert 'no rest' in errors.remarks[0]
+
+
+def test_a_table_with_neither_rest_nor_turns_both_ways_is_refused():
+    found = table([10.0, 20.0, 30.0], [0.0] * 3)
+    with pytest.raises(DataRefused, match='record a rest'):
+        turn_errors(found, found.output)
+
+
+def test_a_table_of_rests_is_refused():
+    found = table([0.0, 0.0, 3.0], [0.0] * 3)
+    with pytest.raises(DataRefused, match='none of 3 dwells turns at 5 deg/s'):
+        turn_errors(found, found.output)
+
+
+# a real turn
+
+NOISE = Noise(angle_random_walk=5e-5)
+GYRO = GyroModel((Term(BIAS, (0.004,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(SINE_RESPONSE, (0.3, 1.0))), noise=NOISE)
+#: Its calibration is not quite right.
+MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)), Term(SINE_RESPONSE, (0.25, 1.0))))
+
+
+@pytest.mark.parametrize('rate', [7.2, -12.0, 36.0, -90.0])
+def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
+    found = table([0.0, rate], [0.0, 0.0])
+    found = replace(found, output=GYRO.output(found.rate, np.full(2, 25.0)))
+    errors = turn_errors(found, compensate(MODEL, found.output).rate)
+    rest, lasts = 10.0, 360.0 / abs(rate)
+    motion = from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]), np.array([0, 0, rate, rate, 0]) * DEGREE)
+    log = simulate(GYRO, motion, 10.0, np.random.default_rng(1))
+    assert log.reference_heading[-1] == pytest.approx(math.copysign(TURN, rate))
+    deviation = NOISE.angle_random_walk * math.sqrt(lasts + lasts ** 2 / rest)
+    for expected, output in ((errors.static[0], log.output), (errors.modelled[0], compensate(MODEL, log.output).rate)):
+        turned = integrate(log.time[100:], output[100:] - output[:100].mean())[-1] - math.copysign(TURN, rate)
+        # The ramps of 0.1 s, at other rates than the turn, may add the error of a tenth of a second.
+        assert turned == pytest.approx(expected, abs=4.0 * deviation + 0.1 * abs(expected) / lasts)
+        assert abs(expected) > 5.0 * deviation, 'the claim would be lost in the noise'
+
+
+# predictions
+
+def sweeps(generator=None, odd=None):
+    """Return four sweeps of a gyro with a bias and a scale factor error; an odd one has a scale factor of its own."""
+    rates = np.tile(np.arange(-60.0, 61.0, 10.0), 4)
+    number = np.repeat(np.arange(4), 13)
+    errors = 0.2 + 0.01 * rates + np.where(number == odd, 0.02 * rates, 0.0)
+    return table(rates, errors if generator is None else errors + generator.normal(0.0, 0.01, len(rates)), sweep=number)
+
+
+def test_a_sweep_has_no_part_in_the_model_that_corrects_it():
+    found = sweeps(odd=2)
+    fit = fit_effects(take(found, found.sweep != 2), (BIAS, SCALE_FACTOR_ERROR))
+    scatter = replace(fit.scatter, kept=np.full(len(found), True))
+    rate = predicted_rates(replace(fit, dwells=found, scatter=scatter))[found.sweep == 2]
+    turning = found.rate[found.sweep == 2]
+    # rate by the model = output less bias, over 1.01; the output holds 1.03 times the rate
+    assert rate == pytest.approx(turning * 1.03 / 1.01, abs=1e-9)
+
+
+def test_errors_that_are_nothing_but_scatter_are_predicted_as_large_as_they_are():
+    found = sweeps(np.random.default_rng(3))
+    rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    assert size(rate - found.rate).rms / DEGREE == pytest.approx(0.01, rel=0.3)
+
+
+def test_a_single_sweep_is_predicted_dwell_by_dwell():
+    found = take(sweeps(), sweeps().sweep == 0)
+    assert predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR))) == pytest.approx(found.rate, abs=1e-9)
+
+
+def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_said():
+    found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1, 0.1, 0.1], sweep=[0, 0, 0, 1, 1, 1])
+    rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+    assert np.isnan(rate[:3]).all()
+    with pytest.raises(DataRefused, match='record faster turns, or several sweeps'):
+        turn_errors(found, rate)
+
+
+def test_the_measured_gyro_errs_by_less_than_2_percent_and_one_order_of_magnitude_less_with_the_published_polynomial(data):
+    found = dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
+    fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
+    kept = fit.scatter.kept
+    errors = turn_errors(take(found, kept), predicted_rates(fit)[kept])
+    assert size(errors.static).largest > 0.02 * TURN > size(errors.modelled).largest
+    assert size(errors.static).rms > 10.0 * size(errors.modelled).rms
+
+
+# the program
+
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs the verb and gives its exit code, standard output and standard error."""
+    def run(*words):
+        return main(['turn', *map(str, words)]), *capsys.readouterr()
+    return run
+
+
+@pytest.fixture
+def log(tmp_path):
+    """Return a file with four sweeps at 20 to 50 degC, with a bias of 0.2 deg/s and a scale factor error of 0.01."""
+    found = sweeps()
+    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate, temperature=20.0 + 10.0 * found.sweep))
+    return tmp_path / 'table.csv'
+
+
+@pytest.fixture
+def model(tmp_path):
+    """Return a model file that leaves 0.002 of the scale factor error, and holds for 35 deg/s and 30 degC."""
+    path = tmp_path / 'model.yaml'
+    path.write_text('effects: {bias: {bias: 0.0}, scale_factor_error: {scale_factor_error: 0.008}}\n'
+                    'valid: {rate: [-0.611, 0.611], temperature: [0, 30]}')
+    return path
+
+
+def test_the_data_hold_every_turn_in_si(run, log, model):
+    code, text, _ = run(log, '--model', model, '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['turns'] == 48 == len(answer['rate_rad_s'])
+    ways = np.sign(answer['rate_rad_s'])
+    assert answer['static_rad_per_turn'] == pytest.approx(TURN * 0.01 * ways)
+    assert answer['modelled_rad_per_turn'] == pytest.approx(TURN * (1.01 / 1.008 - 1.0) * ways)
+    assert answer['ratio_rms'] == pytest.approx(0.01 / (1.01 / 1.008 - 1.0))
+    assert sum(each['turns'] for each in answer['by_rate']) == sum(each['turns'] for each in answer['by_temperature']) == 48
+
+
+def test_turns_beyond_the_range_of_the_model_are_said(run, log, model):
+    code, text, _ = run(log, '--model', model)
+    assert code == 0 and '24 of 52 dwells are beyond the calibrated rates' in text
+    assert '26 of 52 dwells are outside the calibrated temperatures' in text
+    assert 'judged too well' in text
+
+
+def test_the_table_gives_degrees_and_per_cent(run, log, model):
+    lines = run(log, '--model', model)[1].splitlines()
+    row = next(line.split() for line in lines if line.startswith('5 to 10 ') or line.startswith('10 to 20 '))
+    assert [float(cell) for cell in row[4:8]] == [3.6, 1.0, 3.6, 1.0]
+    assert any(line.startswith('rate [deg/s]') for line in lines) and any(line.startswith('temperature [degC]') for line in lines)
+
+
+def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path):
+    found = sweeps(np.random.default_rng(5))
+    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate))
+    code, text, _ = run(tmp_path / 'table.csv', '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['left_out'] and answer['effects'] == ['bias', 'scale_factor_error']
+    assert answer['temperature_degc'] is None and answer['by_temperature'] == []
+    assert answer['modelled']['rms_rad_per_turn'] < 0.3 * answer['static']['rms_rad_per_turn']
+
+
+def test_the_file_has_a_row_for_every_turn(run, log, model, tmp_path):
+    assert run(log, '--model', model, '--slowest', 25, '--out', tmp_path / 'turn.csv')[0] == 0
+    header, *rows = (tmp_path / 'turn.csv').read_text().splitlines()
+    assert header == 'place,sweep,reference_rate_rad_s,temperature_degc,static_rad_per_turn,modelled_rad_per_turn'
+    assert len(rows) == 32
+    place, sweep, rate, temperature, *errors = rows[0].split(',')
+    assert (place, sweep, float(rate) / DEGREE, float(temperature)) == ('row 1', '0', pytest.approx(-60.0), 20.0)
+    assert float(errors[0]) == pytest.approx(-TURN * 0.01)
+
+
+def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
+    lines = log.read_text().splitlines()
+    cells = lines[4].split(',')
+    lines[4] = ','.join([str(float(cells[0]) + 1.0), *cells[1:]])
+    (tmp_path / 'wild.csv').write_text('\n'.join(lines))
+    assert '1 outlying dwells are left out: row 4' in run(tmp_path / 'wild.csv', '--model', model)[1]
+
+
+def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model, tmp_path):
+    time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
+    motion = from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    write_log(tmp_path / 'log.csv', simulate(GYRO, motion, 50.0, np.random.default_rng(2)))
+    code, text, _ = run(tmp_path / 'log.csv', '--model', model, '--json')
+    answer = json.loads(text)
+    assert code == 0 and answer['turns'] == 2
+    rate = np.array(answer['rate_rad_s'])
+    expected = (GYRO.output(rate, np.full(2, 25.0)) - GYRO.output(0.0, 25.0) - rate) * TURN / np.abs(rate)
+    assert answer['static_rad_per_turn'] == pytest.approx(expected, abs=5e-3)
+
+
+def test_a_log_without_a_reference_is_refused(run, tmp_path):
+    (tmp_path / 'log.csv').write_text('gyro_dps\n1.0\n2.0\n3.0\n')
+    code, text, error = run(tmp_path / 'log.csv')
+    assert code == 1 and not text and 'reference_rate_dps' in error
+
+
+def test_a_picture_without_matplotlib_is_refused_before_anything_is_computed(run, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    code, text, error = run(tmp_path / 'missing.csv', '--picture', 'turn.png')
+    assert code == 2 and not text and 'matplotlib' in error and '[plot]' in error
+
+
+def test_a_picture_of_another_format_is_refused(run, log, model):
+    code, _, error = run(log, '--model', model, '--picture', 'turn.jpeg')
+    assert code == 2 and '.png' in error and '.svg' in error
+
+
+def test_everything_but_the_picture_works_without_matplotlib(run, log, model, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    assert run(log, '--model', model)[0] == 0
+
+
+@pytest.mark.parametrize('ending', ['png', 'svg'])
+def test_the_picture_is_written(run, log, model, tmp_path, ending):
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    assert run(log, '--model', model, '--picture', tmp_path / f'turn.{ending}')[0] == 0
+    assert (tmp_path / f'turn.{ending}').stat().st_size > 1000
