@@ -121,7 +121,7 @@ def _leave_out_wild_samples(rate: Array, number: Integers, time: Array) -> list[
     values = _filled(rate)
     off = np.abs(values - medfilt(values, 5))
     off[:2] = off[-2:] = 0.0
-    wild = np.nonzero(off > 2.0 * CHANCE * _scale(off))[0]
+    wild = np.nonzero(off > CHANCE * _scale(off))[0]
     if not wild.size or wild.size > 0.001 * len(rate):
         return []
     rate[wild] = np.nan
@@ -271,7 +271,7 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
     rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
     interval : s
     times : averaging times, s, taken to the nearest whole number of intervals; default: ten a decade, up to a third of the record
-    progress : is given the averaging times to go through, such as a progress bar
+    progress : is given the blocks of the record to go through, such as a progress bar
 
     Raises
     ------
@@ -299,8 +299,8 @@ def _chart(interval: float, samples: int, sizes: Integers, variance: Array, coun
     return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom, lower, upper)
 
 
-#: Samples in a block: its few arrays stay in the cache.
-_BLOCK = 32768
+#: Samples in a block: its few arrays stay in the cache while all averaging times go over it.
+_BLOCK = 16384
 
 #: Longer products are given to several threads, which costs more than they win.
 _PRODUCT = 8192
@@ -312,25 +312,27 @@ def _square_sums(rate: Array, sizes: Integers, progress: Callable[[Iterable[Any]
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
     np.cumsum(_filled(rate), out=angle[1:])
-    twice = 2.0 * angle
-    found = [_square_sum(angle, twice, lost, int(size)) for size in progress(sizes)]
-    return np.array([each[0] for each in found]), np.array([each[1] for each in found])
+    twice, buffer = 2.0 * angle, np.empty(_BLOCK)
+    sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
+    for begin in progress(range(0, len(angle), _BLOCK)):
+        for place, size in enumerate(sizes.tolist()):
+            end = min(begin + _BLOCK, len(angle) - 2 * size)
+            if end <= begin:
+                break
+            block = buffer[:end - begin]
+            np.add(angle[begin + 2 * size:end + 2 * size], angle[begin:end], out=block)
+            np.subtract(block, twice[begin + size:end + size], out=block)
+            counts[place] += len(block) if lost is None else _leave_out(block, lost, begin, size)
+            sums[place] += sum(float(part @ part) for part in (block[:_PRODUCT], block[_PRODUCT:]))
+    return sums, counts
 
 
-def _square_sum(angle: Array, twice: Array, lost: Integers | None, size: int) -> tuple[float, int]:
-    count, total, used = len(angle) - 2 * size, 0.0, 0
-    buffer = np.empty(min(_BLOCK, count))
-    for begin in range(0, count, _BLOCK):
-        end = min(begin + _BLOCK, count)
-        block = buffer[:end - begin]
-        np.add(angle[begin + 2 * size:end + 2 * size], angle[begin:end], out=block)
-        np.subtract(block, twice[begin + size:end + size], out=block)
-        if lost is not None:
-            whole = lost[begin + 2 * size:end + 2 * size] - lost[begin:end] <= _LOST_SHARE * 2 * size
-            block *= whole
-            used += int(whole.sum())
-        total += sum(float(part @ part) for part in (block[at:at + _PRODUCT] for at in range(0, len(block), _PRODUCT)))
-    return total, count if lost is None else used
+def _leave_out(block: Array, lost: Integers, begin: int, size: int) -> int:
+    """Set the second differences to zero that miss too many samples, and return how many are left."""
+    end = begin + len(block)
+    whole = lost[begin + 2 * size:end + 2 * size] - lost[begin:end] <= _LOST_SHARE * 2 * size
+    block *= whole
+    return int(np.count_nonzero(whole))
 
 
 def _lost_before(rate: Array) -> Integers | None:
@@ -542,8 +544,10 @@ class NoiseFit:
 
     @property
     def floor_reached(self) -> bool:
-        """Tell whether the deviation stops to fall within the record."""
-        return self.floor[1] < self.chart.time[-2]
+        """Tell whether what falls with the averaging time is less than half of the variance, one octave before the end of the chart."""
+        time = self.chart.time[-2]
+        falling = sum(figure.value ** 2 * figure.part.variance(time) for figure in self.figures.values() if figure.part.slope < 0.0)
+        return bool(falling < 0.5 * self.deviation(time) ** 2)
 
 
 def fit_noise(rate: Array, interval: float) -> NoiseFit:
@@ -643,15 +647,32 @@ class _Description:
         density = np.log(ninth).sum() + 2.0 / 3.0 * np.log(model).sum() + 2.0 * np.log(half.diagonal()).sum()
         return solve_triangular(half, normal, lower=True), float(density)
 
+    @property
+    def held(self) -> list[int]:
+        """Return the places of the parts that there is something of."""
+        return np.nonzero(self.squares)[0].tolist()
+
     def surprise(self) -> float:
-        """Return -2 ln likelihood, up to what is the same for all combinations, with the evidence that each part costs."""
+        """Return -2 ln likelihood, up to what is the same for all combinations."""
         normal, density = self.scores()
-        return float(normal @ normal) + density + _EVIDENCE * int((self.squares > 0.0).sum())
+        return float(normal @ normal) + density
+
+    def cost(self) -> float:
+        """Return -2 ln likelihood with the evidence that each part must bring."""
+        return self.surprise() + _EVIDENCE * len(self.held)
 
     def likely(self) -> bool:
         """Tell whether chance explains what is left."""
         normal, _ = self.scores()
-        return chdtrc(len(normal) - int((self.squares > 0.0).sum()), float(normal @ normal)) > _CHANCE
+        return chdtrc(len(normal) - len(self.held), float(normal @ normal)) > _CHANCE
+
+    def bounds(self, place: int) -> tuple[float, float]:
+        """Return bounds of a coefficient with 95 % confidence, as if its square were a mean square of so many degrees of freedom."""
+        _, deviations = self.estimate(self.held)
+        square, deviation = self.squares[place], deviations[self.held.index(place)]
+        freedom = max(2.0 * (square / deviation) ** 2, 1.0)
+        lower, upper = (math.sqrt(square * freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+        return lower, upper
 
     def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
         """Return the squares of some parts by least squares, negative ones too, and their standard deviations."""
@@ -669,7 +690,10 @@ _EVIDENCE = 10.0
 _PASSES = 12
 
 #: Shares that the Allan deviations of a gyro may be off the sum of the parts; the smallest that does is taken.
-_MISFITS = tuple(0.01 * 2.0 ** (step / 2.0) for step in range(14))
+_MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
+
+#: A combination that is likelier by this, but not by enough to be believed, widens the bounds.
+_TEMPTING = 1.0
 
 #: A description is taken for good if it is off by more with this probability.
 _CHANCE = 0.01
@@ -707,39 +731,41 @@ def _half(octaves: _Octaves, squares: Array, misfit: float) -> Array:
 _COMBINATIONS = [places for count in range(1, len(PARTS) + 1) for places in itertools.combinations(range(len(PARTS)), count)]
 
 
-def _describe(octaves: _Octaves) -> _Description:
-    """Return the likeliest combination of parts, from the first octave on that chance allows, or else with a misfit."""
-    starts = range(max(len(octaves.variance) // 2, 1))
-    for misfit in (0.0, *_MISFITS):
-        for start in starts:
+def _describe(octaves: _Octaves) -> list[_Description]:
+    """Return all combinations of parts, the likeliest first, from the first octave on that chance allows, or else with a misfit."""
+    for misfit in _MISFITS:
+        for start in range(max(len(octaves.variance) // 2, 1)):
             since = octaves.since(start)
             combinations = [places for places in _COMBINATIONS if start == 0 or _QUANTIZATION not in places]
-            best = min((_fit(since, places, misfit, start) for places in combinations), key=_Description.surprise)
-            if best.likely():
-                return best
-    return best
+            found = sorted((_fit(since, places, misfit, start) for places in combinations), key=_Description.cost)
+            if found[0].likely():
+                return found
+    raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum of the five kinds of noise: there is '
+                      'something else in the record, such as a swing or a vibration; record again at rest')
 
 
-def _figures(chart: AllanChart, found: _Description) -> NoiseFit:
-    held = [place for place in range(len(PARTS)) if found.squares[place] > 0.0]
-    figures = {part.symbol: _held(found, held, place) if place in held else _absent(found, held, place)
+def _figures(chart: AllanChart, found: list[_Description]) -> NoiseFit:
+    best = found[0]
+    tempting = [best, *(each for each in found if each.surprise() < best.surprise() - _TEMPTING)]
+    figures = {part.symbol: _held(best, tempting, place) if place in best.held else _absent(best, found, place)
                for place, part in enumerate(PARTS)}
     return NoiseFit({symbol: _in_seconds(figure, chart.interval) for symbol, figure in figures.items()}, chart,
-                    float(chart.time[found.start]), float(chart.time[-1]), found.misfit)
+                    float(chart.time[best.start]), float(chart.time[-1]), best.misfit)
 
 
-def _held(found: _Description, held: list[int], place: int) -> Figure:
-    """Return a figure whose square is as uncertain as a mean square of so many degrees of freedom."""
-    squares, deviations = found.estimate(held)
-    square, deviation = squares[held.index(place)], deviations[held.index(place)]
-    freedom = 2.0 * (square / deviation) ** 2
-    lower, upper = (math.sqrt(square * freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
-    return Figure(PARTS[place], math.sqrt(square), 0.5 * deviation / math.sqrt(square), lower, upper)
+def _held(best: _Description, tempting: list[_Description], place: int) -> Figure:
+    """Return a figure with bounds that hold whether or not parts are there that the evidence does not suffice for."""
+    bounds = [each.bounds(place) for each in tempting if place in each.held]
+    lower, upper = min(low for low, _ in bounds), max(high for _, high in bounds)
+    return Figure(PARTS[place], math.sqrt(best.squares[place]), (upper - lower) / (2.0 * 1.96), lower, upper)
 
 
-def _absent(found: _Description, held: list[int], place: int) -> Figure:
-    squares, deviations = found.estimate([*held, place])
-    return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(squares[-1], 0.0) + 1.96 * deviations[-1]))
+def _absent(best: _Description, found: list[_Description], place: int) -> Figure:
+    """Return how much of a part there can be besides those that are seen."""
+    places = [*best.held, place]
+    limits = [squares[-1] + 1.96 * deviations[-1] for squares, deviations in (
+        each.estimate(places) for each in found if each is best or set(each.held) == set(places))]
+    return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
 
 
 def _in_seconds(figure: Figure, interval: float) -> Figure:

@@ -16,6 +16,7 @@ from gyro_calibration.allan import AllanChart, Figure, NoiseFit, Record, allan_d
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
+from gyro_calibration.noise import ALLAN_FLOOR
 from gyro_calibration.picture import draw_allan
 from gyro_calibration.verbs.verb import Answer, UsageError, add_log, output_of, read, time_of, verb
 
@@ -60,9 +61,9 @@ def _check(given: argparse.Namespace) -> None:
         raise UsageError('--picture needs matplotlib, which is not installed; install it, or leave the picture out')
 
 
-def _bar(times: Iterable[Any]) -> Iterable[Any]:
+def _bar(blocks: Iterable[Any]) -> Iterable[Any]:
     """Show on a terminal how far the work is, if it takes longer than two seconds."""
-    return tqdm(times, desc='Allan deviation', unit='times', delay=2.0, leave=False, disable=None)
+    return tqdm(blocks, desc='Allan deviation', unit='block', delay=2.0, leave=False, disable=None)
 
 
 def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
@@ -91,11 +92,13 @@ def _named(symbol: str, figure: Figure) -> str:
 def _said_of_floor(fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
     deviation, time = fit.floor
-    text = f'Lowest Allan deviation: {deviation * factor:.4g} {unit} ({deviation:.4g} rad/s) at {time:.4g} s'
+    text = (f'Lowest Allan deviation: {deviation * factor:.4g} {unit} ({deviation:.4g} rad/s) at {time:.4g} s; all of it taken for bias '
+            f'instability, that is {deviation / ALLAN_FLOOR * factor:.4g} {unit}.')
     if fit.floor_reached:
-        return f'{text}.'
-    return (f'{text}, the end of the chart: the record is too short for the floor. The bias instability is below '
-            f'{fit.figures["B"].upper * factor:.3g} {unit}; record longer to see it.')
+        return text
+    bound = f'is only known to be below {fit.figures["B"].upper * factor:.3g} {unit}'
+    seen = 'rests on the bend above the floor' if fit.figures['B'].value else bound
+    return f'{text} The deviation still falls at the end of the chart: the bias instability {seen}; record longer to reach the floor.'
 
 
 def _said_of_fit(fit: NoiseFit) -> str:
@@ -116,6 +119,6 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: Noi
     columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower, 'upper': chart.upper,
                'degrees_of_freedom': chart.degrees_of_freedom, 'differences': chart.differences, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval, 'remarks': list(record.remarks), **figures,
-            'floor': {'deviation': deviation, 'time_s': time, 'reached': fit.floor_reached},
+            'floor': {'deviation': deviation, 'time_s': time, 'bias_instability': deviation / ALLAN_FLOOR, 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
             'chart': {name: values.tolist() for name, values in columns.items()}, 'picture': given.picture, 'out': given.out}
