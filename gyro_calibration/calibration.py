@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import t as student
@@ -61,6 +62,7 @@ class Scatter:
     Attributes
     ----------
     dwell : of a dwell, beyond its own deviation, rad/s
+    dwell_scale : of the scale factor from dwell to dwell, 1; a table's speed is no better than that
     sweep_bias : of the bias from sweep to sweep, rad/s
     sweep_scale : of the scale factor from sweep to sweep, 1
     kept : which dwells are not outlying, shape (n,)
@@ -68,6 +70,7 @@ class Scatter:
     """
 
     dwell: float
+    dwell_scale: float
     sweep_bias: float
     sweep_scale: float
     kept: Mask
@@ -106,6 +109,11 @@ class Calibration:
     def effects(self) -> tuple[Effect, ...]:
         """Return the effects of the model."""
         return tuple(term.effect for term in self.model.terms)
+
+    @property
+    def before_rms(self) -> float:
+        """Return the root mean square of output less rate of what was fitted, rad/s."""
+        return _rms((self.dwells.output - self.dwells.rate)[self.scatter.kept])
 
     @property
     def residual_rms(self) -> float:
@@ -157,7 +165,7 @@ class _Whitener:
     def __init__(self, dwells: Dwells, scatter: Scatter):
         """Factor the covariance of each sweep."""
         self.scatter = scatter
-        self.deviation = np.sqrt(np.nan_to_num(dwells.deviation) ** 2 + scatter.dwell ** 2)
+        self.deviation = _deviation(dwells, scatter)
         self.factors = [(np.flatnonzero(rows), self._factor(dwells.rate[rows], self.deviation[rows])) for rows in _sweeps(dwells)]
 
     def _factor(self, rate: Array, deviation: Array) -> Array:
@@ -171,9 +179,10 @@ class _Whitener:
             whitened[rows] = solve_triangular(factor, values[rows], lower=True)
         return whitened
 
-    def log_determinant(self) -> float:
-        """Return the logarithm of the determinant of the covariance."""
-        return 2.0 * sum(float(np.log(np.diag(factor)).sum()) for _, factor in self.factors)
+
+def _deviation(dwells: Dwells, scatter: Scatter) -> Array:
+    """Return the standard deviation of each dwell, without what its sweep shares, rad/s, shape (n,)."""
+    return np.sqrt(np.nan_to_num(dwells.deviation) ** 2 + scatter.dwell ** 2 + (scatter.dwell_scale * dwells.rate) ** 2)
 
 
 def find_scatter(dwells: Dwells) -> Scatter:
@@ -189,16 +198,16 @@ def find_scatter(dwells: Dwells) -> Scatter:
     kept = _not_outlying(error, surface)
     used, error, surface = take(dwells, kept), error[kept], _surface(take(dwells, kept))
     size = _rms(error - surface @ (surface.T @ error)) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
-    units = np.array([size, size, size / max(float(np.abs(used.rate).max()), 1e-9)])
-    sought = 3 if len(np.unique(used.sweep)) >= _FEWEST_SWEEPS else 1
+    relative = size / max(float(np.abs(used.rate).max()), 1e-9)
+    sought = 4 if len(np.unique(used.sweep)) >= _FEWEST_SWEEPS else 2
+    units = np.array([size, relative, size, relative])[:sought if len(used) >= _FEWEST_DWELLS else 1]
 
     def scatter(logarithms: Array) -> Scatter:
-        dwell, bias, scale = (units * np.append(np.exp(logarithms), np.zeros(3 - sought))).tolist()
-        return Scatter(dwell, bias, scale, kept)
+        return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)  # type: ignore[misc]
 
-    best = minimize(lambda logarithms: -_restricted_likelihood(_Whitener(used, scatter(logarithms)), error, surface),
-                    np.array([0.0, -1.5, -1.5])[:sought], method='Nelder-Mead', options={'xatol': 0.02, 'fatol': 0.01},
-                    bounds=[(-7.0, 2.0)] * sought)
+    best = minimize(lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
+                    np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='Nelder-Mead', bounds=[(-7.0, 2.0)] * len(units),
+                    options={'xatol': 0.02, 'fatol': 0.01})
     return scatter(best.x)
 
 
@@ -220,13 +229,24 @@ def _not_outlying(error: Array, surface: Array) -> Mask:
     return (residual <= OUTLYING * 1.4826 * float(np.median(residual)) + 1e-12) | (len(error) < _FEWEST_DWELLS)
 
 
-def _restricted_likelihood(whitener: _Whitener, error: Array, columns: Array) -> float:
+def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, columns: Array) -> float:
     """Return the logarithm of the likelihood of the scatter, whatever the values are, up to a constant."""
-    orthogonal, triangle = np.linalg.qr(whitener.whiten(columns))
-    whitened = whitener.whiten(error)
-    left = whitened - orthogonal @ (orthogonal.T @ whitened)
-    determinants = whitener.log_determinant() + 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
-    return -0.5 * (determinants + float(left @ left))
+    deviation = _deviation(dwells, scatter)
+    scaled = np.column_stack([columns, error]) / deviation[:, None]
+    shared = np.column_stack([np.full(len(error), scatter.sweep_bias), scatter.sweep_scale * dwells.rate]) / deviation[:, None]
+    inner, outer = (_sums_by_sweep(dwells, shared[:, :, None] * each[:, None, :]) for each in (shared, scaled))
+    inner = inner + np.eye(2)
+    # the inverse of a diagonal and two columns a sweep, by Woodbury's identity
+    gram = scaled.T @ scaled - np.tensordot(outer, np.linalg.solve(inner, outer), axes=((0, 1), (0, 1)))
+    factor = np.linalg.cholesky(gram)
+    log_determinant = 2.0 * float(np.log(deviation).sum()) + float(np.linalg.slogdet(inner)[1].sum())
+    return -0.5 * (log_determinant + 2.0 * float(np.log(np.diag(factor)[:-1]).sum()) + float(factor[-1, -1]) ** 2)
+
+
+def _sums_by_sweep(dwells: Dwells, values: Array) -> Array:
+    """Return the sums of the values, shape (n, ...), over each sweep, shape (sweeps, ...)."""
+    order = np.argsort(dwells.sweep, kind='stable')
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(dwells.sweep[order], prepend=-1)))
 
 
 # the fit
@@ -430,3 +450,43 @@ def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
         return EffectsNotParted(f'{names[0]} cannot be determined from these dwells; {alike[0].shown_by}', names)
     advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1] if effect.shown_by))
     return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be parted; {advice}, or leave one out', names)
+
+
+# looking at it
+
+@dataclass(frozen=True)
+class Bin:
+    """
+    Dwells of nearly one rate, or nearly one temperature.
+
+    Attributes
+    ----------
+    low, high : ends of the bin, in the unit of what was binned
+    count : of dwells
+    before, residual : mean error without the model and with it, rad/s
+    deviation : standard deviation of the mean residual, rad/s
+    rms : of the residual, rad/s
+
+    """
+
+    low: float
+    high: float
+    count: int
+    before: float
+    residual: float
+    deviation: float
+    rms: float
+
+
+def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
+    """Return the errors over one quantity, shape (n,), in bins of equal width that hold something."""
+    edges = np.linspace(values.min(), values.max(), min(most, len(np.unique(values))) + 1)
+    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
+    rows = [np.flatnonzero((place == number) & fit.scatter.kept) for number in range(len(edges) - 1)]
+    return [_bin(fit, float(low), float(high), part) for low, high, part in zip(edges, edges[1:], rows) if len(part)]
+
+
+def _bin(fit: Calibration, low: float, high: float, rows: NDArray[np.intp]) -> Bin:
+    before, residual = (fit.dwells.output - fit.dwells.rate)[rows], fit.residual[rows]
+    deviation = math.sqrt(float(np.sum(fit.deviation[rows] ** 2))) / len(rows)
+    return Bin(low, high, len(rows), float(before.mean()), float(residual.mean()), deviation, _rms(residual))

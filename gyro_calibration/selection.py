@@ -191,14 +191,13 @@ def _part(fit: Calibration, technology: str | None, scatter: Scatter) -> tuple[C
 def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect], technology: str | None) -> tuple[Calibration, Twins]:
     (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
     sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
-    reason = f'it fits better by {sigmas:.1f} standard deviations'
-    if sigmas < PARTED and technology is None:
-        reason += ', which is too little to be sure'
+    reason = f'{taken.name} fits better by {sigmas:.1f} standard deviations'
     if sigmas < PARTED and technology is not None:
         physical = TECHNOLOGIES[technology]
         if physical is other:
             (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
-        reason = f'the data hardly part them ({abs(sigmas):.1f} standard deviations), and it is what the physics of {technology} gives'
+        reason = f'{taken.name} is what the physics of {technology} gives, and fits {"better" if sigmas > 0.0 else "worse"} by ' \
+                 f'{abs(sigmas):.1f} standard deviations'
     return fit, Twins(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
 
 

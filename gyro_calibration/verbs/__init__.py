@@ -6,6 +6,6 @@ converted here, at the rim.
 
 """
 
-from gyro_calibration.verbs import allan, compensate, demo, emulate, reproduce, self_calibrate, simulate, turn
+from gyro_calibration.verbs import allan, compensate, demo, emulate, fit, reproduce, self_calibrate, simulate, turn
 
-VERBS = (compensate, self_calibrate, allan, turn, simulate, emulate, reproduce, demo)
+VERBS = (fit, compensate, self_calibrate, allan, turn, simulate, emulate, reproduce, demo)

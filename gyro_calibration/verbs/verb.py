@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,8 +32,8 @@ def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer 
     return parser
 
 
-def add_log(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz')
+def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
+    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz', **how)
     parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this rate; for logs without a usable time_s')
     parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count, for logs that hold gyro_counts alone')
     parser.add_argument('--invert', action='store_true', help='the gyro counts clockwise turns positive')
@@ -47,6 +48,15 @@ def positive(text: str) -> float:
 
 def not_negative(text: str) -> float:
     return 0.0 if float(text) == 0.0 else positive(text)
+
+
+def picture_file(text: str) -> str:
+    """Return the name of a picture to draw, if one can be drawn."""
+    if not text.endswith(('.png', '.svg')):
+        raise argparse.ArgumentTypeError(f'{text}: a picture ends in .png or .svg; name it so')
+    if importlib.util.find_spec('matplotlib') is None:
+        raise argparse.ArgumentTypeError('a picture needs matplotlib, which is not installed; install it, or leave the picture out')
+    return text
 
 
 def read(given: argparse.Namespace) -> Log:
