@@ -109,4 +109,4 @@ def covariance(model: GyroModel) -> np.ndarray:
 
 def quadratic_form(matrix: np.ndarray, vectors: np.ndarray) -> Number:
     """Return v' M v for vectors of shape (m, ...)."""
-    return np.einsum('i...,ij,j...->...', vectors, matrix, vectors)
+    return np.einsum('i...,i...->...', vectors, matrix @ vectors)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gyro_calibration.compensation import quadratic_form
 from gyro_calibration.log import CACHED, DEGREE, Array
 from gyro_calibration.noise import Noise
 
@@ -188,19 +189,53 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)
 
 
-def integrate_with_deviation(time: Array, rate: Array, filtered: Array, sensitivity: Array, covariance: Array,
-                             noise: Noise) -> tuple[Array, Array]:
+class BlockIntegrator:
     """
-    Return the heading and its standard deviation, rad, shape (n,) each, as `HeadingIntegrator` gives them for a log without gaps.
+    Filter and integrate the rates of a log that comes block by block, with the same result as in one piece.
 
-    Parameters
-    ----------
-    rate, filtered : before and after the threshold filter, rad/s, shape (n,)
-    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
-    covariance : of those values, shape (m, m)
+    It gives what `ThresholdFilter` and `HeadingIntegrator` give sample by sample for a log without gaps.
 
     """
-    kept = (filtered == rate).astype(float)
-    grown = np.array([integrate(time, kept * row) for row in sensitivity]).reshape(len(covariance), len(time))
-    variance = np.einsum('in,ij,jn->n', grown, covariance, grown) + noise.heading_variance(integrate(time, kept))
-    return integrate(time, filtered), np.sqrt(variance)
+
+    def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
+        """Begin at heading zero; `covariance` is that of the values of the calibration, shape (m, m)."""
+        self._settings, self._noise, self._covariance = settings, noise, covariance
+        self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._last: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
+        self._grown: Array = np.zeros(2 + len(covariance))
+
+    def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
+        """
+        Take the next block, which may be empty.
+
+        Parameters
+        ----------
+        time, rate : s and rad/s, before the threshold filter, shape (n,)
+        sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
+
+        Returns
+        -------
+        filtered rate, rad/s, heading and its standard deviation, rad, shape (n,) each
+
+        """
+        if not len(time):
+            return rate, rate, rate
+        filtered = self._filtered(time, rate)
+        kept = (filtered == rate).astype(float)
+        heading, moving_time, *grown = self._integrated(time, np.vstack([filtered, kept, kept * sensitivity]))
+        calibration = quadratic_form(self._covariance, np.reshape(grown, (len(self._covariance), len(time))))
+        return filtered, heading, np.sqrt(calibration + self._noise.heading_variance(moving_time))
+
+    def _filtered(self, time: Array, rate: Array) -> Array:
+        carried = len(self._window[0])
+        time, rate = np.concatenate([self._window[0], time]), np.concatenate([self._window[1], rate])
+        begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
+        self._window = time[begin:], rate[begin:]
+        return filter_rates(self._settings, time, rate)[carried:]
+
+    def _integrated(self, time: Array, grows: Array) -> Array:
+        carried = len(self._last[0])
+        time, grows = np.concatenate([self._last[0], time]), np.hstack([self._last[1], grows])
+        grown = np.array([integrate(time, row, begin) for row, begin in zip(grows, self._grown)])
+        self._last, self._grown = (time[-1:], grows[:, -1:]), grown[:, -1]
+        return grown[:, carried:]

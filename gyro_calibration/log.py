@@ -10,17 +10,19 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import itertools
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import replacing
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -30,6 +32,8 @@ DEGREE = math.pi / 180.0
 
 #: So many samples of a dozen columns stay in the cache of a processor, which is three times as fast as to go through memory for each step.
 CACHED = 1 << 14
+#: Rows of a block of a log that is read piece by piece.
+ROWS = 1 << 16
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -46,7 +50,14 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     'supply_v': ('supply', 1.0),
     'moving': ('moving', 1.0),
 }
+QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
+
+
+#: Quantity -> (place of its column in the file, factor to SI).
+Named = dict[str, tuple[int, float]]
+#: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns that are not ours as text.
+Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
 class LogError(ValueError):
@@ -109,47 +120,90 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     LogError : the file cannot be read, or is not a log; names file, row and column
 
     """
-    notes, header, first_row, rows = _rows(Path(path))
-    named = _named_columns(path, header)
-    if len(rows) < 2:
-        raise LogError(f'{path}: {len(rows)} rows of data; a log has at least two: record more')
-    columns = list(zip(*rows))
-    arrays = {quantity: _numbers(path, first_row, header[index], columns[index], quantity) * factor
-              for quantity, (index, factor) in named.items()}
-    if rate is not None:
-        arrays['time'] = np.arange(len(rows)) / rate
-    _refuse_time(path, first_row, arrays.get('time'))
-    if 'output' not in arrays and sensitivity is not None:
-        arrays['output'] = arrays['counts'] * sensitivity
-    ours = {index for index, _ in named.values()}
-    others = {name: tuple(columns[index]) for index, name in enumerate(header) if index not in ours}
-    return Log(**arrays, notes=tuple(notes), others=others)
+    blocks = list(read_log_blocks(path, sensitivity, rate))
+    first = blocks[0]
+    present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
+    arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks]) for quantity in present}
+    others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks)) for name in first.others}
+    return Log(**arrays, notes=first.notes, others=others)
 
 
-def _rows(path: Path) -> tuple[list[str], list[str], int, list[list[str]]]:
-    """Return notes, header, the line number of the first row, and the rows, each as long as the header."""
+def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None, rows: int = ROWS,
+                heard: Callable[[int], object] | None = None) -> Iterator[Log]:
+    """
+    Read a log file row by row, and give blocks of it, so that one of any length needs little memory.
+
+    Parameters
+    ----------
+    path, sensitivity, rate : as for `read_log`
+    rows : of a block, at least 2; the last one has less, and so have those with texts that go over several lines
+    heard : is told after each block how many bytes of the file are read
+
+    Raises
+    ------
+    LogError : as `read_log`, when the row is reached
+
+    """
+    count, last = 0, -math.inf
+    with _refusing(path), open(path, 'rb') as file, _reading(file, str(path).endswith('.gz')) as text:
+        lines = _without_empty_end(text)
+        notes, header, first_line = _head(path, lines)
+        named = _named_columns(path, header)
+        while block := list(itertools.islice(lines, rows)):
+            places, arrays, others = _quickly(block, first_line, header, named) or _carefully(path, block, lines, first_line, header, named)
+            first_line, before, count = places[-1], count, count + len(places) - 1
+            if rate is not None:
+                arrays['time'] = np.arange(before, count) / rate
+            last = _refuse_time(path, places, arrays.get('time'), last)
+            if 'output' not in arrays and sensitivity is not None:
+                arrays['output'] = arrays['counts'] * sensitivity
+            if heard is not None:
+                heard(file.tell())
+            if count > 1:
+                yield Log(**arrays, notes=notes, others=others)
+    if count < 2:
+        raise LogError(f'{path}: {count} rows of data; a log has at least two: record more')
+
+
+@contextmanager
+def _refusing(path: str | Path) -> Iterator[None]:
     try:
-        data = path.read_bytes()
-        lines = (gzip.decompress(data) if path.suffix == '.gz' else data).decode('utf-8-sig').splitlines(keepends=True)
-        start = next((number for number, line in enumerate(lines) if not line.startswith('#')), len(lines))
-        table = list(csv.reader(lines[start:]))
+        yield
     except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({error}); wanted a CSV file, .csv or .csv.gz') from error
-    notes = [line[1:].strip() for line in lines[:start]]
-    header = [name.strip() for name in table[0]] if table else []
+
+
+def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
+    data: Any = gzip.GzipFile(fileobj=file) if compressed else file
+    return io.TextIOWrapper(data, encoding='utf-8-sig', newline='')
+
+
+def _without_empty_end(lines: Iterable[str]) -> Iterator[str]:
+    empty = []
+    for line in lines:
+        if len(line) < 3 and not line.strip('\r\n'):
+            empty.append(line)
+            continue
+        yield from empty
+        empty.clear()
+        yield line
+
+
+def _head(path: str | Path, lines: Iterator[str]) -> tuple[tuple[str, ...], list[str], int]:
+    """Take notes and header off the lines, and return them with the number of the line after them."""
+    notes, line = [], next(lines, '')
+    while line.startswith('#'):
+        notes.append(line[1:].strip())
+        line = next(lines, '')
+    rows = csv.reader(itertools.chain([line], lines))
+    header = [name.strip() for name in next(rows, [])]
     if not any(name in COLUMNS for name in header):
-        raise LogError(f'{path}: line {start + 1} is no header; name the columns there, such as time_s,gyro_dps,temperature_degc')
-    rows = table[1:]
-    while rows and not rows[-1]:
-        rows.pop()
-    for number, row in enumerate(rows, start + 2):
-        if len(row) != len(header):
-            raise LogError(f'{path}: line {number} has {len(row)} values where the header has {len(header)}; mend or remove the line')
-    return notes, header, start + 2, rows
+        raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, such as time_s,gyro_dps,temperature_degc')
+    return tuple(notes), header, len(notes) + rows.line_num + 1
 
 
-def _named_columns(path: str | Path, header: list[str]) -> dict[str, tuple[int, float]]:
-    named: dict[str, tuple[int, float]] = {}
+def _named_columns(path: str | Path, header: list[str]) -> Named:
+    named: Named = {}
     for index, name in enumerate(header):
         if name not in COLUMNS:
             continue
@@ -162,17 +216,58 @@ def _named_columns(path: str | Path, header: list[str]) -> dict[str, tuple[int, 
     return named
 
 
-def _numbers(path: str | Path, first_row: int, name: str, texts: tuple[str, ...], quantity: str) -> Array:
+def _quickly(lines: list[str], first_line: int, header: list[str], named: Named) -> Parsed | None:
+    """Parse rows of numbers by numpy; None where there is anything else in them, which wants a closer look."""
+    if len(named) < len(header):
+        return None
+    try:
+        table = np.loadtxt(lines, delimiter=',', comments=None, ndmin=2)
+    except ValueError:
+        return None
+    if table.shape != (len(lines), len(header)) or any(_wrong(table[:, index], quantity).any() for quantity, (index, _) in named.items()):
+        return None
+    arrays: dict[str, Array] = {quantity: table[:, index] * factor for quantity, (index, factor) in named.items()}
+    return range(first_line, first_line + len(lines) + 1), arrays, {}
+
+
+def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int, header: list[str], named: Named) -> Parsed:
+    """
+    Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
+
+    A text in quotes may go on in the next line, and so take lines of the rest.
+
+    """
+    reader = csv.reader(itertools.chain(lines, rest))
+    places, rows = [first_line], []
+    for row in reader:
+        if len(row) != len(header):
+            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has {len(header)}; mend or remove the line')
+        rows.append(row)
+        places.append(first_line + reader.line_num)
+        if reader.line_num >= len(lines) and len(rows) > 1:
+            break
+    columns = list(zip(*rows))
+    arrays = {quantity: _numbers(path, places, header[index], columns[index], quantity) * factor
+              for quantity, (index, factor) in named.items()}
+    ours = {index for index, _ in named.values()}
+    return places, arrays, {name: columns[index] for index, name in enumerate(header) if index not in ours}
+
+
+def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...], quantity: str) -> Array:
     try:
         values = np.array(texts, dtype=np.float64)
     except ValueError:
         row = next(number for number, text in enumerate(texts) if not _is_number(text))
-        raise LogError(f'{path}: line {first_row + row}, column {name}: {texts[row]!r} is not a number') from None
-    wrong = np.isinf(values) if quantity in _MAY_BE_LOST else ~np.isfinite(values)
+        raise LogError(f'{path}: line {places[row]}, column {name}: {texts[row]!r} is not a number') from None
+    wrong = _wrong(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise LogError(f'{path}: line {first_row + row}, column {name}: {texts[row]} is not a finite number; remove the row')
+        raise LogError(f'{path}: line {places[row]}, column {name}: {texts[row]} is not a finite number; remove the row')
     return values
+
+
+def _wrong(values: Array, quantity: str) -> Mask:
+    return np.isinf(values) if quantity in _MAY_BE_LOST else ~np.isfinite(values)
 
 
 def _is_number(text: str) -> bool:
@@ -183,14 +278,16 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _refuse_time(path: str | Path, first_row: int, time: Array | None) -> None:
+def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None, before: float) -> float:
+    """Refuse time that does not increase, from the block before on, and return the last one."""
     if time is None:
-        return
-    late = np.diff(time) <= 0
+        return before
+    late = np.diff(time, prepend=before) <= 0
     if late.any():
-        row = int(np.argmax(late)) + 1
-        raise LogError(f'{path}: line {first_row + row}, column time_s: {time[row]:g} s does not come after {time[row - 1]:g} s; '
-                       'sort the rows, or give --rate where the stamps are no use')
+        row = int(np.argmax(late))
+        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come after '
+                       f'{time[row - 1] if row else before:g} s; sort the rows, or give --rate where the stamps are no use')
+    return float(time[-1])
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
@@ -204,17 +301,33 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = Non
     more : name -> array of shape (n,)
 
     """
-    columns: dict[str, list[str]] = {}
+    write_log_blocks(path, [(log, more or {})])
+
+
+def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
+    """Write a log that comes in blocks, each with more named columns, as `write_log` does; the first block has the notes."""
+    with replacing(path) as file, _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data:
+        for number, (log, more) in enumerate(blocks):
+            data.write(_text(log, more, headed=number == 0).encode())
+
+
+def _compressing(file: BinaryIO) -> gzip.GzipFile:
+    # Without a time in it, for the same log gives the same file.
+    return gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
+
+
+def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
+    columns: dict[str, Sequence[Any]] = {}
     for name, (quantity, factor) in COLUMNS.items():
         values = getattr(log, quantity)
         if factor == 1.0 and values is not None:
-            columns[name] = [repr(value) for value in values.tolist()]
-    columns.update({name: list(texts) for name, texts in log.others.items()})
-    columns.update({name: [repr(value) for value in np.asarray(values, dtype=float).tolist()] for name, values in (more or {}).items()})
+            columns[name] = values.tolist()
+    columns.update(log.others)
+    columns.update({name: np.asarray(values, dtype=float).tolist() for name, values in more.items()})
     text = io.StringIO()
-    text.writelines(f'# {note}\n' for note in log.notes)
     writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(columns)
+    if headed:
+        text.writelines(f'# {note}\n' for note in log.notes)
+        writer.writerow(columns)
     writer.writerows(zip(*columns.values()))
-    data = text.getvalue().encode()
-    write_atomically(path, gzip.compress(data) if str(path).endswith('.gz') else data)
+    return text.getvalue()

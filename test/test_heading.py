@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
-from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter, filter_rates, integrate, integrate_with_deviation
-from gyro_calibration.log import DEGREE
+from gyro_calibration.heading import BlockIntegrator, HeadingIntegrator, Threshold, ThresholdFilter, filter_rates, integrate
+from gyro_calibration.log import CACHED, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
@@ -69,6 +69,29 @@ SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(), 'rest test'
 def test_a_log_at_once_is_filtered_as_sample_by_sample(settings):
     time, rate = noisy_robot()
     assert np.array_equal(filter_rates(settings, time, rate), filtered_singly(settings, time, rate))
+
+
+@pytest.mark.parametrize('settings', SETTINGS.values(), ids=SETTINGS)
+def test_a_log_in_blocks_of_any_size_is_filtered_and_integrated_as_in_one_piece(settings):
+    model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
+    time, rate = noisy_robot()
+    sensitivity = rate_sensitivity(model, rate, rate, 25.0)
+    whole = BlockIntegrator(settings, XV3500, covariance(model)).add(time, rate, sensitivity)
+    cuts = np.sort(np.random.default_rng(0).choice(len(time), 40))
+    cuts = [0, 0, 1, 2, *cuts.tolist(), 9000, 9001, 9001, len(time)]
+    integrator = BlockIntegrator(settings, XV3500, covariance(model))
+    pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j]) for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
+    filtered, heading, deviation = (np.concatenate(parts) for parts in zip(*pieces))
+    assert np.array_equal(filtered, whole[0]) and np.array_equal(filtered, filter_rates(settings, time, rate))
+    assert np.array_equal(heading, whole[1]) and np.array_equal(heading, integrate(time, filtered))
+    assert deviation == pytest.approx(whole[2], rel=1e-12)
+
+
+def test_a_log_longer_than_the_cache_is_integrated_by_the_trapezoid_rule():
+    generator, count = np.random.default_rng(0), 2 * CACHED + 5
+    time, rate = np.cumsum(generator.uniform(0.001, 0.1, count)), generator.normal(size=count)
+    steps = 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
+    assert np.array_equal(integrate(time, rate, 0.25), np.cumsum([0.25, *steps]))
 
 
 def test_single_samples_are_filtered_by_equation_12():
@@ -142,7 +165,7 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
         output = (1 + s) * true + b + simulate_noise(XV3500, len(time), INTERVAL, generator)
         ends.append(integrate(time, compensate(model, output).rate)[[1500, 6000]] - ROBOT.heading_at(time)[[1500, 6000]])
     sensitivity = rate_sensitivity(model, true, true, np.full(len(time), 25.0))
-    deviation = integrate_with_deviation(time, true + 1e-9, true + 1e-9, sensitivity, covariance(model), XV3500)[1]
+    deviation = BlockIntegrator(Threshold(0.0), XV3500, covariance(model)).add(time, true, sensitivity)[2]
     ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
     assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)  # to first order in s, 2 % here
 
@@ -155,7 +178,7 @@ def test_the_integrator_gives_the_variance_of_the_batch():
     integrator = HeadingIntegrator()
     integrator.use(XV3500, covariance(model))
     _, headings = added(integrator, time, rate, kept, sensitivity)
-    heading, deviation = integrate_with_deviation(time, rate, kept, sensitivity, covariance(model), XV3500)
+    _, heading, deviation = BlockIntegrator(Threshold(), XV3500, covariance(model)).add(time, rate, sensitivity)
     assert headings == pytest.approx(heading, abs=1e-12)
     assert math.sqrt(integrator.variance) == pytest.approx(deviation[-1], rel=1e-9)
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from gyro_calibration.log import Log, LogError, read_log, write_log
+from gyro_calibration.log import Log, LogError, read_log, read_log_blocks, write_log, write_log_blocks
 
 DEGREE = math.pi / 180.0
 
@@ -57,16 +57,24 @@ REFUSED = {
     'one row': ('gyro_dps\n0\n', '1 rows of data'),
     'short row': ('time_s,gyro_dps\n0,1\n1\n', 'line 3 has 1 values where the header has 2'),
     'long row': ('time_s,gyro_dps\n0,1\n1,2,3\n', 'line 3 has 3 values where the header has 2'),
+    'text after a text': ('gyro_dps,place\n0,"a\nb"\n1,c\nfast,d\n', "line 5, column gyro_dps: 'fast' is not a number"),
+    'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000, 'cannot be read as a log'),
     'binary': (bytes(range(256)), 'cannot be read as a log'),
     'one endless field': ('gyro_dps\n' + '1' * 200000 + '\n1\n', 'cannot be read as a log'),
 }
 
 
+def read_in_pairs(path):
+    """Read a log in blocks of two rows and return them."""
+    return list(read_log_blocks(path, rows=2))
+
+
+@pytest.mark.parametrize('read', [read_log, read_in_pairs])
 @pytest.mark.parametrize('text, message', REFUSED.values(), ids=REFUSED)
-def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, text, message):
+def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, text, message, read):
     path = written(tmp_path, text)
     with pytest.raises(LogError) as refused:
-        read_log(path)
+        read(path)
     assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
 
 
@@ -112,3 +120,79 @@ def test_columns_that_are_not_ours_are_kept(tmp_path):
     again = read_log(path)
     assert again.others == {'operator': ('Ann', 'Bob'), 'lap': ('1, 2', ''), 'heading_rad': ('0.5', '1.0')}
     assert path.read_text().splitlines()[0] == '# note'
+
+
+def test_blocks_are_the_log_piece_by_piece(tmp_path):
+    rows = ''.join(f'{second / 10},{second % 7},"lap, {second}\n of many"\n' for second in range(11))
+    path = written(tmp_path, f'# note\ntime_s,gyro_dps,lap\n{rows}\n\n')
+    whole, blocks = read_log(path), list(read_log_blocks(path, rows=3))
+    assert [len(block) for block in blocks] == [2, 2, 2, 2, 2, 1], 'a row here is two lines'
+    assert np.concatenate([block.output for block in blocks]).tolist() == whole.output.tolist()
+    assert np.concatenate([block.time for block in blocks]).tolist() == whole.time.tolist()
+    assert sum((block.others['lap'] for block in blocks), ()) == whole.others['lap'] == tuple(f'lap, {n}\n of many' for n in range(11))
+    assert {block.notes for block in blocks} == {('note',)}
+
+
+def test_a_row_that_is_longer_than_a_block_is_not_lost(tmp_path):
+    path = written(tmp_path, 'gyro_dps,lap\n1,"a\n\n\n\n\nb"\n2,c\n3,"d\n\n\n\n"\n')
+    blocks = list(read_log_blocks(path, rows=2))
+    assert [block.others['lap'] for block in blocks] == [('a\n\n\n\n\nb', 'c'), ('d\n\n\n\n',)]
+
+
+def test_samples_at_a_rate_go_on_from_block_to_block(tmp_path):
+    path = written(tmp_path, 'gyro_counts\n' + '1\n' * 7)
+    blocks = list(read_log_blocks(path, sensitivity=0.5, rate=100.0, rows=3))
+    assert np.concatenate([block.time for block in blocks]).tolist() == (np.arange(7) / 100.0).tolist()
+    assert [block.output.tolist() for block in blocks] == [[0.5] * 3, [0.5] * 3, [0.5]]
+
+
+def test_numbers_are_the_same_whether_other_columns_stand_beside_them_or_not(tmp_path):
+    """Columns of text are read by another parser than columns of numbers alone."""
+    texts = ['1', '-0.1', '1e-7', ' 2.5 ', '+3', 'nan', '0.1000000000000000055511151231257827', '12345678901234567890', '.5', '5.', '1_0']
+    alone = read_log(written(tmp_path, 'gyro_rad_s\n' + ''.join(f'{text}\n' for text in texts)))
+    beside = read_log(written(tmp_path, 'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
+    assert np.array_equal(alone.output, beside.output, equal_nan=True)
+    assert np.array_equal(alone.output, [float(text) for text in texts], equal_nan=True)
+
+
+@pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
+def test_the_reader_says_how_far_it_is(tmp_path, name):
+    write_log(tmp_path / name, Log(output=np.random.default_rng(0).normal(size=5000)))
+    said = []
+    list(read_log_blocks(tmp_path / name, rows=1000, heard=said.append))
+    assert len(said) == 5 and said == sorted(said) and said[-1] == (tmp_path / name).stat().st_size
+
+
+@pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
+def test_a_log_written_in_blocks_is_the_log_written_at_once(tmp_path, name):
+    generator = np.random.default_rng(0)
+    log = Log(output=generator.normal(size=9), time=np.arange(9.0), notes=('a',), others={'lap': tuple('abcdefghi')})
+    more = generator.normal(size=9)
+    write_log(tmp_path / f'whole_{name}', log, {'rate_rad_s': more})
+    pieces = [slice(0, 4), slice(4, 5), slice(5, 9)]
+    write_log_blocks(tmp_path / name, (
+        (Log(log.output[here], time=log.time[here], notes=('a',), others={'lap': log.others['lap'][here]}), {'rate_rad_s': more[here]})
+        for here in pieces))
+    assert read_log(tmp_path / name).others == read_log(tmp_path / f'whole_{name}').others
+    opened = gzip.open if name.endswith('.gz') else open
+    assert opened(tmp_path / name).read() == opened(tmp_path / f'whole_{name}').read()
+
+
+@pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
+def test_a_log_that_breaks_off_leaves_the_old_file_and_nothing_else(tmp_path, name):
+    write_log(tmp_path / name, Log(output=np.ones(3)))
+    before = (tmp_path / name).read_bytes()
+
+    def blocks():
+        yield Log(output=np.zeros(1000)), {}
+        raise LogError('line 1001 is no row')
+    with pytest.raises(LogError, match='line 1001'):
+        write_log_blocks(tmp_path / name, blocks())
+    assert (tmp_path / name).read_bytes() == before and [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_the_same_log_gives_the_same_compressed_file(tmp_path):
+    log = Log(output=np.arange(100.0))
+    for name in ('a.csv.gz', 'b.csv.gz'):
+        write_log(tmp_path / name, log)
+    assert (tmp_path / 'a.csv.gz').read_bytes() == (tmp_path / 'b.csv.gz').read_bytes()

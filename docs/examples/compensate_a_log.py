@@ -14,7 +14,7 @@ import numpy as np
 
 from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.heading import Threshold, filter_rates, integrate, integrate_with_deviation
+from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
 from gyro_calibration.log import DEGREE, write_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import ROBOT
@@ -32,8 +32,8 @@ def main(path='compensated.csv'):
     log = simulate(MODEL, ROBOT, 100.0, np.random.default_rng(1))
     result = compensate(MODEL, log.output, log.temperature)
     sensitivity = rate_sensitivity(MODEL, log.output, result.rate, log.temperature)
-    filtered = filter_rates(Threshold(angle_random_walk=NOISE.angle_random_walk), log.time, result.rate)
-    heading, deviation = integrate_with_deviation(log.time, result.rate, filtered, sensitivity, covariance(MODEL), NOISE)
+    integrator = BlockIntegrator(Threshold(angle_random_walk=NOISE.angle_random_walk), NOISE, covariance(MODEL))
+    filtered, heading, deviation = integrator.add(log.time, result.rate, sensitivity)
     write_log(path, log, {'rate_rad_s': filtered, 'heading_rad': heading, 'heading_std_rad': deviation})
 
     raw = integrate(log.time, log.output)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.heading import Threshold, filter_rates, integrate_with_deviation
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, write_log
+from gyro_calibration.heading import BlockIntegrator, Threshold
+from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask, write_log_blocks
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
-from gyro_calibration.verbs.verb import Answer, add_log, not_negative, output_of, read, verb
+from gyro_calibration.verbs.verb import Answer, add_log, not_negative, output_of, read_blocks, verb
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -29,53 +31,79 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
-    model, log = read_model(given.model), read(given)
-    output = output_of(given, log)
-    known = np.isfinite(output)
-    if not known.any():
+    model, found = read_model(given.model), _Found()
+    write_log_blocks(given.out, _compensated(given, model, found))
+    return _answer(given, found)
+
+
+@dataclass
+class _Found:
+    """What there was in the blocks so far; heading and deviation are the last ones, rad."""
+
+    rows: int = 0
+    rows_without_output: int = 0
+    temperature_clipped: int = 0
+    beyond_range: int = 0
+    temperature_known: bool = False
+    heading: float | None = None
+    deviation: float = math.nan
+
+    def add(self, log: Log, columns: dict[str, Array]) -> None:
+        self.rows += len(log)
+        self.rows_without_output += len(log) - len(columns['rate_rad_s'])
+        self.temperature_clipped += int(columns['temperature_clipped'].sum())
+        self.beyond_range += int(columns['beyond_range'].sum())
+        self.temperature_known = log.temperature is not None
+        if len(columns.get('heading_rad', ())):
+            self.heading, self.deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
+
+
+def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
+    """Give the log block by block with its new columns, and count what is found in it."""
+    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
+    integrator, variance = BlockIntegrator(threshold, model.noise, covariance(model)), 0.0
+    for log in read_blocks(given):
+        output = output_of(given, log)
+        if log.time is not None and not found.rows:
+            # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
+            variance = model.noise.rate_variance(float(np.median(np.diff(log.time))))
+        known = np.isfinite(output)
+        time, temperature = (None if each is None else each[known] for each in (log.time, log.temperature))
+        columns = _columns(model, integrator, variance, time, output[known], temperature)
+        found.add(log, columns)
+        yield log, {name: _at(known, values) for name, values in columns.items()}
+    if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
-    time, temperature = (None if each is None else each[known] for each in (log.time, log.temperature))
-    columns = _compensated_columns(given, model, time, output[known], temperature)
-    write_log(given.out, log, {name: _at(known, values) for name, values in columns.items()})
-    return _compensated_answer(given, log, columns)
 
 
-def _compensated_columns(given: argparse.Namespace, model: GyroModel, time: Array | None, output: Array,
-                         temperature: Array | None) -> dict[str, Array]:
-    result, uncertainty = compensate(model, output, temperature), covariance(model)
+def _columns(model: GyroModel, integrator: BlockIntegrator, variance: float, time: Array | None, output: Array,
+             temperature: Array | None) -> dict[str, Array]:
+    result = compensate(model, output, temperature)
     sensitivity = rate_sensitivity(model, output, result.rate, result.temperature)
-    variance = quadratic_form(uncertainty, sensitivity)
     columns = {'rate_rad_s': result.rate}
     if time is not None:
-        variance = variance + model.noise.rate_variance(float(np.median(np.diff(time))))
-        threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-        columns['rate_rad_s'] = filter_rates(threshold, time, result.rate)
-        columns['heading_rad'], columns['heading_std_rad'] = integrate_with_deviation(
-            time, result.rate, columns['rate_rad_s'], sensitivity, uncertainty, model.noise)
-    columns['rate_std_rad_s'] = np.sqrt(np.broadcast_to(variance, output.shape))
-    columns['temperature_clipped'] = np.broadcast_to(result.temperature_clipped, output.shape)
-    columns['beyond_range'] = result.beyond_range
+        columns['rate_rad_s'], columns['heading_rad'], columns['heading_std_rad'] = integrator.add(time, result.rate, sensitivity)
+    columns['rate_std_rad_s'] = np.sqrt(variance + quadratic_form(covariance(model), sensitivity))
+    columns['temperature_clipped'], columns['beyond_range'] = result.temperature_clipped, result.beyond_range
     return columns
 
 
-def _at(known: Array, values: Array) -> Array:
+def _at(known: Mask, values: Array) -> Array:
     """Return the values at the rows where the output is known, and nan at the others."""
     whole = np.full(len(known), np.nan)
     whole[known] = values
     return whole
 
 
-def _compensated_answer(given: argparse.Namespace, log: Log, columns: dict[str, Array]) -> Answer:
-    data: dict[str, Any] = {'out': given.out, 'rows': len(log), 'rows_without_output': len(log) - len(columns['rate_rad_s']),
-                            'temperature_known': log.temperature is not None}
-    data.update({name: int(columns[name].sum()) for name in ('temperature_clipped', 'beyond_range')})
-    lines = [f'{len(log)} rows compensated by {given.model}, written to {given.out}.']
-    if 'heading_rad' in columns:
-        heading, deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
+def _answer(given: argparse.Namespace, found: _Found) -> Answer:
+    data: dict[str, Any] = {'out': given.out, **asdict(found)}
+    heading, deviation = data.pop('heading'), data.pop('deviation')
+    lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
+    if heading is not None:
         data.update(heading_rad=heading, heading_std_rad=None if math.isnan(deviation) else deviation)
         known = '' if math.isnan(deviation) else f' +- {deviation / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
-    if log.temperature is None:
+    if not found.temperature_known:
         lines.append('The log holds no temperature: the model was used at its reference temperature.')
     for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
                         ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),

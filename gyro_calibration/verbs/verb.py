@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from gyro_calibration.log import DEGREE, Array, Log, read_log
+from tqdm import tqdm
+
+from gyro_calibration.log import DEGREE, Array, Log, read_log, read_log_blocks
 
 
 class UsageError(ValueError):
@@ -61,7 +64,22 @@ def picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    log = read_log(given.log, None if given.sensitivity is None else given.sensitivity * DEGREE, given.rate)
+    return _turned(given, read_log(given.log, _sensitivity(given), given.rate))
+
+
+def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
+    """Read the log that a verb was given block by block, with a bar that shows how far it is."""
+    size = Path(given.log).stat().st_size if Path(given.log).is_file() else None
+    with tqdm(total=size, desc=given.log, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as bar:
+        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=lambda place: bar.update(place - bar.n)):
+            yield _turned(given, log)
+
+
+def _sensitivity(given: argparse.Namespace) -> float | None:
+    return None if given.sensitivity is None else given.sensitivity * DEGREE
+
+
+def _turned(given: argparse.Namespace, log: Log) -> Log:
     return replace(log, output=-output_of(given, log)) if given.invert else log
 
 

@@ -1,0 +1,106 @@
+"""
+Logs of any length: the verb compensate takes them block by block, and needs no more memory for a longer one.
+
+"""
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gyro_calibration.command_line import main
+from gyro_calibration.log import read_log, read_log_blocks
+from gyro_calibration.motion import ROBOT
+
+MODEL = """
+effects:
+  rate_temperature_polynomial:
+    matrix_dps: [[2.0e-10, -3.0e-9, 1.0e-6, -2.0e-5], [-1.0e-8, 2.0e-7, -4.0e-5, 2.0e-3], [3.0e-7, -4.0e-6, 4.0e-3, -0.05]]
+valid: {rate: [-0.8, 0.8], temperature: [26.0, 45.0]}
+noise: {angle_random_walk: 7.3e-4}
+self_calibration: {scale_factor_error: 0.01, bias: 0.001, covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}
+"""
+
+#: Runs the program and then says how much memory the process had at most, KiB.
+_MEASURED = """
+import resource, sys
+from gyro_calibration.command_line import main
+code = main(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+sys.exit(code)
+"""
+
+
+def write_robot(path, rows):
+    """Write a log of the robot, which drives its way again and again."""
+    time = np.arange(16000) * 0.01
+    way = [f',{rate:.6f},{degc:.2f}\n' for rate, degc in zip(ROBOT.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
+    with open(path, 'w') as file:
+        file.write('time_s,gyro_rad_s,temperature_degc\n')
+        file.writelines(f'{row / 100:.2f}{rest}' for row, rest in zip(range(rows), itertools.cycle(way)))
+
+
+@pytest.fixture
+def model(tmp_path):
+    path = tmp_path / 'model.yaml'
+    path.write_text(MODEL)
+    return path
+
+
+def test_the_memory_does_not_grow_with_the_log(model, tmp_path):
+    peaks = []
+    for rows in (100_000, 400_000):
+        write_robot(tmp_path / 'log.csv', rows)
+        words = ['compensate', 'log.csv', '--model', model, '--out', 'out.csv', '--threshold', '0.3']
+        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)], capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0 and f'{rows} rows compensated' in done.stdout, done.stderr
+        assert not done.stderr, 'a bar is for a terminal only'
+        peaks.append(int(done.stdout.split()[-1]) / 1024)
+    assert peaks[1] < peaks[0] + 14.0, 'MiB; half of what 300 000 more rows of twelve numbers are'
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Let logs be read in blocks of 300 rows."""
+    monkeypatch.setattr('gyro_calibration.verbs.verb.read_log_blocks',
+                        lambda *given, **more: read_log_blocks(*given, rows=300, **more))
+
+
+WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'], 'at a rate': ['--rate', '100']}
+
+
+@pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)
+def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, request, capsys):
+    write_robot(tmp_path / 'log.csv', 4001)
+    lines = (tmp_path / 'log.csv').read_text().splitlines()
+    for lost in (1, 2, *range(290, 1300), 4001):  # outputs, among them those of whole blocks and of the last row
+        time, _, degc = lines[lost].split(',')
+        lines[lost] = f'{time},nan,{degc}'
+    (tmp_path / 'log.csv').write_text('\n'.join(lines) + '\n')
+    answers = []
+    for out in ('whole.csv', 'blocks.csv.gz'):
+        assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / out), '--json', *words]) == 0
+        answers.append(capsys.readouterr().out.replace(out, ''))
+        request.getfixturevalue('small_blocks')
+    assert answers[0] == answers[1] and '"rows_without_output": 1013' in answers[0]
+    whole, blocks = (read_log(tmp_path / out).others for out in ('whole.csv', 'blocks.csv.gz'))
+    assert list(whole) == list(blocks) and len(whole) == 6
+    for name in whole:
+        np.testing.assert_allclose(np.array(blocks[name], float), np.array(whole[name], float), rtol=1e-12, err_msg=name)
+
+
+def test_what_is_refused_late_leaves_no_file(model, tmp_path, small_blocks, capsys):
+    write_robot(tmp_path / 'log.csv', 1000)
+    with open(tmp_path / 'log.csv', 'a') as file:
+        file.write('3.0,0.1,30\n')
+    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / 'out.csv')]) == 2
+    assert 'line 1002, column time_s: 3 s does not come after 9.99 s' in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['log.csv', 'model.yaml']
+
+
+def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, capsys):
+    (tmp_path / 'log.csv').write_text('time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
+    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / 'out.csv')]) == 1
+    assert 'no output of the gyro is a number' in capsys.readouterr().err and not (tmp_path / 'out.csv').exists()
