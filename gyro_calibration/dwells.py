@@ -32,6 +32,8 @@ _BLOCKS = 9
 _FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
 #: Samples that a dwell holds at least.
 _SAMPLES = 24
+#: Longer intervals than this say nothing of the sample rate, s.
+_PAUSE = 1.0
 #: The reference heading is looked at in blocks, s.
 _BLOCK = 0.1
 
@@ -80,7 +82,8 @@ class Steadiness:
     gap : over longer gaps nobody knows what the reference did, s
     settling : a gyro takes no longer than this to settle, s
     temperature : a dwell that warms by more than this is divided, K
-    wild : a sample this many robust standard deviations from its neighbours is left out
+    wild : a sample this many robust standard deviations from its neighbours, and from the middle of the dwell, is left out
+    share : so much of the log is in dwells at least; a log that swings looks steady now and then, 1
 
     """
 
@@ -93,6 +96,7 @@ class Steadiness:
     settling: float = 3.0
     temperature: float = 1.0
     wild: float = 6.0
+    share: float = 0.05
 
 
 class _Samples(NamedTuple):
@@ -109,11 +113,6 @@ class _Samples(NamedTuple):
     def error(self) -> Array:
         """Return what is steady in a dwell: the output, less what a reference rate explains of it."""
         return self.output if self.rate is None else self.output - self.scale * self.rate
-
-    @property
-    def interval(self) -> float:
-        return float(np.median(np.diff(self.time)))
-
 
 def dwells(log: Log, name: str = '') -> Dwells:
     """
@@ -217,14 +216,14 @@ def _sweeps(rate: Array) -> Numbers:
     the order tells nothing, blocks of consecutive dwells stand for sweeps: they are as far apart in time.
 
     """
-    turning = np.abs(rate) > 1e-3 * np.abs(rate).max()
-    for used in (np.full(len(rate), True), turning):
+    turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
+    for used in (np.full(len(rate), True), turning) if turning.any() else ():
         for value in (rate, np.abs(rate)):
             sweep = np.zeros(len(rate), dtype=int)
             sweep[used] = _passes(value[used])
             # A rest belongs to the dwell before it.
             sweep = np.maximum.accumulate(np.where(used, sweep, 0))
-            lengths = np.bincount(sweep)
+            lengths = np.bincount(sweep[used])
             if len(lengths) > 1 and np.median(lengths) >= _ROWS_OF_A_SWEEP:
                 return sweep
     return np.arange(len(rate)) * min(_BLOCKS, len(rate)) // len(rate)
@@ -256,21 +255,49 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
 
     """
     limits = limits or Steadiness()
-    samples, remarks = _usable(log, limits)
-    if samples.rate is not None:
-        stretches = _steady(samples.time, samples.rate, limits)
+    if log.reference_rate is None or log.reference_heading is None:
+        found = _find(log, limits)
     else:
-        stretches = _straight(samples, limits)
+        # A rate that was made of a coarse encoder's steps is hardly ever steady; the heading that it was made of may be straight.
+        by_rate, by_heading = _find(replace(log, reference_heading=None), limits), _find(replace(log, reference_rate=None), limits)
+        found = by_rate if by_rate.duration > 0.9 * by_heading.duration else by_heading
+    if found.share < limits.share:
+        raise DataRefused(_not_steady(found, limits))
+    return _means(found)
+
+
+class _Found(NamedTuple):
+    """The rows of each dwell, and what was left out."""
+
+    samples: _Samples
+    rows: list[Numbers]
+    remarks: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """Return the time in dwells, s."""
+        return float(sum(self.samples.time[part[-1]] - self.samples.time[part[0]] for part in self.rows))
+
+    @property
+    def share(self) -> float:
+        """Return the part of the log that is in dwells."""
+        return self.duration / float(self.samples.time[-1] - self.samples.time[0])
+
+
+def _find(log: Log, limits: Steadiness) -> _Found:
+    samples, remarks = _usable(log)
+    stretches = _straight(samples, limits) if samples.rate is None else _steady(samples.time, samples.rate, limits)
     stretches = [part for part in stretches if samples.time[part.stop - 1] - samples.time[part.start] > limits.duration]
     samples = samples._replace(scale=_scale(samples, stretches))
-    found = [_Cleaned.of(samples, part, limits) for part in stretches]
-    rows, cuts = _settled(samples, [part.rows for part in found], limits)
+    cleaned = [_Cleaned.of(samples, part, limits) for part in stretches]
+    rows, cuts = _settled(samples, [part.rows for part in cleaned], limits)
     rows, divided = _divided(samples, rows, limits)
-    rows = [part for part in rows if len(part) >= _SAMPLES and samples.time[part[-1]] - samples.time[part[0]] >= limits.duration]
-    if not rows:
-        raise DataRefused(_nothing_steady(samples, limits))
-    remarks += cuts + divided + _left_out(samples, rows, found) + _lost_samples(samples, rows)
-    return _means(samples, rows, tuple(remarks))
+    kept = [part for part in rows if len(part) >= _SAMPLES and samples.time[part[-1]] - samples.time[part[0]] >= limits.duration]
+    if len(kept) < len(rows):
+        remarks.append(f'steady stretches shorter than {limits.duration:g} s beside the settling, left out: {len(rows) - len(kept)}')
+    remarks += [*cuts, *divided, *_left_out(samples, kept, cleaned), *_lost_samples(log, samples, kept)]
+    found = _Found(samples, kept, tuple(remarks))
+    return found if found.share > 0.25 else found._replace(remarks=found.remarks + (_little(found.share),))
 
 
 def _scale(samples: _Samples, stretches: list[slice]) -> float:
@@ -285,36 +312,40 @@ def _scale(samples: _Samples, stretches: list[slice]) -> float:
     return _slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
 
 
-def _nothing_steady(samples: _Samples, limits: Steadiness) -> str:
-    steady = (f'to {limits.rate / DEGREE:g} deg/s' if samples.rate is not None
-              else f'to {limits.rate / DEGREE:g} deg/s and straight to {limits.heading / DEGREE:g} deg')
-    return (f'in {samples.time[-1] - samples.time[0]:.0f} s the reference is nowhere steady {steady} for {limits.duration:g} s beside '
-            'the settling; hold each rate for longer, or use the heading itself with --method likelihood')
+def _not_steady(found: _Found, limits: Steadiness) -> str:
+    straight = '' if found.samples.heading is None else f' and straight to {limits.heading / DEGREE:g} deg'
+    return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{straight}, for {limits.duration:g} s at a time beside the '
+            f'settling, in {100.0 * found.share:.0f} % of the log; hold each rate for longer, or use the heading itself with '
+            '--method likelihood')
 
 
-def _usable(log: Log, limits: Steadiness) -> tuple[_Samples, list[str]]:
+def _usable(log: Log) -> tuple[_Samples, list[str]]:
     """Return the samples that have output and reference, not too near to where the reference was lost, and what was lost."""
     output, time = _output(log), log.time
-    use_rate = log.reference_rate is not None and np.isfinite(log.reference_rate).any()
-    reference = log.reference_rate if use_rate else log.reference_heading
+    reference = log.reference_heading if log.reference_rate is None else log.reference_rate
     if time is None or reference is None:
         raise DataRefused('the log has no time or no reference; to find dwells it needs time_s and one of reference_rate_dps and '
                           'reference_heading_deg')
     lost = ~np.isfinite(reference)
     # A reference that gets lost errs before and after; the tracker loses its markers one by one.
-    reach = 2 * round(0.05 / float(np.median(np.diff(time)))) + 1
-    good = np.flatnonzero(~maximum_filter1d(lost, reach) & np.isfinite(output))
+    good = np.flatnonzero(~maximum_filter1d(lost, 2 * _count(time, 0.05) + 1) & np.isfinite(output))
     if len(good) < _SAMPLES:
         raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and a reference; look at the columns')
-    samples = _Samples(time[good], output[good], reference[good] if use_rate else None, None if use_rate else reference[good],
-                       None if log.temperature is None else log.temperature[good])
-    return samples, list(_lost_reference(time, lost))
+    rate, heading, temperature = (None if values is None else values[good]
+                                  for values in (log.reference_rate, log.reference_heading, log.temperature))
+    return _Samples(time[good], output[good], rate, heading, temperature), list(_lost_reference(time, lost))
+
+
+def _count(time: Array, span: float) -> int:
+    """Return the number of samples in a span, by the mean interval: stamps that come in bursts have no typical one."""
+    steps = np.diff(time)
+    return round(span / float(steps[steps < _PAUSE].mean())) if (steps < _PAUSE).any() else 0
 
 
 def _lost_reference(time: Array, lost: Flags) -> Iterator[str]:
     places = [f'{time[start]:.2f} s' for start, _ in _runs(lost)]
     if places:
-        yield f'the reference was lost {_times(len(places))}, {lost.sum()} samples, at {_listed(places)}; they are left out'
+        yield f'the reference was lost {_times(len(places))}, for {lost.sum()} samples, at {_listed(places)}; they are left out'
 
 
 def _times(count: int) -> str:
@@ -329,31 +360,32 @@ def _runs(flags: Flags) -> list[tuple[int, int]]:
 
 def _steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
     """Return the stretches whose reference rate is steady."""
-    count = max(3, round(limits.margin / float(np.median(np.diff(time)))))
+    count = max(3, _count(time, limits.margin))
     # A single wild sample of the reference must not break a dwell.
     smooth = uniform_filter1d(median_filter(rate, 5, mode='nearest'), count, mode='nearest')
     stray = maximum_filter1d(smooth, count, mode='nearest') - minimum_filter1d(smooth, count, mode='nearest')
-    allowed = float(np.clip(3.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
+    allowed = float(np.clip(5.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
     calm = stray <= allowed + limits.relative * np.abs(smooth)
     calm[1:] &= np.diff(time) <= limits.gap
-    return [part for start, stop in _runs(calm) for part in _level(smooth, start, stop, allowed, limits)]
+    return [slice(start + part.start, start + part.stop) for start, stop in _runs(calm)
+            for part in _level(uniform_filter1d(smooth[start:stop], 4 * count, mode='nearest'), allowed, limits)]
 
 
-def _level(smooth: Array, start: int, stop: int, allowed: float, limits: Steadiness) -> Iterator[slice]:
+def _level(rate: Array, allowed: float, limits: Steadiness) -> Iterator[slice]:
     """Divide a stretch where its rate has wandered off: a slow ramp falls to pieces, too short to be dwells."""
-    low = high = float(smooth[start])
-    for place, value in enumerate(smooth[start:stop].tolist(), start):
+    start, low, high = 0, math.inf, -math.inf
+    for place, value in enumerate(rate.tolist()):
         low, high = min(low, value), max(high, value)
         if high - low > 2.0 * (allowed + limits.relative * abs(value)):
             yield slice(start, place)
             start, low, high = place, value, value
-    yield slice(start, stop)
+    yield slice(start, len(rate))
 
 
-def heading_step(heading: Array) -> float:
-    """Return the step of an encoder, rad, from the headings that occur; next to nothing where the heading has no steps."""
+def code_step(values: Array) -> float:
+    """Return the step of an encoder, or of any digital output, from the values that occur; next to nothing where it has no steps."""
     # Rounding in the file splits a step in two sizes, and fast turns leave codes out: neither the smallest nor the middle gap is it.
-    gaps = np.diff(np.unique(heading))
+    gaps = np.diff(np.unique(values))
     gaps = gaps[gaps > 1e-9]
     return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
 
@@ -362,7 +394,7 @@ def _straight(samples: _Samples, limits: Steadiness) -> list[slice]:
     """Return the stretches whose reference heading is a straight line in time, but for the steps of its encoder."""
     heading = samples.heading
     assert heading is not None
-    step = heading_step(heading)
+    step = code_step(heading)
     first = np.unique(np.floor((samples.time - samples.time[0]) / _BLOCK), return_index=True)[1]
     counts = np.diff(np.append(first, len(heading)))
     time, blocks = np.add.reduceat(samples.time, first) / counts, np.add.reduceat(heading, first) / counts
@@ -370,6 +402,8 @@ def _straight(samples: _Samples, limits: Steadiness) -> list[slice]:
     edges = np.append(first, len(heading))
     parts: list[slice] = []
     for start, stop in _cones(time, blocks, 2.0 * tolerance, limits.gap):
+        if time[stop - 1] - time[start] < 0.5 * limits.duration:
+            continue
         part = _walked(time, blocks, start, stop, tolerance, step)
         if part.stop - part.start > 4 and not (parts and part.start < parts[-1].stop):
             parts.append(part)
@@ -402,17 +436,18 @@ def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterato
 
 def _walked(time: Array, heading: Array, start: int, stop: int, tolerance: float, step: float) -> slice:
     """Fit a line to the middle of a stretch, walk from there as far as it holds, and step back from the ramps."""
-    fifth = (stop - start) // 5
+    length = stop - start
+    fifth = length // 5
     middle = slice(start + fifth, stop - fifth)
-    if middle.stop - middle.start < 3:
-        return slice(start, start)
-    slope = _slope(time[middle], heading[middle])
-    stray = np.abs(heading - heading[middle].mean() - slope * (time - time[middle].mean()))
+    # Not beyond as much again at both ends, so that the work does not grow with the square of the log.
+    first, last = max(0, start - length), min(len(time), stop + length)
+    line = heading[middle].mean() + _slope(time[middle], heading[middle]) * (time[first:last] - time[middle].mean())
+    stray = np.abs(heading[first:last] - line)
     beyond = np.flatnonzero(stray > tolerance)
-    before, after = beyond[beyond < start + fifth], beyond[beyond >= stop - fifth]
+    before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
     begin = 0 if not len(before) else int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step)
-    end = len(time) if not len(after) else int(after[0]) - _step_back(stray[after[0]:], tolerance, step)
-    return slice(begin, max(begin, end))
+    end = len(stray) if not len(after) else int(after[0]) - _step_back(stray[after[0]:], tolerance, step)
+    return slice(first + begin, first + max(begin, end))
 
 
 def _step_back(stray: Array, tolerance: float, step: float) -> int:
@@ -459,26 +494,30 @@ class _Cleaned(NamedTuple):
 
 
 def _wild(error: Array, limit: float) -> Flags:
-    """Mark single samples far from their neighbours: neither a drift nor a vibration of the table is wild."""
-    if len(error) < 5:
+    """Mark single samples far from their neighbours and from the rest: neither a drift nor a vibration of the table is wild."""
+    if len(error) < 4:
         return np.zeros(len(error), dtype=bool)
-    edged = np.pad(error, 2, mode='reflect')
-    apart = error - np.median([edged[:-4], edged[1:-3], edged[3:-1], edged[4:]], axis=0)
+    # The median of six neighbours resists two wild ones among them.
+    edged = np.pad(error, 3, mode='reflect')
+    alone = error - np.median([edged[place:place + len(error)] for place in (0, 1, 2, 4, 5, 6)], axis=0)
     # An output of few codes agrees with its neighbours mostly: then the code is the measure.
-    spread = max(1.4826 * float(np.median(np.abs(apart))), heading_step(error), 1e-9)
-    return np.abs(apart) > limit * spread
+    least = max(code_step(error), 1e-9)
+    return _far(alone, limit, least) & _far(error - np.median(error), limit, least)
+
+
+def _far(values: Array, limit: float, least: float) -> Flags:
+    return np.abs(values) > limit * max(1.4826 * float(np.median(np.abs(values))), least)
 
 
 def _stuck(output: Array) -> Flags:
-    """Mark the repeats in runs of one value that are longer than the share of repeats in the stretch explains."""
-    repeats = np.concatenate([[False], np.diff(output) == 0.0])
-    share = repeats.mean()
-    # Most samples repeat: a gyro of coarse codes at rest, or a simulation without noise. That cannot be told from a stuck one.
-    if not 0.0 < share < 0.9:
+    """Mark the repeats in runs of one value that are longer than the share of this value in the stretch explains."""
+    share = np.unique(output, return_counts=True)[1].max() / len(output)
+    # Mostly one value: a gyro of coarse codes at rest, or a simulation without noise. That cannot be told from a stuck one.
+    if share > 0.9:
         return np.zeros(len(output), dtype=bool)
     longest = math.log(1e-6 / len(output)) / math.log(share)
     stuck = np.zeros(len(output), dtype=bool)
-    for start, stop in _runs(repeats):
+    for start, stop in _runs(np.concatenate([[False], np.diff(output) == 0.0])):
         stuck[start:stop] = stop - start > longest
     return stuck
 
@@ -537,25 +576,29 @@ def _last_seen(answer: Array, width: int) -> int:
     smooth = uniform_filter1d(answer, width, mode='nearest')
     # An answer of 20 ppm of the change is not worth a cut, even where no noise hides it.
     spread = max(float(smooth[len(smooth) // 2:].std()), 2e-5)
-    seen = np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread)
-    return 0 if not len(seen) else int(seen[-1]) + 1 + width // 2
+    last = -1
+    for place in np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread):
+        # After ten quiet bins it is over; what is seen later is chance.
+        last = int(place) if place - last <= 10 else last
+    return last + 1 + width // 2 if last >= 0 else 0
 
 
 def _divided(samples: _Samples, rows: list[Numbers], limits: Steadiness) -> tuple[list[Numbers], list[str]]:
     """Divide the dwells along which the temperature changes, so that its slope can be seen."""
     if samples.temperature is None:
         return rows, []
-    parts = [part for whole in rows for part in np.array_split(whole, _pieces(samples.temperature[whole], limits))]
+    pieces = [_pieces(samples.time[whole], samples.temperature[whole], limits) for whole in rows]
+    parts = [part for whole, count in zip(rows, pieces) for part in np.array_split(whole, count)]
     more = len(parts) - len(rows)
     remark = f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, which makes {more} more'
     return parts, [remark] if more else []
 
 
-def _pieces(temperature: Array, limits: Steadiness) -> int:
+def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
     if len(temperature) < _SAMPLES:
         return 1
     change = float(np.ptp([batch.mean() for batch in np.array_split(temperature, _MOST_BATCHES)]))
-    return max(1, math.ceil(change / limits.temperature))
+    return max(1, min(math.ceil(change / limits.temperature), int((time[-1] - time[0]) / limits.duration)))
 
 
 def _left_out(samples: _Samples, rows: list[Numbers], found: list[_Cleaned]) -> list[str]:
@@ -567,7 +610,7 @@ def _left_out(samples: _Samples, rows: list[Numbers], found: list[_Cleaned]) -> 
     runs = _runs(stuck & inside)
     remarks = []
     if wild:
-        remarks.append(f'{len(wild)} wild samples are left out, at {_listed([f"{samples.time[row]:.2f} s" for row in wild])}')
+        remarks.append(f'wild samples, left out: {len(wild)}, at {_listed([f"{samples.time[row]:.2f} s" for row in wild])}')
     if runs:
         places = [f'{samples.time[start]:.2f} s ({stop - start} samples)' for start, stop in runs]
         remarks.append(f'the output was stuck {_times(len(runs))}, at {_listed(places)}; the repeats are left out')
@@ -581,19 +624,29 @@ def _inside(time: Array, rows: list[Numbers]) -> Flags:
     return inside
 
 
-def _lost_samples(samples: _Samples, rows: list[Numbers]) -> list[str]:
-    """Say how many samples are missing within the dwells, where the stamps are regular enough to tell."""
-    steps = np.diff(samples.time) / samples.interval
+def _lost_samples(log: Log, samples: _Samples, rows: list[Numbers]) -> Iterator[str]:
+    """Say how many samples of the gyro are missing within the dwells, where the stamps are regular enough to tell."""
+    assert log.time is not None and log.output is not None
+    time = log.time[np.isfinite(log.output)]
+    steps = np.diff(time) / np.median(np.diff(time))
     if np.mean(np.abs(steps - 1.0) > 0.25) > 0.1:
-        return ['the stamps are too irregular to count lost samples']
-    gaps = np.flatnonzero((steps > 1.5) & _inside(samples.time, rows)[1:])
-    lost = int(np.sum(np.round(steps[gaps]) - 1))
-    places = [f'{samples.time[gap]:.2f} s' for gap in gaps]
-    return [f'{lost} samples are missing within the dwells, at {_listed(places)}; at a steady rate that does no harm'] if lost else []
+        yield 'the stamps are too irregular to count lost samples'
+        return
+    inside = np.interp(time[1:], samples.time, _inside(samples.time, rows)) > 0.5
+    gaps = np.flatnonzero((steps > 1.5) & inside)
+    if len(gaps):
+        lost = int(np.sum(np.round(steps[gaps]) - 1))
+        yield (f'samples missing within the dwells: {lost}, after {_listed([f"{time[gap]:.2f} s" for gap in gaps])}; at a steady rate '
+               'that does no harm')
 
 
-def _means(samples: _Samples, rows: list[Numbers], remarks: tuple[str, ...]) -> Dwells:
+def _little(share: float) -> str:
+    return f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood uses all of it, where there is a heading'
+
+
+def _means(found: _Found) -> Dwells:
     """Average each dwell (Ojeda et al., eq. 6)."""
+    samples, rows, remarks = found
     time, temperature = samples.time, samples.temperature
     durations = np.array([time[part[-1]] - time[part[0]] for part in rows])
     counts = np.clip(durations / _BATCH, _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
@@ -623,7 +676,7 @@ def _average_slopes(samples: _Samples, rows: list[Numbers], counts: Numbers) -> 
 
     """
     assert samples.heading is not None
-    step = heading_step(samples.heading)
+    step = code_step(samples.heading)
     times, headings = ([values[part] for part in rows] for values in (samples.time, samples.heading))
     integrals = [_integral(samples.time[part], samples.output[part]) for part in rows]
     rate, output = (np.array([_slope(*pair) for pair in zip(times, angles)]) for angles in (headings, integrals))
@@ -648,14 +701,16 @@ def _blur(heading: Array, step: float, duration: float) -> float:
     """
     Return the standard deviation of a heading's slope that the steps of an ideal encoder cause, rad/s.
 
-    Over M steps it is about step / (3 M duration), but that of samples that fall on the steps by chance at least; below a step, 0.6
-    step / duration (by simulation). A heading that stays on one step for the whole dwell is a rest: nothing turns that slowly.
+    Over M steps it is about 0.35 step / (M duration), and below one 0.6 step / duration (by simulation). Each step is seen late by up to
+    a sample, which adds the square root of M over the number of samples. A heading that stays on one step for the whole dwell is a
+    rest: nothing turns that slowly.
 
     """
-    if np.ptp(heading) < 0.5 * step:
+    if np.ptp(heading) <= 0.5 * step or step == 0.0:
         return 0.0
     steps = abs(heading[-1] - heading[0]) / step
-    return step / duration * math.hypot(0.35 / max(steps, 0.6), 0.4 / math.sqrt(len(heading)))
+    samples = len(heading)
+    return step / duration * math.hypot(0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
 
 
 def moderated(variance: Array, freedom: Array) -> Array:

@@ -1,18 +1,51 @@
-"""Dwells: what a rate table's file holds, and what is found in a log in time."""
+"""Dwells: what a rate table's file holds, and what is found in a log in time. The truth is simulated, where nothing else is said."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from gyro_calibration.dwells import dwells, find_dwells, from_table, join
+from gyro_calibration.dwells import code_step, dwells, find_dwells, from_table, join, moderated
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
+from gyro_calibration.motion import turns
+from gyro_calibration.noise import Noise, simulate_noise
+
+RATES = (0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1)))
+RUN = turns([(16.0, rate) for rate in RATES])
+TIME = np.arange(0.0, RUN.duration, 0.01)
+RATE, HEADING = RUN.rate_at(TIME), RUN.heading_at(TIME)
+SCALE, BIAS = 1.01, 0.3 * DEGREE
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(3)
 
 
 def table(rates, **more):
     rate = np.array(rates, dtype=float) * DEGREE
-    return Log(output=1.01 * rate, reference_rate=rate, **more)
+    return Log(output=SCALE * rate + BIAS, reference_rate=rate, **more)
 
+
+def run(generator, noise=0.01, rate=RATE, **more):
+    """Return the log of a gyro on a rate table; angle random walk in deg/√s."""
+    output = SCALE * rate + BIAS + simulate_noise(Noise(noise * DEGREE), len(TIME), 0.01, generator)
+    return Log(output=output, time=TIME, **(more or {'reference_rate': RATE}))
+
+
+def encoder(step, generator, heading=HEADING):
+    """Return the heading as an encoder with this step, deg, gives it, that begins anywhere within a step."""
+    return np.floor(heading / (step * DEGREE) + generator.random()) * step * DEGREE
+
+
+def errors(found):
+    """Return the errors of the means in their stated deviations."""
+    return (found.output - SCALE * found.rate - BIAS) / found.deviation
+
+
+# Rate tables
 
 def test_the_rows_of_a_rate_table_are_its_dwells(data):
     found = dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
@@ -22,20 +55,247 @@ def test_the_rows_of_a_rate_table_are_its_dwells(data):
 
 def test_the_order_of_the_rates_tells_the_sweeps_that_the_file_names(data):
     log = read_log(data / 'fog_rate_table' / 'table.csv')
-    assert (dwells(replace(log, others={})).sweep == dwells(log).sweep).mean() > 0.99
+    assert (dwells(replace(log, others={})).sweep == dwells(log).sweep).all()
+
+
+def test_a_column_names_the_sweeps():
+    found = from_table(table([1, 2, 3, 4], others={'sweep': ('cold', 'warm', 'cold', 'warm')}))
+    assert list(found.sweep) == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize('sweep', [
+    list(range(-100, 101, 20)),
+    [0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1))],
+    [rate for size in range(10, 101, 10) for rate in (0, size)],
+    [rate for size in range(10, 101, 10) for rate in (0, size, 0, -size)],
+], ids=['one direction', 'both signs in turn', 'rests between', 'rests between, both signs in turn'])
+def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
+    found = from_table(table(sweep * 3))
+    turning = found.rate != 0.0  # a rest is near to both the sweep before and the one after
+    assert list(found.sweep[turning]) == list(np.repeat([0, 1, 2], len(sweep))[turning])
+
+
+def test_a_sweep_ends_where_the_travel_through_the_rates_turns_back():
+    found = from_table(table([-100, -50, 0, 50, 100, 50, 0, -50, -100]))
+    assert list(found.sweep) == [0] * 5 + [1] * 4
+
+
+def test_rates_in_random_order_make_nine_blocks(generator):
+    found = from_table(table(generator.permutation(np.linspace(-100.0, 100.0, 90))))
+    assert list(found.sweep) == [block for block in range(9) for _ in range(10)]
 
 
 def test_three_speeds_of_a_record_player_are_three_blocks():
     assert list(from_table(table([33.3, 45.0, 78.0])).sweep) == [0, 1, 2]
 
 
-def test_a_log_that_swings_is_refused():
-    time = np.arange(0.0, 60.0, 0.01)
-    rate = 45.0 * DEGREE * np.sin(time)
-    with pytest.raises(DataRefused, match='--method likelihood'):
-        find_dwells(Log(output=rate, time=time, reference_rate=rate))
+def test_rows_without_output_or_reference_are_left_out_and_said():
+    log = table([10, 20, math.nan, 40, 50], temperature=np.arange(5.0))
+    found = from_table(replace(log, output=np.where(np.arange(5) == 3, np.nan, log.output)))
+    assert found.place == ('row 1', 'row 2', 'row 5')
+    assert list(found.temperature) == [0.0, 1.0, 4.0]
+    assert found.remarks == ('2 rows without output or reference are left out: 3, 4',)
 
 
-def test_joined_logs_keep_their_sweeps_apart():
-    whole = join([dwells(table([33.3, 45.0, 78.0]), 'a.csv')] * 2)
-    assert len(whole) == 6 and len(set(whole.sweep)) == 6 and whole.place[0] == 'a.csv: row 1'
+def test_a_table_may_say_how_well_its_means_are_known():
+    found = from_table(table([10, 20, 30], others={'deviation_dps': ('0.5', 'nan', '0')}))
+    assert found.deviation[0] == 0.5 * DEGREE and np.isnan(found.deviation[1:]).all()
+
+
+@pytest.mark.parametrize(('log', 'message'), [
+    (Log(counts=np.ones(3), reference_rate=np.ones(3)), 'how many deg/s a count'),
+    (Log(output=np.ones(3)), 'reference_rate_dps'),
+    (Log(output=np.ones(3), time=np.arange(3.0)), 'reference_heading_deg'),
+    (Log(output=np.ones(3), reference_rate=np.full(3, np.nan)), 'none of the 3 rows'),
+    (Log(output=np.ones(3), time=np.arange(3.0), reference_rate=np.full(3, np.nan)), '0 of 3 samples'),
+    (Log(output=np.ones(2), reference_rate=np.ones(2), others={'deviation_dps': ('0.1', 'good')}), 'good'),
+])
+def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
+    with pytest.raises(DataRefused, match=message):
+        dwells(log)
+
+
+def test_joined_logs_keep_their_sweeps_and_places_apart():
+    whole = join([dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name) for name in ('a.csv', 'b.csv')])
+    assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
+    assert whole.place[0] == 'a.csv: row 1' and whole.place[3] == 'b.csv: row 1'
+    assert len(whole.temperature) == len(whole) == 6
+
+
+def test_a_log_without_temperature_takes_it_from_those_that_it_is_joined_with():
+    whole = join([table_dwells := dwells(table([1, 2, 3])), replace(table_dwells, temperature=np.ones(3))])
+    assert whole.temperature is None and '1 of 2 logs hold no temperature' in whole.remarks[-1]
+
+
+# Logs in time
+
+def references(generator):
+    return {'rate': {'reference_rate': RATE}, 'heading': {'reference_heading': HEADING},
+            'fine encoder': {'reference_heading': encoder(0.088, generator)},
+            'coarse encoder': {'reference_heading': encoder(2.0, generator)}}
+
+
+@pytest.mark.parametrize('reference', ['rate', 'heading', 'fine encoder', 'coarse encoder'])
+def test_every_rate_of_a_table_is_found(reference, generator):
+    found = find_dwells(run(generator, **references(generator)[reference]))
+    assert np.allclose(found.rate / DEGREE, RATES, atol=0.01)
+    assert (np.abs(errors(found)) < 5.0).all()
+    lengths = [float(place.split()[2]) - float(place.split()[0]) for place in found.place]
+    assert min(lengths) > 12.5 and np.median(lengths) > 14.0
+
+
+@pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
+def test_the_means_scatter_as_they_claim_under_white_noise(reference, generator):
+    found = np.concatenate([errors(find_dwells(run(generator, **references(generator)[reference]))) for _ in range(12)])
+    # 252 errors: the standard deviation of their own is 4.5 %.
+    assert np.sqrt(np.mean(found ** 2)) == pytest.approx(1.0, abs=0.15)
+    assert 0.91 < np.mean(np.abs(found) < 1.96) < 0.99
+
+
+def test_the_means_claim_the_steps_of_a_coarse_encoder(generator):
+    found = np.concatenate([errors(find_dwells(run(generator, 1e-4, reference_heading=encoder(2.0, generator)))) for _ in range(12)])
+    assert np.mean(np.abs(found) < 1.96) > 0.93
+
+
+def test_the_claim_counts_what_is_correlated_within_a_batch(generator):
+    log = run(generator, 0.0)
+    scatter = []
+    for _ in range(12):
+        noise = simulate_noise(Noise(0.01 * DEGREE), len(TIME), 0.01, generator)
+        scatter.append(errors(find_dwells(replace(log, output=log.output + lfilter([0.1], [1.0, -0.9], noise)))))
+    assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(1.05, abs=0.15)
+
+
+@pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
+@pytest.mark.parametrize(('late', 'lag'), [(2, 0.1), (-5, 0.0), (5, 0.0), (0, 0.3)])
+def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(reference, late, lag, generator):
+    keep = math.exp(-0.01 / lag) if lag else 0.0
+    rate = lfilter([1.0 - keep], [1.0, -keep], np.roll(RATE, late))
+    found = find_dwells(run(generator, 0.002, rate, **references(generator)[reference]))
+    assert len(found) == len(RATES)
+    assert np.sqrt(np.mean(errors(found) ** 2)) < 1.5
+
+
+def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
+    log = run(generator)
+    found, same = find_dwells(replace(log, output=-log.output)), find_dwells(log)
+    assert np.allclose(found.output, -same.output) and np.allclose(found.deviation, same.deviation)
+
+
+@pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
+def test_wild_stuck_and_lost_samples_are_said_and_left_out(reference, generator):
+    log = run(generator, **references(generator)[reference])
+    output, given = log.output.copy(), next(iter(references(generator)[reference].values())).copy()
+    output[[500, 9000, 9001]] += 500.0 * DEGREE
+    output[12000:12080] = output[12000] = SCALE * RATE[12000] + BIAS + 0.4 * DEGREE
+    given[25000:25040] = np.nan
+    kept = np.ones(len(TIME), dtype=bool)
+    kept[30000:30007] = False
+    quantity = 'reference_rate' if reference == 'rate' else 'reference_heading'
+    found = find_dwells(replace(log, **{'output': output[kept], 'time': TIME[kept], quantity: given[kept]}))
+    said = ' '.join(found.remarks)
+    assert len(found) == len(RATES) and (np.abs(errors(found)) < 5.0).all()
+    assert 'wild samples, left out: 3, at 5.00 s, 90.00 s, 90.01 s' in said
+    assert 'stuck once, at 120.01 s (79 samples)' in said
+    assert 'lost once, for 40 samples, at 250.00 s' in said
+    assert 'samples missing within the dwells: 7, after 299.99 s' in said
+
+
+def test_nothing_is_said_of_a_good_log(generator):
+    said = [remark for _ in range(10) for remark in find_dwells(run(generator)).remarks if 'after each ramp' not in remark]
+    assert not said
+
+
+def test_a_gyro_of_coarse_codes_is_not_stuck(generator):
+    log = run(generator)
+    for step in (0.05, 0.3):
+        found = find_dwells(replace(log, output=np.round(log.output / (step * DEGREE)) * step * DEGREE))
+        assert not [remark for remark in found.remarks if 'stuck' in remark or 'wild' in remark]
+
+
+def test_a_dwell_that_warms_is_divided(generator):
+    still = np.zeros(len(TIME))
+    warm = find_dwells(run(generator, rate=still, reference_rate=still, temperature=25.0 + TIME / 60.0))
+    steady = find_dwells(run(generator, rate=still, reference_rate=still, temperature=25.0 + 0.2 * np.sin(TIME / 60.0)))
+    assert len(steady) == 1
+    assert 5 <= len(warm) <= 7 and np.ptp(warm.temperature) > 4.0 and 'divided' in ' '.join(warm.remarks)
+
+
+def test_a_rate_made_of_coarse_steps_gives_way_to_their_heading(generator):
+    heading = encoder(2.0, generator)
+    found = find_dwells(run(generator, reference_rate=np.gradient(heading, TIME), reference_heading=heading))
+    assert np.allclose(found.rate / DEGREE, RATES, atol=0.02)
+
+
+def test_a_simulation_without_noise_claims_nothing(generator):
+    found = find_dwells(run(generator, 0.0))
+    assert np.allclose(found.output, SCALE * found.rate + BIAS, atol=1e-12)
+    assert (np.isnan(found.deviation) | (found.deviation < 1e-12)).all()
+
+
+def test_stamps_that_come_in_bursts_do_not_hide_dwells(generator):
+    bursts = np.floor(TIME / 0.08) * 0.08 + 1e-4 * (np.arange(len(TIME)) % 8)
+    found = find_dwells(replace(run(generator), time=np.maximum.accumulate(bursts) + 1e-9 * np.arange(len(TIME))))
+    assert len(found) == len(RATES) and 'too irregular' in ' '.join(found.remarks)
+
+
+@pytest.mark.parametrize('rate', [1.0, 0.3])
+def test_a_log_that_swings_is_refused_with_the_other_way(rate, generator):
+    swing = 45.0 * DEGREE * np.sin(rate * TIME)
+    heading = 45.0 * DEGREE / rate * np.cos(rate * TIME)
+    for reference in ({'reference_rate': swing}, {'reference_heading': heading}, {'reference_heading': encoder(2.0, generator, heading)}):
+        with pytest.raises(DataRefused, match='steady to 0.5 deg/s.*--method likelihood'):
+            find_dwells(run(generator, rate=swing, **reference))
+
+
+def test_nothing_is_found_in_a_reference_of_noise(generator):
+    noise = generator.standard_normal(len(TIME)) * 10.0 * DEGREE
+    for reference in ({'reference_rate': noise}, {'reference_heading': noise}, {'reference_heading': np.cumsum(noise) / 20.0}):
+        with pytest.raises(DataRefused):
+            find_dwells(run(generator, **reference))
+
+
+def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
+    assert code_step(np.round(encoder(0.0879, generator) / DEGREE, 2)) == pytest.approx(0.088, abs=0.009)
+    assert code_step(encoder(2.0, generator)) == pytest.approx(2.0 * DEGREE)
+    assert code_step(np.sin(TIME)) < 0.01 * DEGREE
+
+
+# Deviations
+
+def test_variances_that_differ_by_chance_become_one(generator):
+    told = [moderated(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)]
+    # Alone, each would err by 43 %.
+    assert np.sqrt(np.mean((np.array(told) - 1.0) ** 2)) < 0.15
+    assert np.mean(told) == pytest.approx(1.0, abs=0.02)
+
+
+def test_variances_that_really_differ_stay_so(generator):
+    truth = np.repeat([1.0, 100.0], 20)
+    told = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)], axis=0)
+    assert np.allclose(told / truth, 1.0, atol=0.25)
+
+
+# Recordings
+
+def test_a_turntable_that_swings_at_one_speed_gives_dwells_of_both_signs(data):
+    found = find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz'))
+    assert len(found) > 350 and abs(np.sign(found.rate).sum()) < 10
+    scale, _ = np.polyfit(found.rate, found.output, 1)
+    assert scale == pytest.approx(-1.006, abs=0.002)
+
+
+def test_a_turntable_that_turns_back_before_it_is_steady_is_refused(data):
+    with pytest.raises(DataRefused, match='likelihood'):
+        find_dwells(read_log(data / 'mems_encoder_turntable' / 'yaw_fast.csv.gz'))
+
+
+@pytest.mark.parametrize('name', ['slow', 'fast'])
+def test_a_motion_of_the_hand_gives_its_rests_only(data, name):
+    log = read_log(data / 'mems_motion_capture' / f'{name}.csv.gz')
+    found = find_dwells(log)
+    assert len(found) == 2 and (np.abs(found.rate) < 0.05 * DEGREE).all()
+    moving = log.time[log.moving > 0.5]
+    ends = [[float(word) for word in place.split() if word[0].isdigit()] for place in found.place]
+    # The hand stands still a little before the recording says so.
+    assert ends[0][1] < moving[0] and ends[1][0] > moving[-1] - 0.5
