@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,7 @@ def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[flo
     model : of the gyro
     rate_range : of the output, rad/s
     temperature_range : degC; where it is not finite, a single curve is drawn at the model's reference temperature
-    dwells : measured errors, drawn as dots
+    dwells : those that were fitted, drawn as dots
 
     """
     output = np.linspace(*rate_range, 161)
@@ -140,8 +140,7 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
     if dwells is not None and dwells.temperature is not None:
         axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
-    for text in axes.clabel(lines, fontsize=9):
-        text.set_clip_on(False)  # a label at the edge is read all the same
+    for text in axes.clabel(lines, fontsize=9, manual=_label_places(lines.allsegs)):
         text.set_bbox({'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.8, 'alpha': 0.85})
     axes.set(xlabel='gyro output [deg/s]', ylabel='temperature [°C]', title='Error of the model [deg/s]; dots: dwells'
              if dwells is not None else 'Error of the model [deg/s]')
@@ -152,6 +151,15 @@ def _levels(error: Array) -> Array:
     from matplotlib.ticker import MaxNLocator
     low, high = float(error.min()), float(error.max())
     return np.asarray(MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(low, high if high > low else low + 1e-6))
+
+
+def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
+    """Return a place on each contour line, away from its ends and from those of its neighbours."""
+    places = []
+    for number, lines in enumerate(levels):
+        part = (0.35, 0.5, 0.65)[number % 3]
+        places += [tuple(line[round(part * (len(line) - 1))].tolist()) for line in lines if len(line) > 10]
+    return places
 
 
 def draw_residuals(path: str | Path, calibration: Calibration) -> None:
@@ -188,13 +196,14 @@ def _rms(values: Array) -> float:
 
 def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None) -> Any:
     """Draw errors as dots in a shade, on the scale of those that are kept; what is beyond is drawn at the edge."""
-    dots = axes.scatter(across[kept], error[kept], c='black' if shade is None else shade[kept], cmap=_shades(), s=7, linewidths=0)
+    dots = _draw_dots(axes, across[kept], error[kept], None if shade is None else shade[kept])
     low, high = float(error[kept].min()), float(error[kept].max())
     margin = 0.12 * (high - low) or 1e-3
     axes.set_ylim(low - margin, high + margin)
     if not kept.all():
-        axes.plot(across[~kept], np.clip(error[~kept], low - 0.6 * margin, high + 0.6 * margin), 'x', color='black', markersize=8,
-                  label=f'outlying, not fitted ({np.count_nonzero(~kept)})')
+        shown = np.clip(error[~kept], low - 0.6 * margin, high + 0.6 * margin)
+        beyond = ', at the edge: beyond it' if (shown != error[~kept]).any() else ''
+        axes.plot(across[~kept], shown, 'x', color='black', markersize=8, label=f'{len(shown)} outlying{beyond}')
         axes.legend(loc='best')
     axes.axhline(0.0, color='black', linewidth=0.5)
     axes.grid(alpha=0.3)
@@ -215,8 +224,7 @@ def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> No
     figure, panels = _panels(2, 1, (8.5, 8))
     temperature = errors.temperature
     for axes, error, words in zip(panels[:, 0], (errors.static, errors.modelled), ('static bias only', 'the model and its static bias')):
-        dots = axes.scatter(errors.rate / DEGREE, error / DEGREE, c='black' if temperature is None else temperature, cmap=_shades(), s=9,
-                            linewidths=0)
+        dots = _draw_dots(axes, errors.rate / DEGREE, error / DEGREE, temperature)
         limit = 1.15 * float(np.abs(error).max()) / DEGREE or 1e-3
         axes.axvspan(-slowest / DEGREE, slowest / DEGREE, facecolor='none', edgecolor='0.7', hatch='///', linewidth=0)
         axes.axhline(0.0, color='black', linewidth=0.5)
@@ -239,9 +247,11 @@ def _panels(rows: int, columns: int, inches: tuple[float, float]) -> tuple[Any, 
     return pyplot.subplots(rows, columns, figsize=inches, layout='constrained', squeeze=False)
 
 
-def _shades() -> Any:
+def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None) -> Any:
+    """Draw dots, each in the shade of grey that a quantity gives it."""
     from matplotlib.colors import LinearSegmentedColormap
-    return LinearSegmentedColormap.from_list('greys', _GREYS)
+    shades = {'color': 'black'} if shade is None else {'c': shade, 'cmap': LinearSegmentedColormap.from_list('greys', _GREYS)}
+    return axes.scatter(across, up, s=9, linewidths=0, **shades)
 
 
 def _save(figure: Any, path: str | Path) -> None:
