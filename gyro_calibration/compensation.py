@@ -80,11 +80,16 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     Return what the rate changes by for each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
-    `covariance`.
+    `covariance`. The model's rate solves ``rate = output - error(rate)``, so that what a value adds to the error is divided by the
+    steepness there: 0.5 for a sine response at 60 degrees of its phase.
 
     """
-    channels, calibration = Channels(rate, output, temperature), model.self_calibration
-    rows = [] if model.covariance is None else [row for term in model.terms for row in term.sensitivity(channels)]
+    calibration, rows = model.self_calibration, []
+    if model.covariance is not None:
+        modelled = rate if calibration is None else (rate - calibration.offset) / calibration.scale
+        channels = Channels(modelled, output, temperature)
+        steepness = model.steepness(channels)
+        rows = [row / steepness for term in model.terms for row in term.sensitivity(channels)]
     if calibration is not None:
         rows += [rate, 1.0]
     sensitivity = np.empty((len(rows), *np.shape(rate)))

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from gyro_calibration.effects import Channels, Effect, Number
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.noise import Noise
@@ -135,6 +137,15 @@ class GyroModel:
     def error(self, channels: Channels) -> Number:
         """Return the sum of all effects, rad/s."""
         return _sum(self.terms, channels)
+
+    def steepness(self, channels: Channels) -> Number:
+        """Return what rate and error together grow by with the rate, 1; not below 0.1, as `rate` solves for no effect beyond that."""
+        sought = [term for term in self.terms if 'rate' in term.effect.looks_at]
+        if not sought:
+            return 1.0
+        step = 1e-5  # rad/s; small beside what bends an effect, and large beside the rounding of its error
+        below, above = (_sum(sought, replace(channels, rate=channels.rate + change)) for change in (-step, step))
+        return np.maximum(1.0 + (above - below) / (2.0 * step), 0.1)
 
     def looks_at(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""

@@ -3,15 +3,18 @@ Compensation: the model, then its self-calibration; what lies outside the calibr
 
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, Channels, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, Channels, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
 from gyro_calibration.log import CACHED
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.noise import Noise
 
 WARM = Term(*polynomial_from_matrix([[0.1], [0.0]]))  # the bias is 0.1 deg/s a degC
 CALIBRATION = SelfCalibration(0.04, 0.002, ((1e-6, 1e-8), (1e-8, 1e-6)))
@@ -74,19 +77,62 @@ def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
     assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)), rel=1e-12, abs=1e-13)
 
 
-@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
-def test_the_sensitivity_is_the_derivative_of_the_rate(calibration):
-    """To first order: within the size of the scale factor errors and, as the columns are taken at the last rate, of the last bias."""
-    model, step = replace(MODEL, self_calibration=calibration), 1e-6
-    output = np.array([-1.0, 0.0, 0.7])
-    base = compensate(model, output).rate
+UNCERTAIN = {
+    'bias and scale': MODEL,
+    'sine response': GyroModel(
+        (Term(CATALOGUE['sine_response'], (0.6, 1.0)), Term(SCALE_FACTOR_ERROR, (0.02,)), Term(BIAS, (0.01,)),
+         Term(CATALOGUE['scale_factor_temperature'], (25.0, 1e-3))),
+        np.array([[4e-6, 1e-7, 0.0, 0.0], [1e-7, 1e-6, 1e-7, 0.0], [0.0, 1e-7, 1e-6, 0.0], [0.0, 0.0, 0.0, 1e-9]])),
+    'polynomial': GyroModel(
+        (Term(*polynomial_from_matrix([[1e-4, 2e-3, 0.1], [1e-5, 4e-3, -0.05]])),), np.diag(np.arange(1.0, 7.0)) * 1e-7),
+}
 
-    def changed(bias, scale, s, b):
-        moved = None if calibration is None else replace(calibration, scale_factor_error=calibration.scale_factor_error + s, bias=0.002 + b)
-        terms = (Term(BIAS, (0.01 + bias,)), Term(SCALE_FACTOR_ERROR, (0.001 + scale,)))
-        return (compensate(replace(model, terms=terms, self_calibration=moved), output).rate - base) / step
-    differences = np.array([changed(*row) for row in step * np.eye(4)[:2 if calibration is None else 4]])
-    assert rate_sensitivity(model, output, base, np.full(3, 25.0)) == pytest.approx(differences, rel=0.05, abs=0.002)
+
+def with_values(model, change):
+    """Return the model with its fitted values, and then s and b of its self-calibration, changed by so much."""
+    change, terms = list(change), []
+    for term in model.terms:
+        values = list(term.values)
+        for place in term.fitted:
+            values[place] += change.pop(0)
+        terms.append(Term(term.effect, tuple(values)))
+    if model.self_calibration is None:
+        return replace(model, terms=tuple(terms))
+    s, b = change
+    calibration = SelfCalibration(model.self_calibration.scale_factor_error + s, model.self_calibration.bias + b)
+    return replace(model, terms=tuple(terms), self_calibration=calibration)
+
+
+@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('name', UNCERTAIN)
+def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
+    model, step = replace(UNCERTAIN[name], self_calibration=calibration), 1e-6
+    rate, temperature = np.array([-1.4, -0.3, 0.0, 0.7, 1.5]), np.array([22.0, 24.0, 25.0, 30.0, 31.0])
+    output = model.output(rate, temperature)
+    base = compensate(model, output, temperature).rate
+    differences = [(compensate(with_values(model, row), output, temperature).rate - base) / step
+                   for row in step * np.eye(len(covariance(model)))]
+    assert rate_sensitivity(model, output, base, temperature) == pytest.approx(np.array(differences), rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('name', UNCERTAIN)
+def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(name, calibration):
+    """At 1.5 rad/s the sine response has bent so far (k w = 0.9) that a value counts 1.6 times what it adds to the output."""
+    model, generator, runs = replace(UNCERTAIN[name], self_calibration=calibration), np.random.default_rng(0), 2000
+    time = np.arange(101) * 0.1
+    rate, temperature = 1.5 * np.sin(time), 25.0 + time
+    output = model.output(rate, temperature)
+    whole = covariance(model)
+    rates = np.array([compensate(with_values(model, drawn), output, temperature).rate
+                      for drawn in generator.multivariate_normal(np.zeros(len(whole)), whole, runs)])
+    headings = np.array([integrate(time, row) for row in rates])
+    rate = compensate(model, output, temperature).rate
+    sensitivity = rate_sensitivity(model, output, rate, temperature)
+    deviation = BlockIntegrator(Threshold(0.0), Noise(), whole).add(time, rate, sensitivity)[2]
+    scatter = 5.0 * math.sqrt(2.0 / runs)  # of a variance out of so many runs, five sigma for a hundred times
+    assert rates.var(axis=0) / quadratic_form(whole, sensitivity) == pytest.approx(np.ones(101), abs=scatter)
+    assert headings.var(axis=0)[1:] / deviation[1:] ** 2 == pytest.approx(np.ones(100), abs=scatter)
 
 
 def test_the_sensitivity_of_one_sample_is_that_of_the_log():
