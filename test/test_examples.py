@@ -8,9 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from gyro_calibration.log import read_log
+from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model_file import read_model
 
 FOLDER = Path(__file__).parents[1] / 'docs/examples'
@@ -45,6 +46,22 @@ def test_the_self_calibration_is_in_the_written_model(run, tmp_path):
     run('self_calibrate_a_log.py')
     calibration = read_model(tmp_path / 'model.yaml').self_calibration
     assert abs(calibration.scale_factor_error + 0.1) < 4 * calibration.standard_deviations[0]
+
+
+def test_the_rate_table_gives_a_model_that_knows_the_true_rate(run, tmp_path):
+    text = run('rate_table.py')
+    taken = {line.split()[0] for line in text.splitlines() if line.split()[1] == 'taken'}
+    assert {'bias', 'sine_response', 'scale_factor_temperature'} <= taken
+    model = read_model(tmp_path / 'model.yaml')
+    rate = float(text.split()[-2])
+    output = 1.5 + 0.01 * DEGREE + np.sin(0.25 * 1.5) / 0.25 - 1.5 + 4e-4 * 5.0 * 1.5
+    assert abs(rate - 1.5) < 1e-3 and abs(model.rate(output, 30.0) - rate) < 1e-5
+
+
+def test_record_player_and_encoder_find_the_gyro(run):
+    found = [line.split() for line in run('turntable.py').splitlines() if '+-' in line]
+    wrong = [line for line in found if abs(float(line[-4]) - (1.3 if line[-1] == '%' else 0.2)) > 4.0 * float(line[-2])]
+    assert len(found) == 4 and not wrong
 
 
 def test_the_compensated_log_has_a_heading(run, tmp_path):

@@ -1,0 +1,48 @@
+"""
+Calibrate a gyro on a rate table over temperature, and see how well the model predicts sweeps that it was not fitted to.
+
+    python rate_table.py [MODEL.yaml]
+
+The table is simulated here, so that the truth is known. With one of your own: ``dwells(read_log('table.csv'))``.
+
+"""
+
+import sys
+
+import numpy as np
+
+from gyro_calibration.compensation import compensate
+from gyro_calibration.dwells import dwells
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE
+from gyro_calibration.log import DEGREE, Log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model_file import write_model
+from gyro_calibration.selection import select_effects
+
+#: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor that falls with temperature.
+TRUE_GYRO = GyroModel((Term(BIAS, (0.01 * DEGREE,)), Term(SINE_RESPONSE, (0.25, 1.0)), Term(SCALE_FACTOR_TEMPERATURE, (35.0, -4e-4))))
+SCATTER = 0.02 * DEGREE  # of a dwell's mean, rad/s
+
+
+def rate_table(generator):
+    """Return a log whose rows are dwells: ten sweeps over 21 rates, from 25 to 45 degC."""
+    rate = np.concatenate([np.linspace(-100.0, 100.0, 21)[::way] for way in (1, -1) * 5]) * DEGREE
+    temperature = np.linspace(25.0, 45.0, len(rate))
+    output = TRUE_GYRO.output(rate, temperature) + SCATTER * generator.standard_normal(len(rate))
+    return Log(output=output, temperature=temperature, reference_rate=rate)
+
+
+def main(path='model.yaml'):
+    table = dwells(rate_table(np.random.default_rng(1)))
+    selection = select_effects(table, technology='open_loop_fog')
+    fit = selection.calibration
+    for choice in selection.choices:
+        print(f'{choice.effect:28}{"taken" if choice.taken else "not taken":10} {choice.reason}')
+    print(f'error {fit.before_rms / DEGREE:.3f} deg/s rms before, {fit.left_out_rms / DEGREE:.3f} in sweeps left out')
+    write_model(path, fit.model)
+    compensated = compensate(fit.model, TRUE_GYRO.output(1.5, 30.0), 30.0)
+    print(f'written to {path}; a turn of 1.5 rad/s at 30 degC is reported as {compensated.rate:.5f} rad/s')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
