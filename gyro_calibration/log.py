@@ -137,7 +137,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     ----------
     path, sensitivity, rate : as for `read_log`
     rows : of a block, at least 2; the last one has less, and so have those with texts that go over several lines
-    heard : is told after each block how many bytes of the file are read
+    heard : is told after each block how many bytes of the file are read, if it is not a pipe
 
     Raises
     ------
@@ -157,7 +157,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             last = _refuse_time(path, places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
-            if heard is not None:
+            if heard is not None and file.seekable():
                 heard(file.tell())
             if count > 1:
                 yield Log(**arrays, notes=notes, others=others)

@@ -4,6 +4,7 @@ Logs of any length: the verb compensate takes them block by block, and needs no 
 """
 
 import itertools
+import math
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from gyro_calibration.command_line import main
-from gyro_calibration.log import read_log, read_log_blocks
+from gyro_calibration.log import Log, read_log, read_log_blocks, write_log
 from gyro_calibration.motion import ROBOT
 
 MODEL = """
@@ -104,3 +105,20 @@ def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, caps
     (tmp_path / 'log.csv').write_text('time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
     assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / 'out.csv')]) == 1
     assert 'no output of the gyro is a number' in capsys.readouterr().err and not (tmp_path / 'out.csv').exists()
+
+
+def test_a_log_may_come_through_a_pipe(model, tmp_path):
+    write_robot(tmp_path / 'log.csv', 1000)
+    words = ['-m', 'gyro_calibration', 'compensate', '/dev/stdin', '--model', model, '--out', tmp_path / 'out.csv']
+    done = subprocess.run([sys.executable, *map(str, words)], input=(tmp_path / 'log.csv').read_bytes(), capture_output=True)
+    assert done.returncode == 0 and b'1000 rows compensated' in done.stdout, done.stderr
+
+
+def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks):
+    (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
+    time = np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)])  # then samples are lost, and later every other one
+    write_log(tmp_path / 'log.csv', Log(output=np.zeros(len(time)), time=time))
+    words = ['compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv']
+    assert main([str(word) for word in words]) == 0
+    deviation = np.array(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'], float)
+    assert deviation == pytest.approx(np.full(len(time), 7.3e-4 / math.sqrt(0.01)), rel=1e-9)
