@@ -31,7 +31,7 @@ _BLOCKS = 9
 #: of the table, or an answer of the gyro's filter, needs to average out, s.
 _FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
 #: Samples that a dwell holds at least.
-_SAMPLES = 24
+_SAMPLES = 8
 #: Longer intervals than this say nothing of the sample rate, s.
 _PAUSE = 1.0
 #: The reference heading is looked at in blocks, s.
@@ -87,7 +87,7 @@ class Steadiness:
 
     """
 
-    duration: float = 2.0
+    duration: float = 1.5
     margin: float = 0.25
     rate: float = 0.5 * DEGREE
     relative: float = 0.005
@@ -366,6 +366,8 @@ def _steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
     stray = maximum_filter1d(smooth, count, mode='nearest') - minimum_filter1d(smooth, count, mode='nearest')
     allowed = float(np.clip(5.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
     calm = stray <= allowed + limits.relative * np.abs(smooth)
+    # The windows of both filters reach over a ramp's end; half of that is given back, the margin stays.
+    calm = maximum_filter1d(calm, 2 * (count // 2) + 1)
     calm[1:] &= np.diff(time) <= limits.gap
     return [slice(start + part.start, start + part.stop) for start, stop in _runs(calm)
             for part in _level(uniform_filter1d(smooth[start:stop], 4 * count, mode='nearest'), allowed, limits)]
@@ -398,26 +400,33 @@ def _straight(samples: _Samples, limits: Steadiness) -> list[slice]:
     first = np.unique(np.floor((samples.time - samples.time[0]) / _BLOCK), return_index=True)[1]
     counts = np.diff(np.append(first, len(heading)))
     time, blocks = np.add.reduceat(samples.time, first) / counts, np.add.reduceat(heading, first) / counts
-    tolerance = step + _crookedness(time, blocks, limits)
+    tolerance = step + _crookedness(blocks, limits)
     edges = np.append(first, len(heading))
     parts: list[slice] = []
     for start, stop in _cones(time, blocks, 2.0 * tolerance, limits.gap):
         if time[stop - 1] - time[start] < 0.5 * limits.duration:
             continue
         part = _walked(time, blocks, start, stop, tolerance, step)
-        if part.stop - part.start > 4 and not (parts and part.start < parts[-1].stop):
+        # Two stretches of one dwell reach over each other; the longer one knows its line better.
+        if parts and part.start < parts[-1].stop and _length(part) > _length(parts[-1]):
+            parts.pop()
+        if not (parts and part.start < parts[-1].stop):
             parts.append(part)
-    whole = [slice(int(edges[part.start]), int(edges[part.stop])) for part in parts]
+    whole = [slice(int(edges[part.start]), int(edges[part.stop])) for part in parts if _length(part) > 4]
     return [part for part in whole if _holds_its_slope(samples.time[part], heading[part], step, limits)]
 
 
-def _crookedness(time: Array, heading: Array, limits: Steadiness) -> float:
+def _length(part: slice) -> int:
+    return int(part.stop - part.start)
+
+
+def _crookedness(heading: Array, limits: Steadiness) -> float:
     """Return by how much the heading strays from a straight line within about a second, mostly, rad; within the limits."""
-    reach = max(1, round(0.5 / _BLOCK))
-    if len(time) <= 2 * reach:
-        return limits.heading
-    chord = 0.5 * (heading[2 * reach:] + heading[:-2 * reach])
-    return float(np.clip(3.0 * np.median(np.abs(heading[reach:-reach] - chord)), 0.02 * DEGREE, limits.heading))
+    # A vibration of the table is not seen over a whole number of its periods, so several lengths are looked at.
+    reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
+    strays = [np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach])) for reach in reaches]
+    stray = max((float(np.median(each)) for each in strays), default=math.inf)
+    return float(np.clip(3.0 * stray, 0.02 * DEGREE, limits.heading))
 
 
 def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[tuple[int, int]]:
@@ -595,7 +604,7 @@ def _divided(samples: _Samples, rows: list[Numbers], limits: Steadiness) -> tupl
 
 
 def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
-    if len(temperature) < _SAMPLES:
+    if len(temperature) < 2 * _MOST_BATCHES:
         return 1
     change = float(np.ptp([batch.mean() for batch in np.array_split(temperature, _MOST_BATCHES)]))
     return max(1, min(math.ceil(change / limits.temperature), int((time[-1] - time[0]) / limits.duration)))
@@ -649,7 +658,8 @@ def _means(found: _Found) -> Dwells:
     samples, rows, remarks = found
     time, temperature = samples.time, samples.temperature
     durations = np.array([time[part[-1]] - time[part[0]] for part in rows])
-    counts = np.clip(durations / _BATCH, _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
+    halves = np.array([len(part) // 2 for part in rows])
+    counts = np.clip(np.minimum(durations / _BATCH, halves), _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
     average = _average_rates if samples.rate is not None else _average_slopes
     rate, mean, variance, blur = average(samples, rows, counts)
     # White noise in a mean goes with 1 / duration, so dwells are alike in the product.

@@ -176,6 +176,25 @@ def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(reference
     assert np.sqrt(np.mean(errors(found) ** 2)) < 1.5
 
 
+@pytest.mark.parametrize('step', [0.0, 0.088, 2.0])
+def test_a_table_that_vibrates_and_rings_gives_its_dwells_all_the_same(step, generator):
+    keep = math.exp(-0.1 * 2.0 * math.pi * 3.0 * 0.01)
+    answer = [1.0, -2.0 * keep * math.cos(2.0 * math.pi * 3.0 * 0.01), keep ** 2]
+    rate = lfilter([sum(answer)], answer, RATE) + 20.0 * DEGREE * np.sin(2.0 * math.pi * 8.0 * TIME) * (RATE != 0.0)
+    heading = np.concatenate([[0.0], np.cumsum(0.005 * (rate[1:] + rate[:-1]))])
+    given = {'reference_heading': encoder(step, generator, heading)} if step else {'reference_rate': rate}
+    found = find_dwells(run(generator, rate=rate, **given))
+    assert np.allclose(found.rate / DEGREE, RATES, atol=0.1)
+    assert (np.abs(errors(found)) < 5.0).all()
+
+
+@pytest.mark.parametrize('every', [10, 100])
+def test_slow_samples_are_enough(every, generator):
+    log = run(generator)
+    found = find_dwells(Log(output=log.output[::every], time=TIME[::every], reference_rate=RATE[::every]))
+    assert np.allclose(found.rate / DEGREE, RATES) and (np.abs(errors(found)) < 5.0).all()
+
+
 def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
     log = run(generator)
     found, same = find_dwells(replace(log, output=-log.output)), find_dwells(log)
