@@ -5,7 +5,7 @@ One file a source; `finding` holds what they share. Published numbers stand in t
 
 """
 
-from gyro_calibration.reproduction import bot_thoughts, hong_park
+from gyro_calibration.reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein
 
 #: In the order of their years; each has ``reproduce(generator, runs, progress)``.
-SOURCES = {'hong_park': hong_park.reproduce, 'bot_thoughts': bot_thoughts.reproduce}
+SOURCES = {'ojeda': ojeda_chung_borenstein.reproduce, 'hong_park': hong_park.reproduce, 'bot_thoughts': bot_thoughts.reproduce}

@@ -16,9 +16,16 @@ from scipy.stats import t as student
 
 from gyro_calibration.likelihood import fit_likelihood
 from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.motion import Motion, from_headings, turns
+from gyro_calibration.motion import CALIBRATION, Motion, from_headings, turns
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.finding import Comparison, Contradiction, Progress, Reproduction, unseen
+from gyro_calibration.reproduction.finding import (
+    Comparison,
+    Contradiction,
+    Progress,
+    Reproduction,
+    from_own_figures,
+    unseen,
+)
 from gyro_calibration.self_calibration import fit_rate
 
 TITLE = 'Bot Thoughts: gyro calibration of an L3G4200D (blog)'
@@ -77,24 +84,21 @@ def line() -> tuple[float, float, float, float]:
 
 def _three_speeds() -> list[Comparison]:
     (first, second), (slope, interval, rest, _) = slopes(), line()
-    off = 100.0 * (1.0 - MEASURED_STROBE / STROBE)
-    own = [
-        ('33 1/3 turns a minute', 'deg/s', 6.0 * SPEEDS[1], '200', 'part 1', '', ''),
-        ('45 turns a minute', 'deg/s', 6.0 * SPEEDS[2], '270', 'part 1', '', ''),
-        ('slope from 0 to 200 deg/s', 'counts/(deg/s)', first, '-14.285', 'part 1', '', ''),
-        ('slope from 200 to 270 deg/s', 'counts/(deg/s)', second, '-14.334', 'part 1', '', ''),
-        ('SF, mean of the slopes', 'counts/(deg/s)', (first + second) / 2.0, '-14.309', 'part 1', 'cut off, not rounded', ''),
-        ('N', 'deg/s', MEANS[0] / SCALE_FACTOR, '-0.1793', 'part 1', '', ''),
-        ('strobe at 59.8 Hz', '%', off, '0.33', 'part 1', '', ''),
-        ('solver and turntable differ by', '%', 100.0 * (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2', '', "of the solver's scale"),
-        ('temperature coefficient', 'deg/h/K', 3600.0 * BIAS_TEMPERATURE, '144', 'temperature', '', ''),
+    return [
+        from_own_figures('33 1/3 turns a minute', 'deg/s', 6.0 * SPEEDS[1], '200', 'part 1'),
+        from_own_figures('45 turns a minute', 'deg/s', 6.0 * SPEEDS[2], '270', 'part 1'),
+        from_own_figures('slope from 0 to 200 deg/s', 'counts/(deg/s)', first, '-14.285', 'part 1'),
+        from_own_figures('slope from 200 to 270 deg/s', 'counts/(deg/s)', second, '-14.334', 'part 1'),
+        from_own_figures('SF, mean of the slopes', 'counts/(deg/s)', (first + second) / 2.0, '-14.309', 'part 1', 'cut off, not rounded'),
+        from_own_figures('N', 'deg/s', MEANS[0] / SCALE_FACTOR, '-0.1793', 'part 1'),
+        from_own_figures('strobe at 59.8 Hz', '%', 100.0 * (1.0 - MEASURED_STROBE / STROBE), '0.33', 'part 1'),
+        from_own_figures('solver and turntable differ by', '%', 100.0 * (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2',
+                         note="of the solver's scale"),
+        from_own_figures('temperature coefficient', 'deg/h/K', 3600.0 * BIAS_TEMPERATURE, '144', 'temperature'),
+        Comparison('SF, line through three points', 'counts/(deg/s)', slope, note=f'95 %: +- {interval:.2f}, one degree of freedom'),
+        Comparison('N, line through three points', 'deg/s', rest / slope),
+        Comparison('SF of the data sheet, 70 mdeg/s a count', 'counts/(deg/s)', -1.0 / SENSITIVITY),
     ]
-    rows = [Comparison(quantity, unit, ours, published, place, why=why, note=note, own_figures=True)
-            for quantity, unit, ours, published, place, why, note in own]
-    return [*rows,
-            Comparison('SF, line through three points', 'counts/(deg/s)', slope, note=f'95 %: +- {interval:.2f}, one degree of freedom'),
-            Comparison('N, line through three points', 'deg/s', rest / slope),
-            Comparison('SF of the data sheet, 70 mdeg/s a count', 'counts/(deg/s)', -1.0 / SENSITIVITY)]
 
 
 def _slopes() -> list[Contradiction]:
@@ -102,14 +106,15 @@ def _slopes() -> list[Contradiction]:
     rates = np.array(SPEEDS) * 6.0
     null = MEANS[1] - second * rates[1] - MEANS[0]
     return [
-        Contradiction({'first': first, 'second': second, 'percent': 100.0 * (second / first - 1.0), 'off': off / slope,
-                       'null': null / slope, 'kelvin': abs(null / slope) / BIAS_TEMPERATURE,
+        Contradiction({'first': first, 'second': second, 'percent': 100.0 * (second / first - 1.0), 'off': abs(off / slope),
+                       'null': abs(null / slope), 'kelvin': abs(null / slope) / BIAS_TEMPERATURE,
                        'speed': (rates[2] - rates[1]) * (1.0 - first / second), 'interval': interval},
                       'Part 1: the slopes {first:.3f} and {second:.3f} differ by {percent:.2f} %. A strobe that is off changes both '
                       'alike. It takes a middle point that is {off:.2f} deg/s off a line, or 45 turns a minute off by {speed:.2f} '
                       'deg/s, or a null that drifted by {null:.2f} deg/s, as {kelvin:.0f} K would do; three points cannot say which, '
                       'and leave the slope uncertain by {interval:.2f}.'),
-        Contradiction({'mean': sum(slopes()) / 2.0}, 'Part 1: the mean of the slopes is {mean:.4f}, printed as -14.309.'),
+        Contradiction({'mean': (first + second) / 2.0, 'rounded': (round(first, 3) + round(second, 3)) / 2.0},
+                      'Part 1: the mean of the slopes is {mean:.4f}, that of the printed slopes {rounded:.4f}; it is printed as -14.309.'),
         Contradiction({'wrong': 2.0 * abs(MEANS[0] / SCALE_FACTOR), 'offsets': abs(SOLVED_OFFSET - NULL), 'hour':
                        3600.0 * abs(SOLVED_OFFSET - NULL)},
                       'Part 2: the solver subtracts its offset, so the start [-14.309, 0.1793] has the wrong sign, {wrong:.2f} deg/s '
@@ -183,7 +188,7 @@ def _solver(found: Array) -> list[Comparison]:
         Comparison("scale by the solver's way on a gyro with this SF", 'counts/(deg/s)', SCALE_FACTOR * (1.0 + means[0]), '-14.49787',
                    'part 2', 3.0 * abs(SCALE_FACTOR) * deviations[0], 'the way itself does not err so; a scale of encoder, strobe or time'),
         Comparison("offset by the solver's way on a gyro with this N", 'deg/s', NULL + means[1] / DEGREE, '-0.20168', 'part 2',
-                   3.0 * deviations[1] / DEGREE, 'the null drifted'),
+                   3.0 * deviations[1] / DEGREE, 'nor here; a null of another time'),
         Comparison("error of scale, solver's way: mean", '%', 100.0 * means[0]),
         Comparison("error of scale, solver's way: standard deviation", '%', 100.0 * deviations[0]),
         Comparison('error of scale, likelihood: mean', '%', 100.0 * means[2]),
@@ -197,11 +202,19 @@ def _solver(found: Array) -> list[Comparison]:
 def _method(found: Array) -> Contradiction:
     means, deviations = 100.0 * found.mean(axis=0), 100.0 * found.std(axis=0, ddof=1)
     return Contradiction({'solver': means[0], 'solver_scatter': deviations[0], 'likely': means[2], 'likely_scatter': deviations[2],
-                          'reverse': means[4], 'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0), 'late': late_enough()},
+                          'reverse': means[4], 'slow': 100.0 * error_by_increments(CALIBRATION),
+                          'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0), 'late': late_enough()},
                          'Part 2: the two methods differ by {turntable:.2f} % of the turntable\'s SF. Fitting the gradient of a 2 deg '
                          'encoder at 50 Hz errs by {solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by {likely:.4f} +- '
                          '{likely_scatter:.4f} %; the gyro would have to be {late:.2f} s late. The other way round, the gyro fitted to '
-                         'the gradient, the steps of the encoder make it {reverse:.1f} %.')
+                         'the gradient, the steps of the encoder make it {reverse:.1f} %, and increment by increment on a motion up to '
+                         '45 deg/s {slow:.0f} %.')
+
+
+def error_by_increments(motion: Motion) -> float:
+    """Return the error of scale, 1, of increments of a gyro without any error, fitted to those of the encoder."""
+    heading = motion.heading_at(np.arange(round(motion.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE)
+    return float(linregress(np.diff(np.floor(heading / ENCODER_STEP) * ENCODER_STEP), np.diff(heading)).slope) - 1.0
 
 
 def late_enough() -> float:

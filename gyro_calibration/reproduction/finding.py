@@ -85,13 +85,19 @@ def _rounded(ours: float, uncertainty: float, published: str) -> str:
     if uncertainty:
         digits = max(0, 1 - math.floor(math.log10(uncertainty)))
         return f'{ours:.{digits}f} +- {uncertainty:.{digits}f}'
-    if not published:
-        return f'{ours:.3g}' if abs(ours) > 1e-6 else '0'
-    return f'{ours + 0.0:.{_decimals(published) + 1}f}'
+    if not published or published.startswith('<'):
+        return f'{ours:.4g}' if abs(ours) > 1e-6 else '0'
+    digits = _decimals(published) + 1 if '.' in published or ours != round(ours) else 0
+    return f'{ours:.{digits}f}'
 
 
 def _decimals(number: str) -> int:
     return len(number.partition('.')[2])
+
+
+def from_own_figures(quantity: str, unit: str, ours: float, published: str, place: str, why: str = '', note: str = '') -> Comparison:
+    """Return a comparison of what a source prints with what follows from its other figures."""
+    return Comparison(quantity, unit, ours, published, place, why=why, note=note, own_figures=True)
 
 
 @dataclass(frozen=True)

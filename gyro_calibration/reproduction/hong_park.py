@@ -18,7 +18,14 @@ from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.motion import CALIBRATION, ROBOT, Motion, from_rates
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.finding import Comparison, Contradiction, Progress, Reproduction, unseen
+from gyro_calibration.reproduction.finding import (
+    Comparison,
+    Contradiction,
+    Progress,
+    Reproduction,
+    from_own_figures,
+    unseen,
+)
 from gyro_calibration.self_calibration import fit_heading, fit_rate, record
 
 TITLE = 'Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile robots, Sensors 8, 2008'
@@ -54,8 +61,8 @@ def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progres
     """
     errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
     return Reproduction(TITLE, ASSUMED, (*_self_calibration(), *_own_figures(), *_table(errors)),
-                        (_rectangle_rule(), _short_move(), _exchanged_columns(), _efficiency(generator, runs), _bias_unit(), _percentages(),
-                         _half_an_hour(), _noise_over_threshold(errors), _slow_turns()))
+                        (_rectangle_rule(), _short_move(), _exchanged_columns(), _efficiency(generator, runs, progress), _bias_unit(),
+                         _percentages(), _half_an_hour(), _noise_over_threshold(errors), _slow_turns()))
 
 
 # figures 6 and 7
@@ -168,16 +175,15 @@ def drift_in_half_an_hour() -> tuple[float, float]:
 
 def _own_figures() -> list[Comparison]:
     drift = drift_in_half_an_hour()
-    own = [
-        ('scale factor error of 2.53 %, after one revolution', 'deg', 360.0 * 0.0253, '9.1', 'section 2.2', '', ''),
-        ('drift in 30 min, sum of both parts', 'deg', sum(drift), '11', 'section 1', '', 'standard deviations do not add so'),
-        ('drift in 30 min, root of the sum of squares', 'deg', math.hypot(*drift), '11', 'section 1', 'called a standard deviation', ''),
-        ('off pure integration, self-calibration', '%', _off(CALIBRATED[0]), '41', 'section 4.2', 'table 1 against the text', ''),
-        ('off pure integration, threshold filter', '%', _off(FILTERED[0]), '53', 'section 4.2', '', ''),
-        ('off pure integration, both', '%', _off(PROPOSED[0]), '64', 'section 4.2', '', ''),
+    return [
+        from_own_figures('scale factor error of 2.53 %, after one revolution', 'deg', 360.0 * 0.0253, '9.1', 'section 2.2'),
+        from_own_figures('drift in 30 min, sum of both parts', 'deg', sum(drift), '11', 'section 1', note='deviations do not add so'),
+        from_own_figures('drift in 30 min, root of the sum of squares', 'deg', math.hypot(*drift), '11', 'section 1',
+                         'called a standard deviation'),
+        from_own_figures('off pure integration, self-calibration', '%', _off(CALIBRATED[0]), '41', 'section 4.2', 'so says table 1'),
+        from_own_figures('off pure integration, threshold filter', '%', _off(FILTERED[0]), '53', 'section 4.2'),
+        from_own_figures('off pure integration, both', '%', _off(PROPOSED[0]), '64', 'section 4.2'),
     ]
-    return [Comparison(quantity, unit, ours, published, place, why=why, note=note, own_figures=True)
-            for quantity, unit, ours, published, place, why, note in own]
 
 
 def _off(mean: float) -> float:
@@ -296,10 +302,10 @@ def _kept_heading(part: float) -> float:
 
 # how near the estimators come to the bound
 
-def _efficiency(generator: np.random.Generator, runs: int) -> Contradiction:
+def _efficiency(generator: np.random.Generator, runs: int, progress: Progress[int]) -> Contradiction:
     """Return the scatter of eq. 7 and of the likelihood over the Cramér-Rao bound, in white noise and with an exact heading."""
     white, found = Noise(XV3500.noise.angle_random_walk), []
-    for _ in range(runs):
+    for _ in progress(range(runs)):
         time, rate = output_of(CALIBRATION, white, generator)
         scale, offset = _cumulative(integrate(time, rate), time, CALIBRATION.heading_at(time))
         likely = fit_likelihood(time, rate, CALIBRATION, 0.1)
