@@ -13,11 +13,11 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.signal import medfilt
 from scipy.special import chdtrc, chdtri
@@ -121,7 +121,7 @@ def _leave_out_wild_samples(rate: Array, number: Integers, time: Array) -> list[
     values = _filled(rate)
     off = np.abs(values - medfilt(values, 5))
     off[:2] = off[-2:] = 0.0
-    wild = np.nonzero(off > CHANCE * _scale(off))[0]
+    wild = np.nonzero(off > 1.25 * CHANCE * _scale(off))[0]  # the median takes a fifth off the scatter
     if not wild.size or wild.size > 0.001 * len(rate):
         return []
     rate[wild] = np.nan
@@ -402,7 +402,10 @@ QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0, lambda time: (np.asar
 RATE_RAMP = Part('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
 
 PARTS = (ANGLE_RANDOM_WALK, BIAS_INSTABILITY, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
-_RAMP, _QUANTIZATION = PARTS.index(RATE_RAMP), PARTS.index(QUANTIZATION)
+_WALK, _RAMP, _QUANTIZATION = PARTS.index(ANGLE_RANDOM_WALK), PARTS.index(RATE_RAMP), PARTS.index(QUANTIZATION)
+
+#: Beside the parts: what a filter takes from the variance. Over times beyond its memory that goes as quantization, with the other sign.
+_BEND = len(PARTS)
 
 #: Second difference.
 _WEIGHTS = (1.0, -2.0, 1.0)
@@ -495,8 +498,9 @@ class Figure:
     ----------
     part : which
     value : its coefficient, in the part's unit; 0 where the record shows none
-    standard_deviation : of the coefficient; nan where the record shows none
-    lower, upper : bounds with 95 % confidence; where the record shows none, 0 and what it cannot exceed with 97.5 %
+    standard_deviation : of the coefficient, if the parts that are seen are all there are; nan where the record shows none
+    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the record shows none, 0 and how much it
+        may hide
 
     """
 
@@ -518,6 +522,7 @@ class NoiseFit:
     chart : the Allan deviations that were fitted, at octaves
     shortest, longest : the averaging times that the fit holds for, s
     misfit : how much further the Allan deviations are off the sum of the parts than chance allows, as a share of them
+    rivals : the symbols of other combinations of parts that would explain the record nearly as well
 
     """
 
@@ -526,6 +531,7 @@ class NoiseFit:
     shortest: float
     longest: float
     misfit: float
+    rivals: tuple[str, ...] = ()
 
     @property
     def noise(self) -> Noise:
@@ -573,6 +579,16 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     return _figures(chart, _describe(_Octaves.of(chart)))
 
 
+@lru_cache(maxsize=8)
+def _forms(samples: int, sizes: tuple[int, ...]) -> Array:
+    """Return the covariance of Allan variances as a quadratic form of squared coefficients, shape (n, n, 5, 5)."""
+    forms = np.zeros((len(sizes),) * 2 + (len(PARTS),) * 2)
+    for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
+        form = _covariance_parts(samples, sizes[i], sizes[j])
+        forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
+    return forms
+
+
 @dataclass(frozen=True)
 class _Octaves:
     """
@@ -581,7 +597,7 @@ class _Octaves:
     Attributes
     ----------
     variance : shape (n,)
-    columns : of each part for a coefficient of 1, shape (n, 5)
+    columns : of each part, and of a bend, for a coefficient of 1, shape (n, 6)
     forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5)
 
     """
@@ -592,13 +608,9 @@ class _Octaves:
 
     @classmethod
     def of(cls, chart: AllanChart) -> _Octaves:
-        columns = np.column_stack([part.variance(chart.size) for part in PARTS])
-        forms = np.zeros((len(chart.size),) * 2 + (len(PARTS),) * 2)
-        counts = chart.samples + 1 - 2 * chart.size
-        lost = np.sqrt(counts / chart.differences)
-        for i, j in itertools.combinations_with_replacement(range(len(chart.size)), 2):
-            form = _covariance_parts(chart.samples, int(chart.size[i]), int(chart.size[j])) * lost[i] * lost[j]
-            forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
+        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS), -QUANTIZATION.variance(chart.size)])
+        scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
+        forms = _forms(chart.samples, tuple(chart.size.tolist())) * np.outer(scarcity, scarcity)[:, :, None, None]
         return cls(chart.deviation ** 2, columns, forms)
 
     def since(self, start: int) -> _Octaves:
@@ -607,7 +619,11 @@ class _Octaves:
 
     def covariance(self, squares: Array) -> Array:
         """Return the covariance of the variances, shape (n, n), if the squared coefficients are these."""
-        return np.einsum('ijpq,p,q->ij', self.forms, squares, squares)
+        return np.einsum('ijpq,p,q->ij', self.forms, squares[:_BEND], squares[:_BEND])
+
+    def model(self, squares: Array) -> Array:
+        """Return the variances that the squared coefficients add up to; above zero, however deep the bend."""
+        return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
 @dataclass(frozen=True)
@@ -620,7 +636,7 @@ class _Description:
     start : the first octave that it describes
     octaves : those that it describes
     places : the parts that it may hold
-    squares : squared coefficients, shape (5,)
+    squares : squared coefficients, shape (6,)
     half : Cholesky factor of the covariance of the variances
     misfit : see `NoiseFit`
 
@@ -640,12 +656,12 @@ class _Description:
         A mean square is no Gaussian value; its cube root nearly is one (Wilson and Hilferty, 1931).
 
         """
-        model, deviation = self.octaves.columns @ self.squares, np.sqrt((self.half ** 2).sum(axis=1))
+        model, deviation = self.octaves.model(self.squares), np.sqrt((self.half ** 2).sum(axis=1))
         ninth = (deviation / model) ** 2 / 9.0
         normal = (np.cbrt(self.octaves.variance / model) - 1.0 + ninth) / np.sqrt(ninth)
         half = self.half / deviation[:, None]
         density = np.log(ninth).sum() + 2.0 / 3.0 * np.log(model).sum() + 2.0 * np.log(half.diagonal()).sum()
-        return solve_triangular(half, normal, lower=True), float(density)
+        return np.linalg.solve(half, normal), float(density)
 
     @property
     def held(self) -> list[int]:
@@ -676,10 +692,10 @@ class _Description:
 
     def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
         """Return the squares of some parts by least squares, negative ones too, and their standard deviations."""
-        white = solve_triangular(self.half, self.octaves.columns[:, list(places)], lower=True)
+        white = np.linalg.solve(self.half, self.octaves.columns[:, list(places)])
         size = np.linalg.norm(white, axis=0)
         inverse = np.linalg.pinv((white / size).T @ (white / size))
-        found = inverse @ (white / size).T @ solve_triangular(self.half, self.octaves.variance, lower=True)
+        found = inverse @ (white / size).T @ np.linalg.solve(self.half, self.octaves.variance)
         return found / size, np.sqrt(inverse.diagonal()) / size
 
 
@@ -695,18 +711,21 @@ _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 #: A combination that is likelier by this, but not by enough to be believed, widens the bounds.
 _TEMPTING = 1.0
 
+#: A combination of other parts that is less likely by no more than this is as good an explanation.
+_RIVAL = 4.0
+
 #: A description is taken for good if it is off by more with this probability.
 _CHANCE = 0.01
 
 
 def _fit(octaves: _Octaves, places: tuple[int, ...], misfit: float, start: int) -> _Description:
     """Fit a combination of parts by generalized least squares, none negative, with the covariance of the noise that was fitted."""
-    columns, squares = octaves.columns[:, places], np.zeros(len(PARTS))
-    half = np.diag(octaves.variance)
+    both = np.column_stack([octaves.columns[:, places], octaves.variance])
+    squares, half = np.zeros(_BEND + 1), np.diag(octaves.variance)
     for _ in range(_PASSES):
-        white = solve_triangular(half, columns, lower=True)
-        size = np.linalg.norm(white, axis=0)
-        found = nnls(white / size, solve_triangular(half, octaves.variance, lower=True))[0] / size
+        white = np.linalg.solve(half, both)
+        size = np.linalg.norm(white[:, :-1], axis=0)
+        found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
         if not found.any() or np.allclose(squares[list(places)], found, rtol=1e-4, atol=0.0):
             break
         squares[list(places)] = found
@@ -715,57 +734,89 @@ def _fit(octaves: _Octaves, places: tuple[int, ...], misfit: float, start: int) 
 
 
 def _half(octaves: _Octaves, squares: Array, misfit: float) -> Array:
-    """
-    Return the Cholesky factor of the covariance of the variances, each of which may be off the sum of the parts by another share besides.
+    """Return the Cholesky factor of the covariance of the variances, each of which may be off the sum by another share besides."""
+    model = octaves.model(squares)
+    covariance = octaves.covariance(squares)
+    covariance[np.diag_indices(len(model))] += 4.0 * (misfit * model) ** 2
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return _nearly_half(covariance, model)
 
-    What a ramp alone leaves is nearly singular: correlations are kept a little away from one.
 
-    """
-    model = octaves.columns @ squares
-    covariance = octaves.covariance(squares) + np.diag(4.0 * (misfit * model) ** 2)
+def _nearly_half(covariance: Array, model: Array) -> Array:
+    """Return the same for a covariance that is nearly singular, as where a ramp is all there is: correlations are kept away from one."""
     size = np.sqrt(np.maximum(covariance.diagonal(), 1e-12 * model ** 2))
     values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     return size[:, None] * np.linalg.cholesky((vectors * np.maximum(values, 1e-4)) @ vectors.T)
 
 
-_COMBINATIONS = [places for count in range(1, len(PARTS) + 1) for places in itertools.combinations(range(len(PARTS)), count)]
+def _with_short_end(places: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Return a combination of parts as it is, with quantization, and with a bend of its angle random walk."""
+    return [places, (*places, _QUANTIZATION)] + ([(*places, _BEND)] if _WALK in places else [])
+
+
+_COMBINATIONS = [combination for count in range(len(PARTS))
+                 for places in itertools.combinations([place for place in range(len(PARTS)) if place != _QUANTIZATION], count)
+                 for combination in _with_short_end(places) if combination]
 
 
 def _describe(octaves: _Octaves) -> list[_Description]:
-    """Return all combinations of parts, the likeliest first, from the first octave on that chance allows, or else with a misfit."""
+    """
+    Return all combinations of parts, the likeliest first, from the first octave on that chance allows, or else with a misfit.
+
+    What bends the short end fades slowly, so that one octave more is left out than chance asks for.
+
+    """
+    last = max(len(octaves.variance) // 2 - 1, 0)
     for misfit in _MISFITS:
-        for start in range(max(len(octaves.variance) // 2, 1)):
-            since = octaves.since(start)
-            combinations = [places for places in _COMBINATIONS if start == 0 or _QUANTIZATION not in places]
-            found = sorted((_fit(since, places, misfit, start) for places in combinations), key=_Description.cost)
+        for start in range(last + 1):
+            found = _combinations(octaves, start, misfit)
             if found[0].likely():
-                return found
+                return _combinations(octaves, start + 1, misfit) if 0 < start < last else found
     raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum of the five kinds of noise: there is '
                       'something else in the record, such as a swing or a vibration; record again at rest')
+
+
+def _combinations(octaves: _Octaves, start: int, misfit: float) -> list[_Description]:
+    """Return all combinations of parts, fitted from an octave on, the likeliest first."""
+    since = octaves.since(start)
+    return sorted((_fit(since, places, misfit, start) for places in _COMBINATIONS), key=_Description.cost)
 
 
 def _figures(chart: AllanChart, found: list[_Description]) -> NoiseFit:
     best = found[0]
     tempting = [best, *(each for each in found if each.surprise() < best.surprise() - _TEMPTING)]
-    figures = {part.symbol: _held(best, tempting, place) if place in best.held else _absent(best, found, place)
+    seen = [place for place in best.held if place != _BEND and (place != _QUANTIZATION or best.start == 0)]
+    figures = {part.symbol: _held(best, tempting, place) if place in seen else _absent(best, found, place)
                for place, part in enumerate(PARTS)}
     return NoiseFit({symbol: _in_seconds(figure, chart.interval) for symbol, figure in figures.items()}, chart,
-                    float(chart.time[best.start]), float(chart.time[-1]), best.misfit)
+                    float(chart.time[best.start]), float(chart.time[-1]), best.misfit,
+                    tuple(sorted({''.join(PARTS[place].symbol for place in each.held if place != _BEND) for each in _rivals(found)})))
 
 
 def _held(best: _Description, tempting: list[_Description], place: int) -> Figure:
     """Return a figure with bounds that hold whether or not parts are there that the evidence does not suffice for."""
     bounds = [each.bounds(place) for each in tempting if place in each.held]
     lower, upper = min(low for low, _ in bounds), max(high for _, high in bounds)
-    return Figure(PARTS[place], math.sqrt(best.squares[place]), (upper - lower) / (2.0 * 1.96), lower, upper)
+    value, deviation = math.sqrt(best.squares[place]), best.estimate(best.held)[1][best.held.index(place)]
+    return Figure(PARTS[place], value, 0.5 * deviation / value, lower, upper)
 
 
 def _absent(best: _Description, found: list[_Description], place: int) -> Figure:
     """Return how much of a part there can be besides those that are seen."""
-    places = [*best.held, place]
+    places = [*(each for each in best.held if each not in (place, _BEND)), place]
     limits = [squares[-1] + 1.96 * deviations[-1] for squares, deviations in (
         each.estimate(places) for each in found if each is best or set(each.held) == set(places))]
+    limits += [each.bounds(place)[1] ** 2 for each in _rivals(found) if place in each.held]
     return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
+
+
+def _rivals(found: list[_Description]) -> list[_Description]:
+    """Return the combinations of other parts, not more, that are nearly as likely as the best."""
+    best = found[0]
+    return [each for each in found if each.surprise() < best.surprise() + _RIVAL and len(each.held) <= len(best.held)
+            and not set(each.held) - {_BEND, _QUANTIZATION} <= set(best.held)]
 
 
 def _in_seconds(figure: Figure, interval: float) -> Figure:

@@ -107,6 +107,9 @@ def _said_of_fit(fit: NoiseFit) -> str:
         text += '; shorter ones are bent by the filters of the gyro, or by what it picks up'
     if fit.misfit:
         text += f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation unexplained, which the intervals allow for'
+    if fit.rivals:
+        others = ' or '.join(' + '.join(rival) for rival in fit.rivals)
+        text += f'; {others} would describe them nearly as well, and a longer record would tell'
     return f'{text}.'
 
 
@@ -120,5 +123,5 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: Noi
                'degrees_of_freedom': chart.degrees_of_freedom, 'differences': chart.differences, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval, 'remarks': list(record.remarks), **figures,
             'floor': {'deviation': deviation, 'time_s': time, 'bias_instability': deviation / ALLAN_FLOOR, 'reached': fit.floor_reached},
-            'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
+            'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit, 'rivals': list(fit.rivals),
             'chart': {name: values.tolist() for name, values in columns.items()}, 'picture': given.picture, 'out': given.out}
