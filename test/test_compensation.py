@@ -135,6 +135,14 @@ def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(n
     assert headings.var(axis=0)[1:] / deviation[1:] ** 2 == pytest.approx(np.ones(100), abs=scatter)
 
 
+def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():
+    model = UNCERTAIN['sine response']
+    output, degc = np.linspace(-3.0, 3.0, 101), np.full(101, 25.0)
+    rate = compensate(model, output).rate
+    variance = quadratic_form(covariance(model), rate_sensitivity(model, output, rate, degc))
+    assert np.isfinite(variance).all() and variance[0] > 25.0 * variance[50]
+
+
 def test_the_sensitivity_of_one_sample_is_that_of_the_log():
     model, rates = replace(MODEL, self_calibration=CALIBRATION), np.array([-1.0, 0.7])
     at_once = rate_sensitivity(model, rates, rates, np.full(2, 25.0))
