@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import io
 import math
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gyro_calibration.calibration import find_scatter, take
+from gyro_calibration.calibration import take
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells
 from gyro_calibration.files import write_atomically
@@ -21,8 +22,8 @@ from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.picture import draw_turn_errors
 from gyro_calibration.selection import select_effects
-from gyro_calibration.turn import SLOWEST, Size, TurnErrors, predicted_rates, size, turn_errors
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, positive, read, verb
+from gyro_calibration.turn import SLOWEST, Size, TurnErrors, not_outlying, predicted_rates, size, turn_errors
+from gyro_calibration.verbs.verb import Answer, add_log, picture_file, positive, read, verb
 
 TURN = 2.0 * math.pi
 #: Temperatures go into this many bins at most.
@@ -40,15 +41,13 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--slowest', type=positive, default=SLOWEST / DEGREE, metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='the table, a row a turn, in SI')
-    parser.add_argument('--picture', metavar='FILE', help='.png or .svg')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the errors over the rate, .png or .svg')
     return parser
 
 
 def _turn(given: argparse.Namespace) -> Answer:
-    if given.picture:
-        _refuse_picture(given.picture)
     found = dwells(read(given))
-    rate, kept, remarks, data = _fitted(found) if given.model is None else _as_given(read_model(given.model), given.model, found)
+    rate, kept, remarks, data = _fitted(found) if given.model is None else _as_given(given, read_model(given.model), found)
     errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
     if given.out:
         _write(given.out, errors)
@@ -57,16 +56,6 @@ def _turn(given: argparse.Namespace) -> Answer:
     remarks = [*found.remarks, *errors.remarks, *remarks, *_outlying(found, kept)]
     written = [f'Written to {path}.' for path in (given.out, given.picture) if path]
     return Answer('\n'.join([*_text(given, errors, remarks), *written]), {**_data(given, errors, remarks), **data})
-
-
-def _refuse_picture(path: str) -> None:
-    """Say what is missing before anything is computed."""
-    if Path(path).suffix not in ('.png', '.svg'):
-        raise UsageError(f'--picture {path} ends with neither .png nor .svg; name it so')
-    try:
-        import matplotlib  # noqa: F401  a robot does without it
-    except ImportError as error:
-        raise UsageError(f'a picture needs matplotlib ({error}); install gyro_calibration[plot], or leave out --picture') from None
 
 
 # rates by the model
@@ -80,21 +69,27 @@ def _fitted(found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     return predicted_rates(calibration), calibration.scatter.kept, [remark], {'effects': names, 'left_out': True}
 
 
-def _as_given(model: GyroModel, name: str, found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+def _as_given(given: argparse.Namespace, model: GyroModel, found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by a given model, which dwells are not outlying, and what to say of it."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each)) for each in (result.temperature_clipped, result.beyond_range))
-    remarks = [f'the model is {name} as it is ({", ".join(names) or "no effects"}); a model that was fitted to this log is judged too well '
-               'here']
+    remarks = [f'the model is {given.model} as it is: {", ".join(names) or "no effects"}{_acquainted(model, given.log)}']
     if found.temperature is None and model.looks_at('temperature'):
         remarks.append('the log holds no temperature: the model was used at its reference temperature')
     if clipped:
         remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated temperatures; the nearest end was used')
     if beyond:
         remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; the correction is extrapolated')
-    return result.rate, find_scatter(found).kept, remarks, {'effects': names, 'left_out': False, 'temperature_clipped': clipped,
+    return result.rate, not_outlying(found), remarks, {'effects': names, 'left_out': False, 'temperature_clipped': clipped,
                                                             'beyond_range': beyond}
+
+
+def _acquainted(model: GyroModel, log: str) -> str:
+    """Say whether the model was fitted to the log, by the sums of the files that it comes from."""
+    if hashlib.sha256(Path(log).read_bytes()).hexdigest() in str(model.origin):
+        return '; it was fitted to this log, so that these are errors of a fit, not of a prediction'
+    return '' if 'sha256' in str(model.origin) else '; if it was fitted to this log, these are errors of a fit, not of a prediction'
 
 
 def _outlying(found: Dwells, kept: Mask) -> Iterator[str]:
