@@ -255,12 +255,14 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
 
     """
     limits = limits or Steadiness()
-    if log.reference_rate is None or log.reference_heading is None:
-        found = _find(log, limits)
+    if log.reference_rate is None or not np.isfinite(log.reference_rate).any():
+        found = _find(replace(log, reference_rate=None), limits)
     else:
-        # A rate that was made of a coarse encoder's steps is hardly ever steady; the heading that it was made of may be straight.
-        by_rate, by_heading = _find(replace(log, reference_heading=None), limits), _find(replace(log, reference_rate=None), limits)
-        found = by_rate if by_rate.duration > 0.9 * by_heading.duration else by_heading
+        found = _find(replace(log, reference_heading=None), limits)
+        if log.reference_heading is not None and np.isfinite(log.reference_heading).any():
+            # A rate that was made of a coarse encoder's steps is hardly ever steady; the heading that it was made of may be straight.
+            by_heading = _find(replace(log, reference_rate=None), limits)
+            found = found if found.duration > 0.9 * by_heading.duration else by_heading
     if found.share < limits.share:
         raise DataRefused(_not_steady(found, limits))
     return _means(found)
@@ -557,7 +559,7 @@ def _settling(time: Array, error: Array, rows: list[Numbers], change: Array, lim
     lengths = np.array([time[part[-1]] - time[part[0]] for part in rows])
     if not len(lengths):
         return 0.0
-    count = int(min(np.quantile(lengths, 0.25), 10.0 * limits.settling) / interval)
+    count = int(min(np.quantile(lengths, 0.25), 3.0 * limits.settling) / interval)
     edges = np.arange(count + 1) * interval
     used = [(part, step) for part, step, length in zip(rows, change, lengths) if length >= edges[-1]]
     answer = np.array([_binned(time[part] - time[part[0]], error[part], edges) for part, _ in used])
@@ -566,6 +568,7 @@ def _settling(time: Array, error: Array, rows: list[Numbers], change: Array, lim
     if not weight.any():
         return 0.0
     answer = weight @ (answer - answer[:, late].mean(axis=1, keepdims=True)) / (weight @ weight)
+    # Bins, and what a few of them show together; it is looked for in the first third, the last half is the measure.
     return max(_last_seen(answer, width) for width in (1, 4)) * interval
 
 

@@ -107,7 +107,8 @@ def test_a_table_may_say_how_well_its_means_are_known():
     (Log(output=np.ones(3)), 'reference_rate_dps'),
     (Log(output=np.ones(3), time=np.arange(3.0)), 'reference_heading_deg'),
     (Log(output=np.ones(3), reference_rate=np.full(3, np.nan)), 'none of the 3 rows'),
-    (Log(output=np.ones(3), time=np.arange(3.0), reference_rate=np.full(3, np.nan)), '0 of 3 samples'),
+    (Log(output=np.ones(3), time=np.arange(3.0), reference_rate=np.full(3, np.nan)), 'reference_heading_deg'),
+    (Log(output=np.ones(3), time=np.arange(3.0), reference_heading=np.full(3, np.nan)), '0 of 3 samples'),
     (Log(output=np.ones(2), reference_rate=np.ones(2), others={'deviation_dps': ('0.1', 'good')}), 'good'),
 ])
 def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
@@ -244,6 +245,11 @@ def test_a_rate_made_of_coarse_steps_gives_way_to_their_heading(generator):
     heading = encoder(2.0, generator)
     found = find_dwells(run(generator, reference_rate=np.gradient(heading, TIME), reference_heading=heading))
     assert np.allclose(found.rate / DEGREE, RATES, atol=0.02)
+
+
+def test_a_rate_that_was_never_there_gives_way_to_the_heading(generator):
+    found = find_dwells(run(generator, reference_rate=np.full(len(TIME), np.nan), reference_heading=HEADING))
+    assert np.allclose(found.rate / DEGREE, RATES)
 
 
 def test_a_simulation_without_noise_claims_nothing(generator):
