@@ -101,7 +101,9 @@ def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys,
     answers = []
     for seed in (1, 1, 2):
         assert main(['reproduce', source, '--seed', str(seed), '--json']) == 0
-        answers.append(json.loads(capsys.readouterr().out)['sources'])
+        text, error = capsys.readouterr()
+        assert not error, 'the progress bar is for terminals'
+        answers.append(json.loads(text)['sources'])
     assert answers[0] == answers[1] != answers[2]
     assert {'quantity', 'unit', 'published', 'ours', 'verdict'} <= set(answers[0][source]['comparisons'][0])
 
@@ -323,5 +325,5 @@ def test_the_solvers_way_is_least_squares_of_its_sum():
 def test_neither_way_explains_the_difference_of_the_scales():
     found = numbers('bot_thoughts', 'the two methods differ by')
     assert found['turntable'] == pytest.approx(1.32, abs=0.005) and abs(found['solver']) + 3 * found['solver_scatter'] < 0.05
-    assert found['likely_scatter'] < 0.6 * found['solver_scatter'] and abs(found['likely']) < found['likely_scatter']
+    assert abs(found['likely']) + 3 * found['likely_scatter'] < 0.05
     assert found['late'] > 0.1 and found['reverse'] < -1 and found['slow'] < -40

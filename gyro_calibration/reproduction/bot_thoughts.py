@@ -1,5 +1,5 @@
 """
-Michael Shimniok, Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an encoder.
+Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an encoder.
 
 Counts, deg/s and per cent, as the source has them; what is computed from rates is in SI until it is put beside them.
 

@@ -86,7 +86,7 @@ def _rounded(ours: float, uncertainty: float, published: str) -> str:
         digits = max(0, 1 - math.floor(math.log10(uncertainty)))
         return f'{ours:.{digits}f} +- {uncertainty:.{digits}f}'
     if not published or published.startswith('<'):
-        return f'{ours:.4g}' if abs(ours) > 1e-6 else '0'
+        return f'{ours:#.4g}' if abs(ours) > 1e-6 else '0'
     digits = _decimals(published) + 1 if '.' in published or ours != round(ours) else 0
     return f'{ours:.{digits}f}'
 
