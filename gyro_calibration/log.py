@@ -30,7 +30,7 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 
-#: So many samples of a dozen columns stay in the cache of a processor, which is three times as fast as to go through memory for each step.
+#: So many samples of a dozen columns stay in the cache of a processor, which is twice as fast as to go through memory for each step.
 CACHED = 1 << 14
 #: Rows of a block of a log that is read piece by piece.
 ROWS = 1 << 16
