@@ -715,7 +715,7 @@ _TEMPTING = 1.0
 _RIVAL = 4.0
 
 #: A description is taken for good if it is off by more with this probability.
-_CHANCE = 0.01
+_CHANCE = 0.05
 
 
 def _fit(octaves: _Octaves, places: tuple[int, ...], misfit: float, start: int) -> _Description:
@@ -785,8 +785,7 @@ def _combinations(octaves: _Octaves, start: int, misfit: float) -> list[_Descrip
 
 
 def _figures(chart: AllanChart, found: list[_Description]) -> NoiseFit:
-    best = found[0]
-    tempting = [best, *(each for each in found if each.surprise() < best.surprise() - _TEMPTING)]
+    best, tempting = found[0], _tempting(found)
     seen = [place for place in best.held if place != _BEND and (place != _QUANTIZATION or best.start == 0)]
     figures = {part.symbol: _held(best, tempting, place) if place in seen else _absent(best, found, place)
                for place, part in enumerate(PARTS)}
@@ -810,6 +809,13 @@ def _absent(best: _Description, found: list[_Description], place: int) -> Figure
         each.estimate(places) for each in found if each is best or set(each.held) == set(places))]
     limits += [each.bounds(place)[1] ** 2 for each in _rivals(found) if place in each.held]
     return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
+
+
+def _tempting(found: list[_Description]) -> list[_Description]:
+    """Return the best combination with those that are likelier, but not by enough to be believed, or hold a rival's parts too."""
+    best = found[0]
+    both = [{*best.held, *rival.held} for rival in _rivals(found)]
+    return [best, *(each for each in found if each.surprise() < best.surprise() - _TEMPTING or set(each.held) in both)]
 
 
 def _rivals(found: list[_Description]) -> list[_Description]:

@@ -92,9 +92,12 @@ def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit, names: Mappin
 _PART_STYLES = ('--', '-.', ':', (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)))
 
 
+#: Where IEEE Std 952 reads angle random walk, s; the others are named along their line.
+_READ_AT = 1.0
+
+
 def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
-    """Write the symbol at the place where IEEE Std 952 reads the figure, or at the end of the line that comes nearest to it."""
-    at = int(np.argmin(np.abs(np.log(times / {'N': 1.0, 'K': 3.0}.get(symbol, times[len(times) // 2])))))
+    at = int(np.argmin(np.abs(times - _READ_AT))) if symbol == 'N' else len(times) * (1 if symbol in 'BQ' else 2) // 3
     axes.annotate(symbol, (times[at], line[at]), xytext=(0, 6), textcoords='offset points', fontsize=13, weight='bold', ha='center')
 
 
