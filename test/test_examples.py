@@ -67,9 +67,3 @@ def test_record_player_and_encoder_find_the_gyro(run):
 def test_the_compensated_log_has_a_heading(run, tmp_path):
     run('compensate_a_log.py')
     assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(read_log(tmp_path / 'compensated.csv').others)
-
-
-def test_the_misprints_are_those_that_the_document_shows(run):
-    text = (FOLDER.parent / 'self_calibration.md').read_text()
-    lines = run('misprints.py').splitlines()
-    assert lines and not [line for line in lines if line not in text]
