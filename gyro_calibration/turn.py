@@ -18,6 +18,7 @@ from gyro_calibration.calibration import Calibration, _not_outlying, _surface, f
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, Numbers
 from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
+from gyro_calibration.self_calibration import refuse_scale
 
 #: Slower turns take so long that their error says more of the bias than of the gyro's scale; as published.
 SLOWEST = 5.0 * DEGREE
@@ -66,25 +67,33 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
 
     Raises
     ------
-    DataRefused : nothing turns as fast as that with a rate by the model, or nothing shows the static bias
+    DataRefused : nothing turns as fast as that with a rate by the model, nothing shows the static bias, or the gyro is upside down
 
     """
-    rests, remark = _rests(dwells)
-    turning, known = np.abs(dwells.rate) >= slowest, np.isfinite(rate)
-    wanted = turning & known
+    known = np.isfinite(rate)
+    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= slowest)))
+    dwells, rate = take(dwells, known), rate[known]
+    wanted = np.abs(dwells.rate) >= slowest
     if not wanted.any():
-        raise DataRefused(f'none of {len(dwells)} dwells turns at {slowest / DEGREE:g} deg/s or faster and has a rate by the model; '
+        raise DataRefused(f'none of {len(known)} dwells turns at {slowest / DEGREE:g} deg/s or faster and has a rate by the model; '
                           'record faster turns, or several sweeps')
+    turns = take(dwells, wanted)
+    _refuse_other_way(turns)
+    rests, remark = _rests(dwells)
     nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
     # eq. 1 and 2, and eq. 13, 15 and 16
     static, modelled = (_turned(dwells, error, wanted, nearest) for error in (dwells.output - dwells.rate, rate - dwells.rate))
-    turns = take(dwells, wanted)
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place, (remark, *_unknown(turning & ~known)))
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place, (remark, *_unknown(lost)))
 
 
-def _unknown(lost: Mask) -> Iterator[str]:
-    if lost.any():
-        yield f'{np.count_nonzero(lost)} turns are left out: the other sweeps do not determine the model'
+def _refuse_other_way(turns: Dwells) -> None:
+    scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
+    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
+
+
+def _unknown(lost: int) -> Iterator[str]:
+    if lost:
+        yield f'{lost} turns are left out: the other sweeps do not determine the model'
 
 
 def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
@@ -112,12 +121,13 @@ class _Rest:
 def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
     """Return what shows the static bias: the rests of the sweeps, or where there is none the slowest turns both ways."""
     numbers = np.unique(dwells.sweep)
-    for find, words in ((_at_rest, 'the rest'), (_between_turns, 'no rest: the error between the slowest turns both ways')):
+    for find, words in ((_at_rest, 'the static bias is from the rest of each sweep'),
+                        (_between_turns, 'no rest; the static bias is the error between the slowest turns both ways of each sweep')):
         found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
         if found:
             others = len(numbers) - len(found)
             more = f'; {others} of {len(numbers)} sweeps have none and take that of the nearest temperature' if others else ''
-            return found, f'the static bias is from {words} of each sweep{more}'
+            return found, words + more
     raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing shows the static bias; '
                       'record a rest before each sweep')
 

@@ -75,13 +75,18 @@ def test_without_a_rest_the_error_between_the_slowest_turns_both_ways_stands_for
     rates = np.array([-30.0, -10.0, 6.0, 30.0])
     errors = turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
     assert errors.static == pytest.approx(TURN * 0.01 * np.sign(rates))
-    assert 'no rest' in errors.remarks[0]
+    assert errors.remarks[0].startswith('no rest; the static bias is the error between the slowest turns')
 
 
 def test_a_table_with_neither_rest_nor_turns_both_ways_is_refused():
     found = table([10.0, 20.0, 30.0], [0.0] * 3)
     with pytest.raises(DataRefused, match='record a rest'):
         turn_errors(found, found.output)
+
+
+def test_a_gyro_that_is_upside_down_is_refused_with_the_way_out():
+    with pytest.raises(DataRefused, match='the other way than the reference .* --invert'):
+        turn_errors(replace(HAND, output=-HAND.output), -HAND.output)
 
 
 def test_a_table_of_rests_is_refused():
@@ -152,6 +157,14 @@ def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_said():
     assert np.isnan(rate[:3]).all()
     with pytest.raises(DataRefused, match='record faster turns, or several sweeps'):
         turn_errors(found, rate)
+
+
+def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
+    found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21], [0, 0, 1, 1, 2])
+    rate = np.where(found.sweep == 0, np.nan, found.rate + 0.1 * DEGREE)
+    errors = turn_errors(found, rate)
+    assert errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0]) and errors.modelled == pytest.approx(0.0)
+    assert '1 turns are left out' in errors.remarks[1]
 
 
 def test_the_measured_gyro_errs_by_less_than_2_percent_and_one_order_of_magnitude_less_with_the_published_polynomial(data):
