@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyro_calibration.calibration import Calibration, _not_outlying, _surface, fit_effects, take
+from gyro_calibration.calibration import Calibration, fit_effects, take
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, Numbers
 from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
@@ -160,11 +160,6 @@ def _nearest(dwells: Dwells, place: int, rests: list[_Rest]) -> _Rest:
 
 
 # rates by a model
-
-def not_outlying(dwells: Dwells) -> Mask:
-    """Return which dwells lie as the others do, shape (n,), as a fit finds them, for a model that was not fitted to them."""
-    return _not_outlying(dwells.output - dwells.rate, _surface(dwells))
-
 
 def predicted_rates(calibration: Calibration) -> Array:
     """

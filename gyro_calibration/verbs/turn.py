@@ -21,8 +21,9 @@ from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.picture import draw_turn_errors
+from gyro_calibration.scatter import not_outlying
 from gyro_calibration.selection import select_effects
-from gyro_calibration.turn import SLOWEST, Size, TurnErrors, not_outlying, predicted_rates, size, turn_errors
+from gyro_calibration.turn import SLOWEST, Size, TurnErrors, predicted_rates, size, turn_errors
 from gyro_calibration.verbs.verb import Answer, add_log, picture_file, positive, read, verb
 
 TURN = 2.0 * math.pi

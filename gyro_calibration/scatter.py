@@ -1,0 +1,294 @@
+"""
+How dwells scatter about what a gyro's effects explain, and what that leaves open of the effects' values.
+
+The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own, that of its sweep's bias, and that of its
+sweep's scale factor (a bias that wanders, a temperature that the sensor does not show). How large they are is found by restricted
+likelihood, so that thirty dwells of one sweep do not count as thirty independent ones.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import t as student
+
+from gyro_calibration.dwells import Dwells
+from gyro_calibration.likelihood import _robust_residual
+from gyro_calibration.log import Array, Mask
+
+#: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
+OUTLYING = 6.0
+#: With a smaller spread, K, a sensor's own error looks like a change of temperature.
+SMALLEST_TEMPERATURE_SPREAD = 1.0
+#: With fewer, what the dwells of a sweep have in common cannot be told from chance.
+_FEWEST_SWEEPS = 4
+#: With fewer, an outlying dwell cannot be told from a gyro that is not linear.
+_FEWEST_DWELLS = 12
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """
+    How dwells scatter about a surface over rate and temperature that is as smooth as their number allows, as standard deviations.
+
+    It does not depend on the effects that are fitted: a scatter found beside too few of them would take in what they leave.
+
+    Attributes
+    ----------
+    dwell : of a dwell, beyond its own deviation, rad/s
+    dwell_scale : of the scale factor from dwell to dwell, 1; a table's speed is no better than that
+    sweep_bias : of the bias from sweep to sweep, rad/s
+    sweep_scale : of the scale factor from sweep to sweep, 1
+    kept : which dwells are not outlying, shape (n,)
+
+    """
+
+    dwell: float
+    dwell_scale: float
+    sweep_bias: float
+    sweep_scale: float
+    kept: Mask
+
+    def deviation(self, dwells: Dwells) -> Array:
+        """Return the standard deviation of each dwell, without what its sweep shares, rad/s, shape (n,)."""
+        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell ** 2 + (self.dwell_scale * dwells.rate) ** 2)
+
+    def shared(self, dwells: Dwells) -> Array:
+        """Return what one standard deviation of its sweep's bias and scale factor adds to each dwell, rad/s, shape (n, 2)."""
+        return np.column_stack([np.full(len(dwells), self.sweep_bias), self.sweep_scale * dwells.rate])
+
+
+def _own_deviation(dwells: Dwells) -> Array:
+    """Return the deviations that the dwells came with, rad/s; one that is not known is like the others."""
+    known = np.isfinite(dwells.deviation)
+    typical = rms(dwells.deviation[known]) if known.any() else 0.0
+    return np.where(known, dwells.deviation, typical)
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def take(dwells: Dwells, which: Mask) -> Dwells:
+    """Return some of the dwells, by a mask of shape (n,)."""
+    temperature = None if dwells.temperature is None else dwells.temperature[which]
+    places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
+    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which], temperature=temperature,
+                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places)
+
+
+def sweeps_of(dwells: Dwells) -> list[Mask]:
+    """Return a mask for each sweep; a single sweep counts as one a dwell, so that something can be left out."""
+    numbers = np.unique(dwells.sweep)
+    if len(numbers) == 1:
+        return list(np.eye(len(dwells), dtype=bool))
+    return [dwells.sweep == number for number in numbers]
+
+
+class Whitener:
+    """The covariance of the errors of dwells; sweeps are independent of each other, and what one shares has two directions."""
+
+    def __init__(self, dwells: Dwells, scatter: Scatter):
+        """Find the directions of each sweep."""
+        self.deviation = scatter.deviation(dwells)
+        shared = scatter.shared(dwells) / self.deviation[:, None]
+        self.sweeps = [(rows, *np.linalg.svd(shared[rows], full_matrices=False)[:2]) for rows in map(np.flatnonzero, sweeps_of(dwells))]
+
+    def whiten(self, values: Array) -> Array:
+        """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
+        whitened = (values.T / self.deviation).T
+        for rows, directions, sizes in self.sweeps:
+            along = directions.T @ whitened[rows]
+            whitened[rows] -= directions @ ((1.0 - 1.0 / np.sqrt(1.0 + sizes ** 2)) * along.T).T
+        return whitened
+
+    def restore(self, whitened: Array) -> Array:
+        """Return what `whiten` was given, shape (n,)."""
+        values = whitened.copy()
+        for rows, directions, sizes in self.sweeps:
+            values[rows] += directions @ ((np.sqrt(1.0 + sizes ** 2) - 1.0) * (directions.T @ whitened[rows]))
+        return values * self.deviation
+
+
+# how large it is
+
+def find_scatter(dwells: Dwells) -> Scatter:
+    """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
+    kept = not_outlying(dwells)
+    used = take(dwells, kept)
+    error, surface = used.output - used.rate, _surface(used)
+    size = rms(error - surface @ (surface.T @ error)) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
+    relative = size / max(float(np.abs(used.rate).max()), 1e-9)
+    units = np.array([size, relative, size, relative])[:_sought(used)]
+
+    def scatter(logarithms: Array) -> Scatter:
+        return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)  # type: ignore[misc]
+
+    best = minimize(lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
+                    np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='Nelder-Mead', bounds=[(-7.0, 2.0)] * len(units),
+                    options={'xatol': 0.02, 'fatol': 0.01})
+    return scatter(best.x)
+
+
+def _sought(dwells: Dwells) -> int:
+    """Return how many of the four scatters so many dwells and sweeps can show."""
+    if len(dwells) < _FEWEST_DWELLS:
+        return 1
+    return 4 if len(np.unique(dwells.sweep)) >= _FEWEST_SWEEPS else 2
+
+
+def not_outlying(dwells: Dwells) -> Mask:
+    """Return which dwells lie as the others do, by a fit in which a large residual counts by its size, not its square."""
+    residual = np.abs(_robust_residual(_surface(dwells), dwells.output - dwells.rate, 20))
+    return (residual <= OUTLYING * 1.4826 * float(np.median(residual)) + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
+
+
+def _surface(dwells: Dwells) -> Array:
+    """Return orthonormal columns that span a smooth surface over rate and temperature, one for three dwells at most, shape (n, m)."""
+    rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
+    temperature = np.zeros(len(rate)) if dwells.temperature is None else dwells.temperature - dwells.temperature.mean()
+    temperature = temperature / max(float(np.abs(temperature).max()), 0.5 * SMALLEST_TEMPERATURE_SPREAD)
+    powers = sorted(((i, j) for i in range(6) for j in range(3)), key=lambda power: (power[0] + 2 * power[1], power[1]))
+    products = [rate ** i * temperature ** j for i, j in powers]
+    columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, sizes > 1e-4 * sizes[0]]
+
+
+def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, columns: Array) -> float:
+    """Return the logarithm of the likelihood of the scatter, whatever the values are, up to a constant."""
+    deviation = scatter.deviation(dwells)
+    sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
+    gram, log_determinant = sums.reduced(scatter.sweep_bias, scatter.sweep_scale)
+    factor = np.linalg.cholesky(gram)
+    log_determinant += 2.0 * float(np.log(deviation).sum())
+    return -0.5 * (log_determinant + 2.0 * float(np.log(np.diag(factor)[:-1]).sum()) + float(factor[-1, -1]) ** 2)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """
+    All that a likelihood needs of columns, whatever the scatter of sweeps is.
+
+    Attributes
+    ----------
+    gram : products of the columns, shape (m, m)
+    inner : products of what each sweep shares, shape (sweeps, 2, 2)
+    outer : products of that and the columns, shape (sweeps, 2, m)
+
+    """
+
+    gram: Array
+    inner: Array
+    outer: Array
+
+    @classmethod
+    def of(cls, dwells: Dwells, deviation: Array, columns: Array) -> _Sums:
+        """Sum over each sweep."""
+        columns = columns / deviation[:, None]
+        shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
+        order = np.argsort(dwells.sweep, kind='stable')
+        first = np.flatnonzero(np.diff(dwells.sweep[order], prepend=-1))
+        inner, outer = (np.add.reduceat(shared[order, :, None] * each[order, None, :], first) for each in (shared, columns))
+        return cls(columns.T @ columns, inner, outer)
+
+    def reduced(self, sweep_bias: float, sweep_scale: float) -> tuple[Array, float]:
+        """Return the products of the whitened columns, and the logarithm of the determinant of the scatter of sweeps (Woodbury)."""
+        size = np.array([sweep_bias, sweep_scale])
+        inner, outer = np.eye(2) + size[:, None] * self.inner * size, size[:, None] * self.outer
+        taken = np.tensordot(outer, np.linalg.solve(inner, outer), axes=((0, 1), (0, 1)))
+        return self.gram - taken, float(np.linalg.slogdet(inner)[1].sum())
+
+
+# what it leaves open
+
+def covariance_of(dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Array | None:
+    """
+    Return the covariance of values that were fitted, wide enough for 1.96 standard deviations to hold 95 %; None with no dwell to spare.
+
+    How large the scatter is, few dwells and few sweeps do not tell. So the intervals are averaged over what it may be, each weighted by its
+    restricted likelihood: that of the dwells gives Student's distribution, that of the sweeps is summed over a grid. Before looking,
+    chances are even that sweeps share nothing; if they do share something, it is about as large as the scatter of a dwell (half
+    Cauchy, Gelman 2006). The largest likelihood alone would say "nothing" about every other time, and its intervals be too narrow.
+
+    Parameters
+    ----------
+    dwells : that were fitted
+    scatter : of them
+    columns : what the error changes by for each value, shape (n, m)
+    error : that the fitted values leave, rad/s, shape (n,)
+
+    """
+    freedom = len(dwells) - columns.shape[1]
+    if freedom == 0:
+        return None
+    lengths = np.linalg.norm(columns, axis=0)
+    deviation = scatter.deviation(dwells)
+    sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
+    weights, offsets, covariances = _averaged(sums, freedom, _units(dwells, deviation))
+    half = _half_width(weights, offsets, np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)), freedom)
+    covariance = np.tensordot(weights, covariances, axes=1)
+    widened = half / 1.959964 / np.sqrt(np.diag(covariance)) / lengths
+    return covariance * np.outer(widened, widened)
+
+
+def _units(dwells: Dwells, deviation: Array) -> Array:
+    """Return the scatter of sweeps' bias and scale that is as large as that of a dwell, or zeros where sweeps are too few to show it."""
+    return np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)]) * (_sought(dwells) == 4)
+
+
+def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array]:
+    """Return the weights of possible scatters of sweeps, shape (k,), what each moves the values by, (k, m), and their covariances."""
+    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)])] * 2 if units.any() else [np.zeros(1)] * 2
+    for _ in range(2 if units.any() else 1):
+        pairs = [(bias, scale) for bias in axes[0] for scale in axes[1]]
+        found = [_given(sums, freedom, *(units * pair)) for pair in pairs]
+        logarithm = np.array([each[0] for each in found]).reshape(len(axes[0]), -1)
+        weights = np.exp(logarithm - logarithm.max()) * np.outer(*(_prior(axis) for axis in axes))
+        weights /= weights.sum()
+        axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
+    likely = np.flatnonzero(weights.ravel() > 1e-4)
+    return (weights.ravel()[likely] / weights.ravel()[likely].sum(), np.array([found[place][1] for place in likely]),
+            np.array([found[place][2] for place in likely]))
+
+
+def _given(sums: _Sums, freedom: int, sweep_bias: float, sweep_scale: float) -> tuple[float, Array, Array]:
+    """Return the logarithm of the likelihood, the values and their covariance, the scatter of sweeps being given beside that of dwells."""
+    gram, log_determinant = sums.reduced(sweep_bias, sweep_scale)
+    inverse = np.linalg.inv(gram[:-1, :-1])
+    values = inverse @ gram[:-1, -1]
+    misfit = max(float(gram[-1, -1] - values @ gram[:-1, -1]), 1e-12 * float(sums.gram[-1, -1])) + 1e-300
+    logarithm = -0.5 * (log_determinant - float(np.linalg.slogdet(inverse)[1]) + freedom * math.log(misfit))
+    return logarithm, values, inverse * misfit / freedom
+
+
+def _prior(sizes: Array) -> Array:
+    """Return the chance of each size before looking: a half for 0, the rest spread over the others, which are evenly spaced in size."""
+    if len(sizes) == 1:
+        return np.ones(1)
+    return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2) * math.log(sizes[2] / sizes[1])])
+
+
+def _nearer(sizes: Array, weights: Array) -> Array:
+    """Return 0 and sizes about as finely spaced as those above 0 that are likely."""
+    if len(sizes) == 1:
+        return sizes
+    logarithms, share = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
+    middle = float(share @ logarithms)
+    spread = max(math.sqrt(float(share @ (logarithms - middle) ** 2)), 0.3)
+    return np.concatenate([[0.0], np.exp(middle + spread * np.linspace(-3.0, 3.0, 13))])
+
+
+def _half_width(weights: Array, offsets: Array, deviations: Array, freedom: int) -> Array:
+    """Return how far 95 % of the averaged distribution reach to both sides, shape (m,)."""
+    low, high = np.zeros(deviations.shape[1]), 2.0 * student.ppf(0.975, freedom) * (deviations + np.abs(offsets)).max(axis=0)
+    for _ in range(25):
+        half = 0.5 * (low + high)
+        inside = weights @ (student.cdf((half - offsets) / deviations, freedom) - student.cdf((-half - offsets) / deviations, freedom))
+        low, high = np.where(inside < 0.95, half, low), np.where(inside < 0.95, high, half)
+    return high
