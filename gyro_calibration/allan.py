@@ -283,8 +283,9 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
         raise DataRefused(f'{int(np.isfinite(rate).sum())} samples; an Allan deviation wants at least {FEWEST}: record longer')
     sizes = averaging_sizes(samples) if times is None else np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64))
     if not sizes.size or sizes[0] < 1 or 2 * sizes[-1] > samples:
-        raise DataRefused(f'averaging times from {sizes[:1] * interval} to {sizes[-1:] * interval} s; wanted at least one sample, '
-                          f'{interval:g} s, and at most half the record, {samples // 2 * interval:g} s: record longer')
+        given = f'{sizes[0] * interval:g} to {sizes[-1] * interval:g} s' if sizes.size else 'none'
+        raise DataRefused(f'averaging times: {given}; wanted at least one sample, {interval:g} s, and at most half the record, '
+                          f'{samples // 2 * interval:g} s: choose others, or record longer')
     sums, counts = _square_sums(rate, sizes, progress)
     some = counts > 0
     sizes, counts = sizes[some], counts[some]
@@ -576,6 +577,10 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
     """
     chart = allan_deviation(rate, interval, 2.0 ** np.arange(max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
+    if len(chart.size) < _FEWEST_OCTAVES or not chart.deviation.all():
+        raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the lowest Allan deviation '
+                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted {_FEWEST_OCTAVES} octaves, all above 0: record longer '
+                          'and without losses')
     return _figures(chart, _describe(_Octaves.of(chart)))
 
 
@@ -702,6 +707,9 @@ class _Description:
 #: What a further part must take off -2 ln likelihood. White noise alone then shows none in 95 of 100 records.
 _EVIDENCE = 10.0
 
+#: A slope and its end cannot be seen in fewer.
+_FEWEST_OCTAVES = 4
+
 #: Passes of the fit; two or three suffice.
 _PASSES = 12
 
@@ -712,7 +720,7 @@ _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 _TEMPTING = 1.0
 
 #: A combination of other parts that is less likely by no more than this is as good an explanation.
-_RIVAL = 4.0
+_RIVAL = 6.0
 
 #: A description is taken for good if it is off by more with this probability.
 _CHANCE = 0.05

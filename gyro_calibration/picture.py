@@ -98,7 +98,8 @@ _READ_AT = 1.0
 
 def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
     at = int(np.argmin(np.abs(times - _READ_AT))) if symbol == 'N' else len(times) * (1 if symbol in 'BQ' else 2) // 3
-    axes.annotate(symbol, (times[at], line[at]), xytext=(0, 6), textcoords='offset points', fontsize=13, weight='bold', ha='center')
+    beside = (10, -14) if symbol in 'KR' else (0, 6)  # below what rises, above what falls: away from the sum
+    axes.annotate(symbol, (times[at], line[at]), xytext=beside, textcoords='offset points', fontsize=13, weight='bold', ha='center')
 
 
 # rate tables

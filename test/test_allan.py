@@ -213,6 +213,13 @@ def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
         fit_noise(record.rate, record.interval)
 
 
+def test_figures_want_noise_and_windows_without_a_gap():
+    with pytest.raises(DataRefused, match='lowest Allan deviation 0 rad/s'):
+        fit_noise(np.ones(1000), INTERVAL)
+    with pytest.raises(DataRefused, match='wanted 4 octaves'):
+        fit_noise(np.where(np.arange(1000) % 6 == 0, np.nan, np.random.default_rng(19).standard_normal(1000)), INTERVAL)
+
+
 def test_a_wild_sample_is_left_out_and_a_walking_bias_is_no_motion():
     rate = simulate_noise(Noise(1e-3, 3e-4, 3e-4), 50_000, INTERVAL, np.random.default_rng(16))
     rate[[700, 30_000]] += 0.5, -2.0
