@@ -11,6 +11,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.fft import dct
 
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
@@ -18,7 +21,7 @@ from gyro_calibration.likelihood import Fit, fit_likelihood
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import Motion, from_headings
-from gyro_calibration.noise import Noise
+from gyro_calibration.noise import ALLAN_FLOOR, Noise
 from gyro_calibration.self_calibration import Limits, fit_rate, refuse_dead, refuse_scale
 
 METHODS = ('likelihood', 'rate')
@@ -49,6 +52,28 @@ class Residual:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """
+    How a heading drifts after the fit.
+
+    Attributes
+    ----------
+    time, rate : middles of the intervals between pieces of the log, s, and how the heading drifts there, rad/s, shape (m,)
+    angle_random_walk : rad/√s, over times longer than a piece
+    mean : standard deviation of the mean bias over the log, rad/s
+    wander : standard deviation of what the mean bias differs by from the bias at the beginning, or half of what it differs by in another
+        log as long, rad/s
+
+    """
+
+    time: Array
+    rate: Array
+    angle_random_walk: float
+    mean: float
+    wander: float
+
+
+@dataclass(frozen=True)
 class EncoderCalibration:
     """
     What a log with a reference heading says of a gyro.
@@ -58,6 +83,7 @@ class EncoderCalibration:
     model : scale factor error and bias with their covariance, the ranges and the temperature that they were found at
     method : one of `METHODS`
     fit : the same with noise and time offset, as found
+    drift : what is left of the bias, and of its standard deviation what its wander is
     time : of the reference's samples, s, shape (n,)
     before, after : the residual heading without calibration and with it
     lost_samples : so many are missing between the stamps
@@ -68,6 +94,7 @@ class EncoderCalibration:
     model: GyroModel
     method: str
     fit: Fit
+    drift: Drift
     time: Array
     before: Residual
     after: Residual
@@ -96,17 +123,21 @@ def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None 
     time, output, motion = _pair(log)
     _refuse_motion(motion, limits)
     refuse_dead(output)
-    fit = fit_likelihood(time, output, motion, limits.time_offset) if method == 'likelihood' else _by_rate(time, output, motion)
+    fit = fit_likelihood(time, output, motion, limits.time_offset, LAG) if method == 'likelihood' else _by_rate(time, output, motion)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
-    _refuse_uncertain(fit, limits)
     compensated = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     before, after = (_residual(time - np.nan_to_num(fit.time_offset), rate, motion) for rate in (output, compensated))
-    return EncoderCalibration(_model(output, log.temperature, fit, noise), method, fit, motion.time, before, after, _lost(time),
-                              _remarks(fit))
+    drift = _drift(motion.time, after.heading, noise or Noise())
+    fit = replace(fit, covariance=_covariance(fit, drift))
+    _refuse_uncertain(fit, limits)
+    model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
+    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit))
 
 
 #: Gyro and encoder on one host are no further apart, s; a swing may look alike half a period later.
 LARGEST_TIME_OFFSET = 0.25
+#: Standard deviation of what is assumed of the gyro's lag, s²: that of a filter of 20 ms.
+LAG = 2e-4
 
 
 def _pair(log: Log) -> tuple[Array, Array, Motion]:
@@ -148,23 +179,105 @@ def _by_rate(time: Array, output: Array, motion: Motion) -> Fit:
     scale, offset = 1.0 / (1.0 + fit.scale_factor_error), -fit.bias / (1.0 + fit.scale_factor_error)
     columns = np.column_stack([output, np.ones(len(output))])
     scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
-    inverse = np.linalg.inv(columns.T @ columns)
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
-    transformed = jacobian @ inverse
-    covariance = transformed @ _long_run(scores) @ transformed.T
-    return Fit(fit.scale_factor_error, fit.bias, covariance, math.nan)
+    influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
+    return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan)
 
 
-def _long_run(scores: Array) -> Array:
-    """Return the covariance of the sum of correlated scores, shape (n, k), by the scatter of 40 blocks' sums about their mean."""
-    sums = np.array([block.sum(axis=0) for block in np.array_split(scores, 40)])
-    return 40.0 * np.cov(sums.T)
+def _pieces(time: Array) -> NDArray[np.intp]:
+    """Return which piece of a log each time is in: pieces of at least 5 s, but 8 of them, and up to 64."""
+    since = (time - time[0]) / (time[-1] - time[0])
+    count = int(np.clip((time[-1] - time[0]) / 5.0, 8, 64))
+    return np.minimum(since * count, count - 1).astype(np.intp)
 
 
-def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise | None) -> GyroModel:
+def _drift(time: Array, error: Array, noise: Noise) -> Drift:
+    """
+    Find how the bias wanders, by restricted likelihood of the mean drifts between pieces of the log.
+
+    What repeats itself with a motion within a piece does not show. The sizes of the noises being unknown, all of a grid count by how
+    likely they are.
+
+    """
+    piece = _pieces(time)
+    known = np.flatnonzero(np.bincount(piece))
+    if len(known) < 6:
+        raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of the log; at least 6 are needed: '
+                          'mend its line and record again')
+    middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known] for values in (time, error))
+    rate = np.diff(heading) / np.diff(middle)
+    duration = float(time[-1] - time[0])
+    walk, mean, wander = _likely_noise(rate, duration / len(rate))
+    figured = 2.0 / math.pi * noise.bias_instability ** 2 + noise.rate_random_walk ** 2 * duration / 3.0
+    return Drift(0.5 * (middle[1:] + middle[:-1]), rate, math.sqrt(walk), math.sqrt(mean), math.sqrt(max(wander, figured)))
+
+
+def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
+    """
+    Return N², rad²/s, of mean rates between pieces of some length, s, and the variances of their mean by noise and by wander, (rad/s)².
+
+    The cosine transform makes independent values of them, each with a variance that is known but for one factor, as soon as three ratios
+    are: those of rate noise, of noise of the headings, and of flicker or rate random walk.
+
+    """
+    power = dct(rate, norm='ortho')[1:] ** 2
+    shapes, means, wanders, odds = _shapes(len(rate), length)
+    variances = np.mean(power / shapes, axis=1)
+    likelihoods = -0.5 * (len(power) * np.log(variances) + np.log(shapes).sum(axis=1))
+    weights = odds * np.exp(likelihoods - likelihoods.max())
+    variances = variances * weights / weights.sum()
+    student = len(power) / (len(power) - 2.0)
+    return float(variances.sum() * length), float(student * variances @ means), float(student * variances @ wanders)
+
+
+#: Odds of a random walk against flicker, where the drifts themselves do not tell: with 1, intervals are too narrow for a random walk.
+_ODDS = 3.0
+
+
+def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
+    """
+    Return what the cosine transform of rates between `count` pieces, and their mean, may have as variances, in units of N² / length.
+
+    Flicker B² and rate random walk K² are given by the averaging time at which the Allan deviation shows them above N. They begin with
+    the log: the mean over it has the variance 2 / pi B² or K² duration / 3.
+
+    Returns
+    -------
+    of the values but the first, shape (n, count - 1); of the mean by noise, and by wander, shape (n,) each; and odds, shape (n,)
+
+    """
+    frequency, duration = math.pi * np.arange(1, count) / count, count * length
+    cosine, crossing = np.cos(frequency), np.geomspace(0.01 * length, 1000.0 * duration, 30)[:, None]
+    flicker, walk = length / (ALLAN_FLOOR ** 2 * crossing), 3.0 * length / crossing ** 2
+    wander = np.vstack([flicker / frequency, walk * length / frequency ** 2])
+    wander_of_mean = np.vstack([2.0 / math.pi * flicker, walk * duration / 3.0])
+    ratio = np.geomspace(1e-3, 1e3, 13)[:, None, None]
+    shapes = (2.0 + cosine) / 3.0 + ratio * 2.0 * (1.0 - cosine) + wander
+    means = 1.0 / count + 2.0 * ratio / count ** 2 + 0.0 * wander_of_mean
+    odds = np.tile(np.repeat([1.0, _ODDS], len(crossing)), len(ratio))
+    return shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(), odds
+
+
+def _covariance(fit: Fit, drift: Drift) -> Array:
+    """
+    Return the covariance of (s, b) by the scatter between pieces of the log, with the drift's variance of the bias.
+
+    What repeats itself with the motion is no noise of the fit, and what is slower than a piece is not all of it.
+
+    """
+    piece = _pieces(fit.influence[:, 2])
+    sums = np.array([np.bincount(piece, values) for values in fit.influence[:, :2].T])
+    student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1) / stats.norm.ppf(0.975)) ** 2
+    scatter = student * sums @ sums.T
+    deviations = np.sqrt(np.diag(scatter))
+    known = np.array([deviations[0], math.hypot(drift.mean, drift.wander)])
+    return scatter * np.outer(known / deviations, known / deviations)
+
+
+def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> GyroModel:
     model = GyroModel((Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))), fit.covariance[::-1, ::-1],
                       (float(output.min()), float(output.max())),
-                      noise=noise or Noise(float(np.nan_to_num(fit.angle_random_walk))))
+                      noise=noise)
     if temperature is None:
         return model
     return replace(model, temperature_range=(float(temperature.min()), float(temperature.max())),

@@ -8,9 +8,10 @@ Everything is done on increments between blocks of up to half a second: rates in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
 
 from gyro_calibration.heading import integrate
@@ -28,8 +29,10 @@ class Fit:
     scale_factor_error, bias : s, 1, and b, rad/s
     covariance : of (s, b), shape (2, 2); nan where the method gives none
     time_offset : the gyro lags the profile by so much, s
-    angle_random_walk, reference_noise : as the run shows them, rad/√s and rad
+    angle_random_walk, reference_noise : as the run shows them, rad/√s and rad in one reading
     residual : largest stretch that turned otherwise than the profile, rad, and how unlikely it is, in standard deviations
+    time_offset_deviation : standard deviation of the time offset, s
+    influence : what the noise of each block did to (s, b), shape (n, 2), and the times of the blocks, s, shape (n,), as one array (n, 3)
 
     """
 
@@ -40,10 +43,28 @@ class Fit:
     angle_random_walk: float = math.nan
     reference_noise: float = math.nan
     residual: tuple[float, float] = (0.0, 0.0)
+    time_offset_deviation: float = math.nan
+    influence: Array = field(default_factory=lambda: np.empty((0, 3)))
 
 
 #: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a robot's life.
 CHANCE = 7.0
+
+
+@dataclass(frozen=True)
+class _Points:
+    """
+    Where the reference is known: times, s, headings, rad, and the variance of each, up to one factor; shape (n,) each.
+
+    What several points are wrong by together has a column of ones and zeros, shape (n, k), and a standard deviation, rad.
+
+    """
+
+    time: Array
+    heading: Array
+    variance: Array
+    shared: Array
+    shared_deviation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -53,17 +74,23 @@ class _Increments:
 
     Attributes
     ----------
-    columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; what a lag adds, rad/s²; shape (n, 4)
+    columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; what a lag adds, rad/s²; what errors that several
+        points share add, rad; shape (n, 4 + k)
+    prior : standard deviations that are known of the values beforehand, shape (4 + k,)
     turned : increments of the gyro's integral, rad, shape (n,)
-    points : in a block
-    resting : what the encoder's rounding adds wherever the reference stands, one column a stand, rad, shape (n, stands)
+    walk, neighbours : variance of the increments of a random walk, and covariance of each with the one before, s, shape (n,)
+    reference : variance of the reference in each block, up to one factor, shape (n + 1,)
+    time : of the blocks, s, shape (n + 1,)
 
     """
 
     columns: Array
+    prior: Array
     turned: Array
-    points: int
-    resting: Array
+    walk: Array
+    neighbours: Array
+    reference: Array
+    time: Array
 
 
 #: Longest block, s. What a run does within it (vibration, backlash, an eccentric encoder) is no random walk and must not be taken for one.
@@ -73,35 +100,37 @@ _BLOCK = 0.5
 class _Pairing:
     """A run and a motion, brought together at any time offset."""
 
-    def __init__(self, time: Array, rate: Array, motion: Motion):
-        self._time, self._rate, self._motion = time, rate, motion
-        self._integral = integrate(time, rate)
+    def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
+        self._time, self._rate = time, rate
+        self._prior = np.array([math.inf, math.inf, 0.1, lag])
+        self._integral, self._interval = integrate(time, rate), float(np.median(np.diff(time)))
         self.sampled = motion.rate is None
-        self._points = motion.time if self.sampled else np.arange(0.0, motion.duration + 1e-9, 0.01)
-        self._step = _encoder_step(motion.heading) if self.sampled else 0.0
-        self._points_in_block = max(1, round(min(_BLOCK, motion.duration / 40.0) / float(np.median(np.diff(self._points)))))
-
-    def _known(self, offset: float) -> Array:
-        """Return at every point reference heading, time, rate and gyro's integral, shape (n, 4), if the gyro is `offset` s late."""
-        points = self._points[(self._points + offset >= self._time[0]) & (self._points + offset <= self._time[-1])]
-        rate = np.interp(points + offset, self._time, self._rate)
-        return np.column_stack([self._motion.heading_at(points), points, rate, self._integral_at(points + offset, rate)])
+        self._block = _block(motion)
+        self._points = _points(motion, self._block)
 
     def increments(self, offset: float) -> _Increments:
         """Return the increments if the gyro is `offset` s late."""
-        known = self._known(offset)
-        blocks = len(known) // self._points_in_block
-        grouped = known[:blocks * self._points_in_block].reshape(blocks, self._points_in_block, 4)
-        steps = np.diff(grouped.mean(axis=1), axis=0)
-        accelerations = (grouped[:, -1, 2] - grouped[:, 0, 2]) / max(grouped[0, -1, 1] - grouped[0, 0, 1], 1e-9)
-        columns = np.column_stack([steps[:, :3], np.diff(accelerations)])
-        resting = np.diff(_stands(grouped[:, :, 0]), axis=0) * self._step / math.sqrt(12.0)
-        return _Increments(columns, steps[:, 3], self._points_in_block, resting)
+        points = self._points
+        kept = (points.time + offset >= self._time[0]) & (points.time + offset <= self._time[-1])
+        time, weight = points.time[kept], 1.0 / points.variance[kept]
+        if len(time) < 2:
+            return _Increments(np.empty((0, 4)), self._prior, *np.empty((5, 0)))
+        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block + 1e-6), prepend=-1.0))
+        precision = np.add.reduceat(weight, begins)
+        weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
+        known = np.column_stack([points.heading[kept], time, *self._heard(time + offset), points.shared[kept]])
+        means = np.add.reduceat(weight[:, None] * known, begins)
+        columns = np.diff(np.delete(means, 4, axis=1), axis=0)
+        prior = np.append(self._prior, np.full(points.shared.shape[1], points.shared_deviation))
+        return _Increments(columns, prior, np.diff(means[:, 4]), *_random_walk(time, weight, begins), 1.0 / precision, means[:, 1])
 
-    def _integral_at(self, at: Array, rate: Array) -> Array:
-        """Return the integral of the rate that is linear between the samples."""
+    def _heard(self, at: Array) -> tuple[Array, Array, Array]:
+        """Return rate, acceleration and integral of the rate that is linear between the samples."""
+        rate, half = np.interp(at, self._time, self._rate), 0.5 * self._interval
+        later, earlier = (np.interp(at + shift, self._time, self._rate) for shift in (half, -half))
         index = np.clip(np.searchsorted(self._time, at, side='right') - 1, 0, len(self._time) - 1)
-        return self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
+        integral = self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
+        return rate, (later - earlier) / self._interval, integral
 
     def coarse_offset(self, largest: float) -> float:
         """Return the offset, s, at which most increments fit; a slip does not count more than the blocks that it is in."""
@@ -113,6 +142,97 @@ class _Pairing:
         if len(data.turned) < 10:
             return math.inf
         return float(np.mean(np.abs(_robust_residual(data.columns[:, :2], data.turned, 3))))
+
+
+def _block(motion: Motion) -> float:
+    """Return the length of a block, s: short enough that the means over blocks keep what the heading varies by."""
+    block = min(_BLOCK, motion.duration / 40.0)
+    time = np.arange(0.0, motion.duration, block / 64.0)
+    heading = motion.heading_at(time[:len(time) // 64 * 64]).reshape(-1, 64)
+    whole, within = np.var(heading), [np.var(heading.reshape(-1, size), axis=1).mean() for size in (64, 32, 16, 8, 4)]
+    halvings = int(np.argmax(np.append(np.array(within) < 0.05 * whole, True)))
+    return block / 2.0 ** halvings
+
+
+def _points(motion: Motion, block: float) -> _Points:
+    """Return where a motion is known: at its samples, or for an encoder where it steps."""
+    if motion.rate is not None:
+        time = np.arange(0.0, motion.duration + 1e-9, 0.01)
+        return _Points(time, motion.heading_at(time), np.ones(len(time)), np.empty((len(time), 0)))
+    step = _encoder_step(motion.heading)
+    if not step:
+        return _Points(motion.time, motion.heading, np.ones(len(motion.time)), np.empty((len(motion.time), 0)))
+    crossings, stands = _crossings(motion, step), _stands(motion, step, block)
+    order = np.argsort(np.append(crossings.time, stands.time), kind='stable')
+    time, heading, variance, shared = (np.concatenate([getattr(points, name) for points in (crossings, stands)])[order]
+                                       for name in ('time', 'heading', 'variance', 'shared'))
+    return _Points(time, heading, variance, shared, step / math.sqrt(12.0))
+
+
+def _crossings(motion: Motion, step: float) -> _Points:
+    """
+    Return the middles between readings one step apart that stay, with variances in units of that of a reading.
+
+    A reading that stays is off by anything up to half a step, and stays so; where it changes by one step, the heading is the edge between
+    the two, to what was turned between the samples.
+
+    """
+    moved = np.abs(np.diff(motion.heading))
+    index = np.flatnonzero(moved > 0.5 * step)
+    time, heading = (0.5 * (values[index] + values[index + 1]) for values in (motion.time, motion.heading))
+    speed = np.abs(np.diff(heading) / np.diff(time))
+    turned = np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)]) if len(time) else time
+    turned = np.where(moved[index] > 1.5 * step, 1.0, np.clip(turned * np.diff(motion.time)[index] / step, _SHARPEST, 1.0))
+    # none counts more than the usual one: a reference is seldom as good as its slowest steps say
+    turned = np.maximum(turned, np.median(turned)) if len(time) else turned
+    alone = np.diff(index, prepend=-1, append=len(moved)) == 1
+    edges = (moved[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
+    return _Points(time[edges], heading[edges], turned[edges] ** 2, np.zeros((int(edges.sum()), 2)))
+
+
+#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
+_SHARPEST = 0.05
+
+
+def _stands(motion: Motion, step: float, block: float) -> _Points:
+    """
+    Return the readings that stay longer than a block, those that do not stay, and the first and last.
+
+    All that stay count as one reading. At the first and the last the gyro rests if they stay much longer than the readings beside them;
+    then they are wrong all by the same.
+
+    """
+    run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
+    begins = np.flatnonzero(np.diff(run, prepend=-1))
+    ends = np.append(begins[1:], len(run)) - 1
+    lasts = motion.time[ends] - motion.time[begins]
+    stays = (lasts > block) | (ends == begins)
+    stays[[0, -1]] = True
+    rests = np.zeros((len(begins), 2))
+    if len(begins) > 2:
+        rests[0, 0], rests[-1, 1] = (lasts[end] > max(block, 2.0 * lasts[beside]) for end, beside in ((0, 1), (-1, -2)))
+    variance = np.where(rests.any(axis=1), 1.0, np.bincount(run))
+    kept = stays[run]
+    return _Points(motion.time[kept], motion.heading[kept], variance[run[kept]], rests[run[kept]])
+
+
+def _random_walk(time: Array, weight: Array, begins: NDArray[np.intp]) -> tuple[Array, Array]:
+    """
+    Return what a random walk of unit variance a second does to increments between weighted means of blocks, s, shape (n,) each.
+
+    With A the weights summed up to each point, the mean of a block is its last value less the sum of A times the steps, and its first
+    value plus the sum of (1 - A) times the steps.
+
+    """
+    interval = np.diff(time, append=time[-1])
+    until = np.cumsum(weight)
+    until -= np.repeat(until[begins] - weight[begins], np.diff(begins, append=len(time)))
+    last = np.append(begins[1:], len(time)) - 1
+    gap = interval[last]
+    within = interval.copy()
+    within[last] = 0.0
+    before, after, both = (np.add.reduceat(product * within, begins) for product in (until ** 2, (1 - until) ** 2, until * (1 - until)))
+    return before[:-1] + gap[:-1] + after[1:], both[:-1]
 
 
 def _robust_residual(columns: Array, turned: Array, passes: int) -> Array:
@@ -136,28 +256,14 @@ def _encoder_step(heading: Array) -> float:
     return step if np.abs(moved / step - np.round(moved / step)).max() < 0.2 else 0.0
 
 
-def _stands(headings: Array) -> Array:
-    """Return which blocks, shape (n, points), stand together at one heading: a column of ones and zeros for each stand."""
-    still = np.ptp(headings, axis=1) == 0.0
-    begins = still & ~np.append(False, still[:-1] & (headings[1:, 0] == headings[:-1, 0]))
-    number = np.cumsum(begins)
-    return (still[:, None] & (number[:, None] == np.arange(1, number[-1] + 1))).astype(float)
-
-
 class _Covariance:
-    """
-    Covariance of the increments, up to one factor: rate noise, and noise of the reference heading in each block.
-
-    A random walk, averaged over blocks of m points, has increments of variance ``interval (2 m² + 1) / 3 m²`` and a covariance with the
-    neighbours of ``interval (m² - 1) / 6 m²``; independent noise of the blocks adds ``2 ratio`` and ``-ratio``: a banded matrix.
-
-    """
+    """Covariance of the increments, up to one factor: rate noise, and noise of the reference heading in each block; a banded matrix."""
 
     def __init__(self, data: _Increments, ratio: float):
-        intervals, squared = data.columns[:, 1], data.points ** 2
-        band = np.zeros((2, len(intervals)))
-        band[0, 1:] = np.sqrt(intervals[1:] * intervals[:-1]) * (squared - 1) / (6 * squared) - ratio
-        band[1] = intervals * (2 * squared + 1) / (3 * squared) + 2.0 * ratio
+        band = np.zeros((2, len(data.turned)))
+        self._reference = ratio * data.reference
+        band[0, 1:] = data.neighbours[1:] - self._reference[1:-1]
+        band[1] = data.walk + self._reference[1:] + self._reference[:-1]
         self.ratio = ratio
         self._factor = cholesky_banded(band)
         self.log_determinant = 2.0 * float(np.log(self._factor[1]).sum())
@@ -174,60 +280,60 @@ class _Covariance:
     def reference_error(self, residual: Array) -> Array:
         """Return the part of the increments' residual that the noise of the headings is expected to be."""
         solved = np.concatenate([[0.0], self.solve(residual), [0.0]])
-        return self.ratio * (2.0 * solved[1:-1] - solved[:-2] - solved[2:])
+        return np.diff(self._reference * -np.diff(solved))
 
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Values of (1 + s, b, error of the time offset, lag), their covariance, and what is left."""
+    """Values of (1 + s, b, error of the time offset, lag, ...), their covariance, what is left, with which noise, and how likely."""
 
     values: Array
     covariance: Array
     residual: Array
     rate_variance: float
     log_likelihood: float
+    noise: _Covariance
+    influence: Array
 
 
 #: Variance of a block's reference noise over what the rate noise adds from block to block.
-_RATIOS = np.geomspace(1e-3, 1e3, 19)
-#: Standard deviations of what is assumed of s, b, time offset, s, and lag, s²; they matter only where the data do not show the two latter.
-_PRIOR = np.array([math.inf, math.inf, 0.1, 0.1])
+_RATIOS = np.geomspace(1e-3, 1e5, 25)
 
 
 def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Estimate:
     """Solve the weighted normal equations; the restricted likelihood is that of the noise, the values being unknown."""
-    freedom, weighted = len(data.turned) - 5, noise.solve(instrument)  # four values and the ratio of the noises
+    freedom = len(data.turned) - len(data.prior) - 1  # the values, and the ratio of the noises
+    weighted = noise.solve(instrument)
     matrix, vector = weighted.T @ data.columns, weighted.T @ data.turned
     rate_variance = 0.0
     for _ in range(3):
-        regular = matrix + np.diag(rate_variance / _PRIOR ** 2)
+        regular = matrix + np.diag(rate_variance / data.prior ** 2)
         values = np.linalg.lstsq(regular, vector, rcond=1e-14)[0]
         residual = data.turned - data.columns @ values
         rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
     inverse = np.linalg.pinv(regular, rcond=1e-14)
-    resting = inverse @ (weighted.T @ data.resting)
     # the variance is estimated too, so that the values have Student's distribution, which is wider
-    covariance = freedom / (freedom - 2) * rate_variance * inverse + resting @ resting.T
+    covariance = freedom / (freedom - 2) * rate_variance * inverse
     log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
-    return _Estimate(values, covariance, residual, rate_variance, -0.5 * (freedom * math.log(rate_variance) + log_determinants))
+    return _Estimate(values, covariance, residual, rate_variance, -0.5 * (freedom * math.log(rate_variance) + log_determinants), noise,
+                     residual[:, None] * (weighted @ inverse[:2].T))
 
 
-def _estimates(data: _Increments) -> tuple[list[_Covariance], list[_Estimate], Array]:
+def _estimates(data: _Increments) -> tuple[list[_Estimate], Array]:
     """Return the estimates for every ratio of the two noises, and how likely each ratio is, summing to 1."""
-    interval = float(np.median(data.columns[:, 1]))
-    noises = [_Covariance(data, interval * ratio) for ratio in _RATIOS]
-    estimates = [_estimate(data, noise, data.columns) for noise in noises]
+    unit = float(np.median(data.walk) / np.median(data.reference))
+    estimates = [_estimate(data, _Covariance(data, unit * ratio), data.columns) for ratio in _RATIOS]
     log_likelihoods = np.array([estimate.log_likelihood for estimate in estimates])
     weights = np.exp(log_likelihoods - log_likelihoods.max())
-    return noises, estimates, weights / weights.sum()
+    return estimates, weights / weights.sum()
 
 
-def _errors_in_variables(data: _Increments, noise: _Covariance, estimate: _Estimate) -> _Estimate:
+def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
     """Estimate again with the reference heading smoothed by what the gyro says as the instrument."""
     for _ in range(3):
         instrument = data.columns.copy()
-        instrument[:, 0] += noise.reference_error(estimate.residual) / _away_from_zero(estimate.values[0])
-        estimate = _estimate(data, noise, instrument)
+        instrument[:, 0] += estimate.noise.reference_error(estimate.residual) / _away_from_zero(estimate.values[0])
+        estimate = _estimate(data, estimate.noise, instrument)
     return estimate
 
 
@@ -236,7 +342,8 @@ def _away_from_zero(scale: float) -> float:
     return math.copysign(max(abs(float(scale)), 1e-3), scale)
 
 
-def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0) -> Fit:
+def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
+                   lag: float = 0.1) -> Fit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -254,22 +361,23 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     rate : output of the gyro, rad/s, shape (n,)
     motion : what the gyro was put through
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
+    lag : standard deviation of what is assumed of the lag, s²; a sine cannot part it from the scale
 
     Raises
     ------
     DataRefused : gyro and motion hardly overlap
 
     """
-    pairing = _Pairing(time, rate, motion)
+    pairing = _Pairing(time, rate, motion, lag)
     offset = pairing.coarse_offset(largest_time_offset)
     for _ in range(6):
         data = pairing.increments(offset)
         if len(data.turned) < 10:
             raise DataRefused('the samples cover less than ten blocks of the profile: record the whole motion')
-        noises, estimates, weights = _estimates(data)
-        noise, estimate = noises[weights.argmax()], estimates[weights.argmax()]
+        estimates, weights = _estimates(data)
+        estimate = estimates[weights.argmax()]
         if pairing.sampled:
-            estimate = _errors_in_variables(data, noise, estimate)
+            estimate = _errors_in_variables(data, estimate)
         step = float(np.clip(estimate.values[2], -0.02, 0.02))
         if abs(step) < 1e-9:
             break
@@ -278,7 +386,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
     scale, bias = estimate.values[:2]
     return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
-               math.sqrt(estimate.rate_variance * noise.ratio) / abs(_away_from_zero(scale)), _worst_stretch(noise, data))
+               math.sqrt(estimate.rate_variance * estimate.noise.ratio) / abs(_away_from_zero(scale)),
+               _worst_stretch(estimate.noise, data), math.sqrt(covariance[2, 2]), np.column_stack([estimate.influence, data.time[1:]]))
 
 
 def _worst_stretch(noise: _Covariance, data: _Increments) -> tuple[float, float]:
@@ -288,7 +397,7 @@ def _worst_stretch(noise: _Covariance, data: _Increments) -> tuple[float, float]
     All stretches of a few lengths are looked at. Fit and scale are robust, so that a slip does not hide itself.
 
     """
-    residual = _robust_residual(data.columns, data.turned, 20)
+    residual = _robust_residual(data.columns[:, :4], data.turned, 20)
     whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(residual))])
     turned = np.concatenate([[0.0], np.cumsum(residual)])
     scale = max(float(np.median(np.abs(np.diff(whitened)))) / 0.6745, 1e-15)

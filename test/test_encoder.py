@@ -3,13 +3,16 @@ Calibration against an encoder: what was put in is found, with true intervals, o
 
 """
 
+import math
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE, DataRefused, Log
+from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
 from gyro_calibration.motion import from_rates
 from gyro_calibration.noise import simulate_noise
 
@@ -74,3 +77,92 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason(log, reason, metho
     with pytest.raises(DataRefused) as refused:
         calibrate_encoder(log, method)
     assert reason in str(refused.value) and '\n' not in str(refused.value)
+
+
+def test_lost_samples_are_counted_and_do_not_look_like_bias():
+    """A hundred samples lost while turning one way would be 60 deg/s * 1 s over 100 s: 0.6 deg/s, were the stamps not believed."""
+    kept = ~((SWING.rate_at(CLEAN.time) > 1.0) & (np.arange(len(CLEAN)) % 40 == 7))
+    log = replace(CLEAN, **{name: getattr(CLEAN, name)[kept] for name in ('time', 'output', 'reference_heading')})
+    found = calibrate_encoder(log)
+    assert found.lost_samples == np.sum(~kept) > 80
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
+
+
+def test_a_reference_that_is_lost_at_times_is_bridged_by_the_gyro():
+    lost = (CLEAN.time > 30.0) & (CLEAN.time < 34.0) | (CLEAN.time > 70.0) & (CLEAN.time < 71.0)
+    found = calibrate_encoder(replace(CLEAN, reference_heading=np.where(lost, np.nan, CLEAN.reference_heading)))
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
+    assert len(found.time) == np.sum(~lost)
+
+
+def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
+    """A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large; the remark says 351."""
+    log = replace(CLEAN, output=(CLEAN.output - B) / (1 + S), reference_heading=CLEAN.reference_heading * 351 / 360)
+    found = calibrate_encoder(log)
+    assert found.fit.scale_factor_error == pytest.approx(360 / 351 - 1, abs=5e-5)
+    assert '351.0' in found.remarks[0]
+
+
+def test_the_temperature_of_the_log_is_that_of_the_model():
+    model = calibrate_encoder(replace(CLEAN, temperature=np.linspace(20.0, 30.0, len(CLEAN)))).model
+    assert (model.temperature_range, model.reference_temperature) == ((20.0, 30.0), pytest.approx(25.0))
+
+
+def test_the_residual_heading_is_what_the_calibration_leaves():
+    found = calibrate_encoder(CLEAN)
+    assert found.before.largest > 10 * DEGREE
+    assert found.after.rms < 0.05 * DEGREE and found.after.rms < found.after.largest == np.abs(found.after.heading).max()
+
+
+def benchmark(name):
+    return runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / f'{name}.py'))
+
+
+def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders():
+    """Four standard errors of 40 runs; benchmarks/encoder_intervals.py does this for more noises and 400 runs."""
+    run = benchmark('encoder_intervals')['run']
+    found = np.array([run(('white, flicker, rate random walk', seed, 300.0)) for seed in range(40)])
+    within = (np.abs(found[:, 0]) < 1.96 * found[:, 1]).mean(axis=0)
+    assert (within > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / 40)).all(), within
+    assert (found[:, 1].mean(axis=0) < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
+
+
+@pytest.mark.parametrize('step, noise', [(0.088, 0.02), (5.0, 0.5)])
+def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(step, noise):
+    """Within three standard errors of 40 runs of a ratio of 1.1; benchmarks/efficiency.py does this for more cases and runs."""
+    of = benchmark('efficiency')
+    found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2] for seed in range(40)])
+    ratios = (found ** 2).mean(axis=0) / of['bound'](step * DEGREE, noise * DEGREE, True)
+    assert (ratios[0] < 1.1 * (1.0 + 3.0 * math.sqrt(2.0 / 40))).all() and (ratios[1] > 3.0).all(), ratios
+
+
+#: Which way round the gyro was; what the encoder's own scale makes of s is not known to 0.2 %.
+MEASURED = {'yaw_slow': (-1.0, 0.006), 'yaw_fast': (-1.0, 0.006), 'pitch_slow': (1.0, -0.0149)}
+
+
+def measured(data, name, start=0.0, end=1500.0):
+    log = read_log(data / 'mems_encoder_turntable' / f'{name}.csv.gz')
+    kept = (log.time >= start) & (log.time < end)
+    return Log(output=MEASURED[name][0] * log.output[kept], time=log.time[kept], reference_heading=log.reference_heading[kept])
+
+
+@pytest.mark.parametrize('name', MEASURED)
+def test_measured_gyros_are_12_ms_late_and_that_is_not_taken_for_scale(data, name):
+    """Measured: 12.00, 12.17 and 12.06 ms."""
+    found = calibrate_encoder(measured(data, name, 0.0, 300.0))
+    assert found.fit.time_offset == pytest.approx(0.012, abs=0.0005)
+    assert found.fit.scale_factor_error == pytest.approx(MEASURED[name][1], abs=0.001)
+
+
+def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
+    """Ten pieces of 2.5 minutes: the scatter of s and b is between a third and twice of what is stated."""
+    fits = [calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit for start in np.arange(0.0, 1490.0, 150.0)]
+    scatter = np.std([(fit.scale_factor_error, fit.bias) for fit in fits], axis=0, ddof=1)
+    stated = np.sqrt(np.mean([np.diag(fit.covariance) for fit in fits], axis=0))
+    assert (scatter < 2.0 * stated).all() and (scatter > stated / 3.0).all(), (scatter, stated)
+
+
+def test_one_half_of_a_measured_log_predicts_the_other(data):
+    first, second = (calibrate_encoder(measured(data, 'yaw_slow', start, start + 750.0)).fit for start in (0.0, 750.0))
+    apart = np.abs((first.scale_factor_error - second.scale_factor_error, first.bias - second.bias))
+    assert (apart < 2.6 * np.sqrt(np.diag(first.covariance + second.covariance))).all()

@@ -1,0 +1,73 @@
+"""
+How often the 95 % intervals of scale factor error and bias hold the truth, for logs against an encoder with a bias that wanders.
+
+    python benchmarks/encoder_intervals.py [RUNS]
+
+Ten minutes at 20 Hz on a swing, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning, white noise of
+0.3 deg/sqrt(h). Prints a table in Markdown. The truth of the bias is what was put in, about which it wanders, or for the drift with
+temperature its mean over the log, which is what a model without a term for it can hold.
+
+"""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+
+from gyro_calibration.encoder import calibrate_encoder
+from gyro_calibration.log import DEGREE, Array, Log
+from gyro_calibration.motion import Motion, from_rates
+from gyro_calibration.noise import Noise, simulate_noise
+
+SCALE_FACTOR_ERROR, BIAS, STEP, INTERVAL = 0.02, 0.3 * DEGREE, 0.088 * DEGREE, 0.05
+WHITE, FLICKER, WALK = 0.3 * DEGREE / 60, 20 * DEGREE / 3600, 1.0 * DEGREE / 3600
+#: Noise, and how much the bias drifts with the temperature, rad/s, as the gyro warms up with a time constant of a third of the log.
+CASES = {'white': (Noise(WHITE), 0.0), 'white, flicker': (Noise(WHITE, FLICKER), 0.0),
+         'white, rate random walk': (Noise(WHITE, 0.0, WALK), 0.0),
+         'white, flicker, rate random walk': (Noise(WHITE, FLICKER, WALK), 0.0),
+         'white, flicker, drift with temperature': (Noise(WHITE, FLICKER), 0.03 * DEGREE)}
+
+
+def swing(duration: float, generator: np.random.Generator, half: float = 4.0) -> Motion:
+    """Return the motion to and fro at 55 to 65 deg/s, each way in `half` s with ramps of 0.3 s, and a rest of 0.4 s at each end."""
+    starts = np.arange(0.0, duration, half)
+    knots = (starts[:, None] + (0.0, 0.3, half - 0.7, half - 0.4)).ravel()
+    speeds = np.where(np.arange(len(starts)) % 2, -1.0, 1.0) * generator.uniform(55.0, 65.0, len(starts)) * DEGREE
+    return from_rates(knots, (speeds[:, None] * (0.0, 1.0, 1.0, 0.0)).ravel())
+
+
+def simulated(noise: Noise, drift: float, generator: np.random.Generator, duration: float) -> tuple[Log, Array]:
+    """Return a log, and the true (s, b)."""
+    time = np.arange(round(duration / INTERVAL)) * INTERVAL
+    motion = swing(duration, generator)
+    warming = drift * (1.0 - np.exp(-3.0 * time / duration))
+    output = (1.0 + SCALE_FACTOR_ERROR) * motion.rate_at(time) + BIAS + warming + simulate_noise(noise, len(time), INTERVAL, generator)
+    heading = np.round((motion.heading_at(time) + generator.uniform(0.0, STEP)) / STEP) * STEP
+    return Log(output=output, time=time, reference_heading=heading), np.array([SCALE_FACTOR_ERROR, BIAS + warming.mean()])
+
+
+def run(case: tuple[str, int, float]) -> Array:
+    """Return error and standard deviation of s and b of one run, shape (2, 2)."""
+    name, seed, duration = case
+    log, truth = simulated(*CASES[name], np.random.default_rng([seed, 5]), duration)
+    fit = calibrate_encoder(log).fit
+    return np.array([(fit.scale_factor_error, fit.bias) - truth, np.sqrt(np.diag(fit.covariance))])
+
+
+def table(runs: int, duration: float = 600.0) -> str:
+    """Return the coverage as a table."""
+    lines = ['| noise | s within | b within | rms error of s | stated | rms error of b | stated |', '|---|---|---|---|---|---|---|']
+    with ProcessPoolExecutor() as pool:
+        for name in CASES:
+            found = np.array(list(pool.map(run, [(name, seed, duration) for seed in range(runs)], chunksize=5)))
+            within = 100.0 * (np.abs(found[:, 0]) < 1.96 * found[:, 1]).mean(axis=0)
+            (s, b), (s_stated, b_stated) = np.sqrt((found ** 2).mean(axis=0)) * (100.0, 1.0 / DEGREE)
+            lines.append(f'| {name} | {within[0]:.1f} % | {within[1]:.1f} % | {s:.5f} % | {s_stated:.5f} % | {b:.5f} deg/s | '
+                         f'{b_stated:.5f} deg/s |')
+    return '\n'.join(lines)
+
+
+if __name__ == '__main__':
+    print(table(int(sys.argv[1]) if len(sys.argv) > 1 else 400))
