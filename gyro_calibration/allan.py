@@ -56,6 +56,9 @@ class Record:
 #: Share of intervals below half of the usual one from which on the stamps are taken to come in bursts.
 _BURSTS = 0.02
 
+#: Share of intervals that are alike from which on stamps are not taken to come in bursts.
+_STEADY = 0.9
+
 #: Samples over which delayed stamps catch up again: for single late ones, and for bursts of packets on their way through a host.
 _CATCH_UP, _CATCH_UP_BURSTS = 10, 300
 
@@ -121,7 +124,8 @@ def _leave_out_wild_samples(rate: Array, number: Integers, time: Array) -> list[
     values = _filled(rate)
     off = np.abs(values - medfilt(values, 5))
     off[:2] = off[-2:] = 0.0
-    wild = np.nonzero(off > 1.25 * CHANCE * _scale(off))[0]  # the median takes a fifth off the scatter
+    usual = float(np.quantile(off, 0.9)) / 1.645 or _scale(off)  # not the median: where the output walks, half of these are zero
+    wild = np.nonzero(off > 1.25 * CHANCE * usual)[0]
     if not wild.size or wild.size > 0.001 * len(rate):
         return []
     rate[wild] = np.nan
@@ -182,6 +186,10 @@ def _numbering(time: Array) -> tuple[float, Integers, list[str]]:
     lag = min(100, len(time) // 4)
     interval = float(np.median(time[lag:] - time[:-lag])) / lag
     steps = np.diff(time)
+    usual = float(np.median(steps))
+    if not 0.8 < interval / usual < 1.25 and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > _STEADY:
+        raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take {100 * interval:.4g} s: either most samples '
+                          'are lost, or they come in long bursts; say with --rate how many there are a second, or record again')
     bursts = float((steps < 0.5 * interval).mean()) > _BURSTS
     lost = _lost_samples(time, steps, interval, bursts)
     number = np.arange(len(time)) + np.cumsum(np.concatenate([[0], lost]))
@@ -215,10 +223,11 @@ def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> I
 def _said_of_stamps(time: Array, lost: Integers, interval: float, wander: float) -> list[str]:
     remarks = []
     if wander:
-        remarks.append(f'The stamps come in bursts, up to {wander:.3g} s off an even interval of {1000 * interval:.5g} ms, which is used.')
+        remarks.append(f'The stamps come in bursts or with jitter, up to {wander:.3g} s off an even interval of {1000 * interval:.5g} ms, '
+                       'which is used.')
     if lost.any():
-        longest = int(np.argmax(lost))
-        remarks.append(f'{lost.sum()} samples are lost in {np.count_nonzero(lost)} gaps; the longest, of {lost[longest]}, is at '
+        longest, gaps = int(np.argmax(lost)), int(np.count_nonzero(lost))
+        remarks.append(f'{lost.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; the longest, of {lost[longest]}, is at '
                        f'{time[longest]:.3f} s. Windows with more than {100 * _LOST_SHARE:g} % lost are not used.')
     return remarks
 

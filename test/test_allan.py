@@ -200,12 +200,14 @@ def moved(kind):
             'dies': (time, np.where(time > 400.0, 0.01, rate)),
             'few': (time[:99], rate[:99]),
             'lost': (time, np.where(generator.random(50_000) < 0.4, np.nan, rate)),
+            'tatters': (time + 5.0 * np.cumsum(generator.random(50_000) < 0.015), rate),
             'uneven': (np.cumsum(0.006 + 0.008 * generator.random(50_000) + 0.05 * np.sin(time / 80.0) ** 2), rate)}[kind]
 
 
 @pytest.mark.parametrize('kind, said', [
     ('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'), ('jolt', r'moved.*from (199|200)\.\d+ s on'),
     ('swing', 'something else in the record'), ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
+    ('tatters', r'10 ms apart.*--rate'),
     ('few', '99 samples.*at least 100'), ('lost', '40 % of the samples are lost'), ('uneven', 'no even interval.*--rate')])
 def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
@@ -225,6 +227,7 @@ def test_a_wild_sample_is_left_out_and_a_walking_bias_is_no_motion():
     rate[[700, 30_000]] += 0.5, -2.0
     record = even_record(stamps(50_000), rate)
     assert np.nonzero(np.isnan(record.rate))[0].tolist() == [700, 30_000] and '2 samples far beyond the noise' in record.remarks[0]
+    assert not even_record(stamps(50_000), simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL, np.random.default_rng(20))).remarks
 
 
 def test_what_the_log_says_was_moved_is_left_out():
