@@ -122,7 +122,9 @@ def find_scatter(dwells: Dwells) -> Scatter:
     kept = not_outlying(dwells)
     used = take(dwells, kept)
     error, surface = used.output - used.rate, _surface(used)
-    size = rms(error - surface @ (surface.T @ error)) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
+    # The likelihood does not look at what the surface explains; beside it, errors that are next to nothing would be lost in rounding.
+    error = error - surface @ (surface.T @ error)
+    size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)
     units = np.array([size, relative, size, relative])[:_sought(used)]
 
@@ -144,8 +146,11 @@ def _sought(dwells: Dwells) -> int:
 
 def not_outlying(dwells: Dwells) -> Mask:
     """Return which dwells lie as the others do, by a fit in which a large residual counts by its size, not its square."""
-    residual = np.abs(_robust_residual(_surface(dwells), dwells.output - dwells.rate, 20))
-    return (residual <= OUTLYING * 1.4826 * float(np.median(residual)) + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
+    surface = _surface(dwells)
+    residual = np.abs(_robust_residual(surface, dwells.output - dwells.rate, 20))
+    # Such a fit passes through as many dwells as it has columns, which say nothing of the scatter.
+    spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
+    return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
 
 
 def _surface(dwells: Dwells) -> Array:
@@ -164,9 +169,9 @@ def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, colum
     """Return the logarithm of the likelihood of the scatter, whatever the values are, up to a constant."""
     deviation = scatter.deviation(dwells)
     sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
-    gram, log_determinant = sums.reduced(scatter.sweep_bias, scatter.sweep_scale)
+    (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
     factor = np.linalg.cholesky(gram)
-    log_determinant += 2.0 * float(np.log(deviation).sum())
+    log_determinant = float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
     return -0.5 * (log_determinant + 2.0 * float(np.log(np.diag(factor)[:-1]).sum()) + float(factor[-1, -1]) ** 2)
 
 
@@ -197,44 +202,92 @@ class _Sums:
         inner, outer = (np.add.reduceat(shared[order, :, None] * each[order, None, :], first) for each in (shared, columns))
         return cls(columns.T @ columns, inner, outer)
 
-    def reduced(self, sweep_bias: float, sweep_scale: float) -> tuple[Array, float]:
-        """Return the products of the whitened columns, and the logarithm of the determinant of the scatter of sweeps (Woodbury)."""
-        size = np.array([sweep_bias, sweep_scale])
-        inner, outer = np.eye(2) + size[:, None] * self.inner * size, size[:, None] * self.outer
-        taken = np.tensordot(outer, np.linalg.solve(inner, outer), axes=((0, 1), (0, 1)))
-        return self.gram - taken, float(np.linalg.slogdet(inner)[1].sum())
+    def reduced(self, sizes: Array) -> tuple[Array, Array]:
+        """
+        Return the products of the whitened columns, and the logarithm of the determinant of what sweeps add (Woodbury).
+
+        Parameters
+        ----------
+        sizes : of the scatter of sweeps' bias and scale, shape (k, 2)
+
+        Returns
+        -------
+        arrays of shape (k, m, m) and (k,)
+
+        """
+        inner = np.eye(2) + sizes[:, None, :, None] * self.inner * sizes[:, None, None, :]
+        outer = sizes[:, None, :, None] * self.outer
+        taken = np.einsum('ksij,ksil->kjl', outer, np.linalg.solve(inner, outer), optimize=True)
+        return self.gram - taken, np.linalg.slogdet(inner)[1].sum(axis=1)
 
 
 # what it leaves open
 
-def covariance_of(dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Array | None:
+@dataclass(frozen=True)
+class Uncertainty:
     """
-    Return the covariance of values that were fitted, wide enough for 1.96 standard deviations to hold 95 %; None with no dwell to spare.
+    What dwells leave open of values that were fitted.
 
-    How large the scatter is, few dwells and few sweeps do not tell. So the intervals are averaged over what it may be, each weighted by its
-    restricted likelihood: that of the dwells gives Student's distribution, that of the sweeps is summed over a grid. Before looking,
-    chances are even that sweeps share nothing; if they do share something, it is about as large as the scatter of a dwell (half
-    Cauchy, Gelman 2006). The largest likelihood alone would say "nothing" about every other time, and its intervals be too narrow.
+    How large the scatter is, few dwells and few sweeps do not tell. So the distribution of the values is averaged over what it may be,
+    each weighted by its restricted likelihood: that of the dwells gives Student's distribution, that of the sweeps is summed over a grid.
+    Before looking, chances are even that sweeps share nothing; if they do share something, it is about as large as the scatter of a
+    dwell (half Cauchy, Gelman 2006). The largest likelihood alone would say "nothing" about every other time, and its intervals be too
+    narrow.
 
-    Parameters
+    Attributes
     ----------
-    dwells : that were fitted
-    scatter : of them
-    columns : what the error changes by for each value, shape (n, m)
-    error : that the fitted values leave, rad/s, shape (n,)
+    weights : of possible scatters, shape (k,)
+    offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
+    covariances : scale of the distribution, shape (k, m, m)
+    freedom : of Student's distribution
 
     """
-    freedom = len(dwells) - columns.shape[1]
-    if freedom == 0:
-        return None
-    lengths = np.linalg.norm(columns, axis=0)
-    deviation = scatter.deviation(dwells)
-    sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
-    weights, offsets, covariances = _averaged(sums, freedom, _units(dwells, deviation))
-    half = _half_width(weights, offsets, np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)), freedom)
-    covariance = np.tensordot(weights, covariances, axes=1)
-    widened = half / 1.959964 / np.sqrt(np.diag(covariance)) / lengths
-    return covariance * np.outer(widened, widened)
+
+    weights: Array
+    offsets: Array
+    covariances: Array
+    freedom: int
+
+    @classmethod
+    def of(cls, dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Uncertainty:
+        """
+        Average over what the scatter may be.
+
+        Parameters
+        ----------
+        dwells : that were fitted, more than there are values
+        scatter : of them
+        columns : what the error changes by for each value, shape (n, m)
+        error : that the fitted values leave, rad/s, shape (n,)
+
+        """
+        lengths = np.linalg.norm(columns, axis=0)
+        deviation = scatter.deviation(dwells)
+        sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
+        freedom = len(dwells) - len(lengths)
+        weights, offsets, covariances = _averaged(sums, freedom, _units(dwells, deviation))
+        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), freedom)
+
+    @property
+    def deviations(self) -> Array:
+        """Return the scales of the distributions of each value, shape (k, m)."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+
+    def below(self, change: Array | float) -> Array:
+        """Return how likely each value is below what was fitted plus a change, shape (m,)."""
+        return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations, self.freedom))
+
+    def covariance(self) -> Array:
+        """Return the covariance of the values, wide enough for 1.96 standard deviations to hold 95 %, shape (m, m)."""
+        low = np.zeros(self.offsets.shape[1])
+        high = 2.0 * student.ppf(0.975, self.freedom) * (self.deviations + np.abs(self.offsets)).max(axis=0)
+        for _ in range(25):
+            half = 0.5 * (low + high)
+            narrow = self.below(half) - self.below(-half) < 0.95
+            low, high = np.where(narrow, half, low), np.where(narrow, high, half)
+        covariance = np.tensordot(self.weights, self.covariances, axes=1)
+        widened = high / 1.959964 / np.sqrt(np.diag(covariance))
+        return covariance * np.outer(widened, widened)
 
 
 def _units(dwells: Dwells, deviation: Array) -> Array:
@@ -244,27 +297,27 @@ def _units(dwells: Dwells, deviation: Array) -> Array:
 
 def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array]:
     """Return the weights of possible scatters of sweeps, shape (k,), what each moves the values by, (k, m), and their covariances."""
-    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)])] * 2 if units.any() else [np.zeros(1)] * 2
-    for _ in range(2 if units.any() else 1):
-        pairs = [(bias, scale) for bias in axes[0] for scale in axes[1]]
-        found = [_given(sums, freedom, *(units * pair)) for pair in pairs]
-        logarithm = np.array([each[0] for each in found]).reshape(len(axes[0]), -1)
+    shown = bool(units.any())
+    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if shown else np.zeros(1)] * 2
+    for _ in range(2 if shown else 1):
+        found = [_given(sums, freedom, units * np.column_stack([np.full(len(axes[1]), bias), axes[1]])) for bias in axes[0]]
+        logarithm = np.array([each[0] for each in found])
         weights = np.exp(logarithm - logarithm.max()) * np.outer(*(_prior(axis) for axis in axes))
         weights /= weights.sum()
         axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
-    likely = np.flatnonzero(weights.ravel() > 1e-4)
-    return (weights.ravel()[likely] / weights.ravel()[likely].sum(), np.array([found[place][1] for place in likely]),
-            np.array([found[place][2] for place in likely]))
+    likely = weights.ravel() > 1e-4
+    values, covariances = (np.concatenate([each[place] for each in found])[likely] for place in (1, 2))
+    return weights.ravel()[likely] / weights.ravel()[likely].sum(), values, covariances
 
 
-def _given(sums: _Sums, freedom: int, sweep_bias: float, sweep_scale: float) -> tuple[float, Array, Array]:
-    """Return the logarithm of the likelihood, the values and their covariance, the scatter of sweeps being given beside that of dwells."""
-    gram, log_determinant = sums.reduced(sweep_bias, sweep_scale)
-    inverse = np.linalg.inv(gram[:-1, :-1])
-    values = inverse @ gram[:-1, -1]
-    misfit = max(float(gram[-1, -1] - values @ gram[:-1, -1]), 1e-12 * float(sums.gram[-1, -1])) + 1e-300
-    logarithm = -0.5 * (log_determinant - float(np.linalg.slogdet(inverse)[1]) + freedom * math.log(misfit))
-    return logarithm, values, inverse * misfit / freedom
+def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array]:
+    """Return the logarithm of the likelihood of scatters of sweeps, shape (k, 2), the values with each, and their covariances."""
+    gram, log_determinant = sums.reduced(sizes)
+    inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
+    values = np.einsum('kij,kj->ki', inverse, right)
+    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right), 1e-12 * sums.gram[-1, -1]) + 1e-300
+    logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
+    return logarithm, values, inverse * (misfit / freedom)[:, None, None]
 
 
 def _prior(sizes: Array) -> Array:
@@ -282,13 +335,3 @@ def _nearer(sizes: Array, weights: Array) -> Array:
     middle = float(share @ logarithms)
     spread = max(math.sqrt(float(share @ (logarithms - middle) ** 2)), 0.3)
     return np.concatenate([[0.0], np.exp(middle + spread * np.linspace(-3.0, 3.0, 13))])
-
-
-def _half_width(weights: Array, offsets: Array, deviations: Array, freedom: int) -> Array:
-    """Return how far 95 % of the averaged distribution reach to both sides, shape (m,)."""
-    low, high = np.zeros(deviations.shape[1]), 2.0 * student.ppf(0.975, freedom) * (deviations + np.abs(offsets)).max(axis=0)
-    for _ in range(25):
-        half = 0.5 * (low + high)
-        inside = weights @ (student.cdf((half - offsets) / deviations, freedom) - student.cdf((-half - offsets) / deviations, freedom))
-        low, high = np.where(inside < 0.95, half, low), np.where(inside < 0.95, high, half)
-    return high

@@ -21,6 +21,7 @@ from gyro_calibration.encoder import EncoderCalibration, calibrate_encoder
 from gyro_calibration.log import DEGREE, Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import POLYNOMIAL, write_model
+from gyro_calibration.scatter import take
 from gyro_calibration.selection import TECHNOLOGIES, Selection, select_effects
 from gyro_calibration.verbs.verb import Answer, UsageError, add_log, picture_file, read, verb
 
@@ -107,7 +108,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.picture:
         picture.draw_residuals(given.picture, fit)
     if given.surface:
-        picture.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range, table)
+        picture.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range, take(table, fit.scatter.kept))
     matrix = _matrix(model)
     data = {'out': given.out, 'method': 'dwells', **_dwell_data(selection), 'effects': _values(model), **_model_data(model),
             'matrix_dps': matrix, 'remarks': list(table.remarks)}
