@@ -114,4 +114,4 @@ def covariance(model: GyroModel) -> np.ndarray:
 
 def quadratic_form(matrix: np.ndarray, vectors: np.ndarray) -> Number:
     """Return v' M v for vectors of shape (m, ...)."""
-    return np.einsum('i...,i...->...', vectors, matrix @ vectors)
+    return (vectors * (matrix @ vectors)).sum(axis=0)
