@@ -688,8 +688,8 @@ class _Description:
         return float(normal @ normal) + density
 
     def cost(self) -> float:
-        """Return -2 ln likelihood with the evidence that each part must bring."""
-        return self.surprise() + _EVIDENCE * len(self.held)
+        """Return -2 ln likelihood with the evidence that each part must bring; a ramp more: in one record a walk looks like it."""
+        return self.surprise() + _EVIDENCE * len(self.held) + _RIVAL * (_RAMP in self.held)
 
     def likely(self) -> bool:
         """Tell whether chance explains what is left."""
