@@ -42,6 +42,7 @@ def _prepare_environment():
     os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
     os.environ.update({
         'ROS_LOG_DIR': str(_FOLDER),
+        'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',  # leaves nothing in shared memory after a kill
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile),

@@ -78,7 +78,7 @@ BAD = {
     'text for a number': ('effects: {bias: {bias: "0.01"}}', "effects.bias.bias is '0.01'"),
     'an integer beyond all floats': ('effects: {bias: {bias: 1' + '0' * 400 + '}}', 'effects.bias.bias'),
     'an integer of too many digits': ('effects: {bias: {bias: 1' + '0' * 5000 + '}}', 'model.yaml'),
-    'out of bounds': ('effects: {sine_response: {k: -1.0}}', 'effects.sine_response.k is -1.0; wanted 1e-06 to 1000 s'),
+    'out of bounds': ('effects: {sine_response: {k: -1.0}}', 'effects.sine_response.k is -1.0; wanted 0.001 to 30 s'),
     'matrix of two lengths': ('effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3]]}}', 'rows of finite numbers'),
     'matrix with nan': ('effects: {rate_temperature_polynomial: {matrix_dps: [[.nan]]}}', 'matrix_dps[0][0] is nan; wanted a finite'),
     'polynomial of order -1': ('effects: {rate_temperature_polynomial: {orders: [-1, 2]}}', 'the orders in rate and temperature'),
