@@ -24,8 +24,6 @@ from gyro_calibration.motion import Motion, from_headings
 from gyro_calibration.noise import ALLAN_FLOOR, Noise
 from gyro_calibration.self_calibration import Limits, fit_rate, refuse_dead, refuse_scale
 
-METHODS = ('likelihood', 'rate')
-
 
 @dataclass(frozen=True)
 class Residual:
@@ -123,7 +121,7 @@ def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None 
     time, output, motion = _pair(log)
     _refuse_motion(motion, limits)
     refuse_dead(output)
-    fit = fit_likelihood(time, output, motion, limits.time_offset, LAG) if method == 'likelihood' else _by_rate(time, output, motion)
+    fit = METHODS[method](time, output, motion, limits)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
     compensated = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     before, after = (_residual(time - np.nan_to_num(fit.time_offset), rate, motion) for rate in (output, compensated))
@@ -131,7 +129,7 @@ def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None 
     fit = replace(fit, covariance=_covariance(fit, drift))
     _refuse_uncertain(fit, limits)
     model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
-    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit))
+    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit, method))
 
 
 #: Gyro and encoder on one host are no further apart, s; a swing may look alike half a period later.
@@ -171,8 +169,12 @@ def _refuse_uncertain(fit: Fit, limits: Limits) -> None:
                           f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often')
 
 
-def _by_rate(time: Array, output: Array, motion: Motion) -> Fit:
-    """Fit by the rate of the encoder; the standard deviations are from the scatter of the residual, which is correlated."""
+def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -> Fit:
+    return fit_likelihood(time, output, motion, limits.time_offset, LAG)
+
+
+def _by_rate(time: Array, output: Array, motion: Motion, _: Limits) -> Fit:
+    """Fit by the rate of the encoder, as it stands: the stamps are believed."""
     inside = (time >= 0.0) & (time <= motion.duration)
     time, output = time[inside], output[inside]
     fit = fit_rate(time, output, motion)
@@ -182,6 +184,9 @@ def _by_rate(time: Array, output: Array, motion: Motion) -> Fit:
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
     influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
     return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan)
+
+
+METHODS = {'likelihood': _by_likelihood, 'rate': _by_rate}
 
 
 def _pieces(time: Array) -> NDArray[np.intp]:
@@ -295,8 +300,12 @@ def _lost(time: Array) -> int:
     return int(np.sum(np.round(intervals / np.median(intervals)) - 1.0))
 
 
-def _remarks(fit: Fit) -> tuple[str, ...]:
+def _remarks(fit: Fit, method: str) -> tuple[str, ...]:
     s = fit.scale_factor_error
     wrong = -s / (1.0 + s)
-    return (f'a reference that shows {100 * wrong:+.2f} % of each turn too much, {360.0 * (1.0 + wrong):.2f} for 360 deg, would look just '
-            f'like this scale factor error of {100 * s:+.2f} %: check its scale over whole turns closed on a mark',)
+    scale = (f'a reference that shows {abs(100 * wrong):.2f} % too {"much" if wrong > 0.0 else "little"}, {360.0 * (1.0 + wrong):.2f} for '
+             f'360 deg, would look just like this scale factor error of {100 * s:+.2f} %: check it over whole turns closed on a mark')
+    if method == 'likelihood':
+        return (scale,)
+    return scale, ('the regression of rates knows no time offset, and takes noise of the gyro for scale: its scale factor error is too '
+                   'large by more than is stated; compare it with the method likelihood')

@@ -14,7 +14,7 @@ import pytest
 from gyro_calibration.encoder import calibrate_encoder
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
 from gyro_calibration.motion import from_rates
-from gyro_calibration.noise import simulate_noise
+from gyro_calibration.noise import Noise, simulate_noise
 
 S, B = 0.02, 0.3 * DEGREE
 INTERVAL = 0.01
@@ -134,6 +134,20 @@ def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_no
     found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2] for seed in range(40)])
     ratios = (found ** 2).mean(axis=0) / of['bound'](step * DEGREE, noise * DEGREE, True)
     assert (ratios[0] < 1.1 * (1.0 + 3.0 * math.sqrt(2.0 / 40))).all() and (ratios[1] > 3.0).all(), ratios
+
+
+def test_the_rate_of_the_encoder_finds_the_truth_where_nothing_is_late():
+    found = calibrate_encoder(log_of(SWING, 100.0, Noise(0.3 * DEGREE / 60), np.random.default_rng(1)), 'rate')
+    errors = np.abs((found.fit.scale_factor_error - S, found.fit.bias - B))
+    assert (errors < 4.0 * np.sqrt(np.diag(found.fit.covariance))).all() and math.isnan(found.fit.time_offset)
+
+
+def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
+    """By 0.25 % for 50 ms on ramps of 0.3 s; by more where the motion is not smooth."""
+    late = log_of(SWING, 100.0, late=0.05)
+    by_rate, by_likelihood = (calibrate_encoder(late, method) for method in ('rate', 'likelihood'))
+    assert by_rate.fit.scale_factor_error - S > 0.002 > 50.0 * abs(by_likelihood.fit.scale_factor_error - S)
+    assert 'no time offset' in by_rate.remarks[1]
 
 
 #: Which way round the gyro was; what the encoder's own scale makes of s is not known to 0.2 %.
