@@ -21,8 +21,8 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import (
     SMALLEST_TEMPERATURE_SPREAD,
     Scatter,
+    Uncertainty,
     Whitener,
-    covariance_of,
     find_scatter,
     rms,
     sweeps_of,
@@ -86,8 +86,23 @@ class Calibration:
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 standard deviations hold 95 %."""
         used = take(self.dwells, self.scatter.kept)
-        covariance = covariance_of(used, self.scatter, columns_of(used, self.terms), self.residual[self.scatter.kept])
+        covariance = self._uncertainty(columns_of(used, self.terms)).covariance() if self.freedom else None
         return _model(used, self.terms, covariance)
+
+    def chance_of(self, effect: Effect) -> float:
+        """Return how likely the dwells would show as much of an effect, either way, where there is nothing of it."""
+        if not self.freedom:
+            return 1.0
+        used = take(self.dwells, self.scatter.kept)
+        term = next(each for each in self.terms if each.effect is effect)
+        others = [each for each in self.terms if each is not term]
+        # What it adds as a whole, not its derivative by a shape: near nothing, that of a sine's is nothing too.
+        columns = [*columns_of(used, others).T, term.error(channels_of(used))] if others else [term.error(channels_of(used))]
+        below = float(self._uncertainty(np.column_stack(columns)).below(-1.0)[-1])
+        return 2.0 * min(below, 1.0 - below)
+
+    def _uncertainty(self, columns: Array) -> Uncertainty:
+        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns, self.residual[self.scatter.kept])
 
     @property
     def before_rms(self) -> float:

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as fisher
 
 from gyro_calibration.calibration import Calibration, Scatter, find_scatter, fit_effects
 from gyro_calibration.dwells import Dwells
@@ -128,26 +127,17 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
         return None
 
 
-def chance(smaller: Calibration, larger: Calibration) -> float:
-    """Return how likely it is that the larger model fits so much better by chance (F test on the misfits)."""
-    freedom = smaller.freedom - larger.freedom
-    if larger.freedom < 1 or freedom < 1:
-        return 1.0
-    spread = max(larger.misfit / larger.freedom, 1.0)
-    return float(fisher.sf((smaller.misfit - larger.misfit) / freedom / spread, freedom, larger.freedom))
-
-
-def _supported(smaller: Calibration, larger: Calibration, tried: int) -> bool:
-    """Tell whether left-out sweeps are predicted better, and the evidence is beyond chance."""
+def _supported(smaller: Calibration, larger: Calibration, effect: Effect, tried: int) -> bool:
+    """Tell whether left-out sweeps are predicted better with an effect, and the evidence is beyond chance."""
     predicts = larger.predicted_misfit().mean() < smaller.predicted_misfit().mean()
-    return bool(predicts and chance(smaller, larger) < FALSE_ALARM_RATE / tried)
+    return bool(predicts) and larger.chance_of(effect) < FALSE_ALARM_RATE / tried
 
 
 def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter) -> Calibration:
     """Add the effect that predicts left-out sweeps best, again and again."""
     while True:
-        tried = [_try(fit.dwells, (*fit.effects, effect), scatter) for effect in candidates if _may_join(effect, fit.effects)]
-        better = [each for each in tried if each is not None and _supported(fit, each, len(candidates))]
+        tried = [(effect, _try(fit.dwells, (*fit.effects, effect), scatter)) for effect in candidates if _may_join(effect, fit.effects)]
+        better = [each for effect, each in tried if each is not None and _supported(fit, each, effect, len(candidates))]
         if not better:
             return fit
         fit = min(better, key=lambda each: float(each.predicted_misfit().mean()))
@@ -166,7 +156,7 @@ def _prune(fit: Calibration, base: Sequence[Effect], tried: int, scatter: Scatte
         if effect in base or effect.name in {_NEEDS.get(each.name) for each in rest}:
             continue
         smaller = _try(fit.dwells, rest, scatter)
-        if smaller is not None and not _supported(smaller, fit, tried):
+        if smaller is not None and not _supported(smaller, fit, effect, tried):
             return _prune(smaller, base, tried, scatter)
     return fit
 
@@ -180,7 +170,7 @@ def _part(fit: Calibration, technology: str | None, scatter: Scatter) -> tuple[C
         for taken, other in (pair, pair[::-1]):
             swapped = None
             if taken in fit.effects:
-                swapped = _try(fit.dwells, tuple(other if each is taken else each for each in fit.effects), scatter)
+                swapped = _try(fit.dwells, _swapped(fit.effects, taken, other), scatter)
             if swapped is not None:
                 fit, twins = _decide((fit, taken), (swapped, other), technology)
                 found.append(twins)
@@ -225,7 +215,12 @@ def _separation(fit: Calibration, swapped: Calibration, rate: float) -> float:
 # reasons
 
 def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins], scatter: Scatter) -> Choice:
-    """Return what a fit with the effect has over one without it, everything else being as it was chosen."""
+    """Return what a fit with the effect has over one without it, or with its twin, everything else being as it was chosen."""
+    for pair in twins:
+        if effect.name == pair.other:
+            swapped = fit_effects(fit.dwells, _swapped(fit.effects, CATALOGUE[pair.taken], effect), scatter)
+            reason = f'explains the same as {pair.taken}, in place of which it is tried here'
+            return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan, reason)
     taken = effect in fit.effects
     rest = tuple(each for each in fit.effects if each is not effect)
     if taken and not rest:
@@ -235,14 +230,15 @@ def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = _reason(effect, taken, _supported(smaller, larger, tried), twins)
-    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, chance(smaller, larger), reason)
+    reason = _reason(effect, taken, _supported(smaller, larger, effect, tried))
+    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, larger.chance_of(effect), reason)
 
 
-def _reason(effect: Effect, taken: bool, supported: bool, twins: Sequence[Twins]) -> str:
-    for pair in twins:
-        if effect.name == pair.other:
-            return f'explains the same as {pair.taken}, which was taken: {pair.reason}'
+def _swapped(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
+    return tuple(other if each is taken else each for each in effects)
+
+
+def _reason(effect: Effect, taken: bool, supported: bool) -> str:
     if taken:
         return 'predicts left-out sweeps better' if supported else 'belongs to every model'
     needed = _NEEDS.get(effect.name)
