@@ -406,7 +406,7 @@ def _flicker_covariance(time: Integers) -> Array:
 
 
 ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0, lambda time: -0.5 * np.abs(time))
-BIAS_INSTABILITY = Part('bias_instability', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
+BIAS_INSTABILITY = Part('flicker', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
 RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0, lambda time: np.abs(time) ** 3 / 12.0)
 QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0, lambda time: (np.asarray(time) == 0.0).astype(float))
 RATE_RAMP = Part('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
@@ -522,6 +522,29 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Floor:
+    """
+    The lowest point of a chart.
+
+    Attributes
+    ----------
+    time : averaging time, s
+    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
+
+    """
+
+    time: float
+    deviation: float
+    lower: float
+    upper: float
+
+    @property
+    def bias_instability(self) -> tuple[float, float, float]:
+        """Return B as IEEE Std 952 reads it off the floor, which is 0.664 B, and its bounds, rad/s."""
+        return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
+
+
+@dataclass(frozen=True)
 class NoiseFit:
     """
     The noise figures of a record.
@@ -553,10 +576,10 @@ class NoiseFit:
         return np.sqrt(sum(figure.value ** 2 * figure.part.variance(time) for figure in self.figures.values()))
 
     @property
-    def floor(self) -> tuple[float, float]:
-        """Return the lowest Allan deviation of the chart, rad/s, and its averaging time, s."""
+    def floor(self) -> Floor:
+        """Return the lowest point of the chart."""
         lowest = int(np.argmin(self.chart.deviation))
-        return float(self.chart.deviation[lowest]), float(self.chart.time[lowest])
+        return Floor(*(float(values[lowest]) for values in (self.chart.time, self.chart.deviation, self.chart.lower, self.chart.upper)))
 
     @property
     def floor_reached(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -16,9 +15,8 @@ from gyro_calibration.allan import AllanChart, Figure, NoiseFit, Record, allan_d
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.noise import ALLAN_FLOOR
 from gyro_calibration.picture import draw_allan
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, output_of, read, time_of, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, output_of, picture_file, read, time_of, verb
 
 #: Symbol -> unit that people use, and how many of it are one in SI.
 UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE), 'K': ('deg/h/√h', 216000.0 / DEGREE),
@@ -29,7 +27,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'allan', _allan, 'find the noise figures of a gyro in a record at rest, by its Allan deviation',
                   'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
     add_log(parser)
-    parser.add_argument('--picture', metavar='FILE', help='draw the chart, .png or .svg')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the chart, .png or .svg')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model that the figures are put in; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model with these noise figures')
     return parser
@@ -55,10 +53,6 @@ def _check(given: argparse.Namespace) -> None:
     """Refuse what cannot work before the work is done."""
     if given.model and not given.out:
         raise UsageError('--model says which model the figures are put in; say with --out where to write it')
-    if given.picture and not given.picture.endswith(('.png', '.svg')):
-        raise UsageError(f'{given.picture}: a picture ends in .png or .svg; name it so')
-    if given.picture and importlib.util.find_spec('matplotlib') is None:
-        raise UsageError('--picture needs matplotlib, which is not installed; install it, or leave the picture out')
 
 
 def _bar(blocks: Iterable[Any]) -> Iterable[Any]:
@@ -70,14 +64,15 @@ def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: No
     lost = int(np.isnan(record.rate).sum())
     lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
              f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks]
-    lines += [_line(symbol, figure) for symbol, figure in fit.figures.items()]
-    lines += [_said_of_floor(fit), _said_of_fit(fit)]
+    lines += [_said_of_floor(fit), *(_line(symbol, figure) for symbol, figure in fit.figures.items()), _said_of_fit(fit)]
+    if given.out:
+        lines.append('The model gets the flicker as its bias instability, for it adds N and K to it.')
     return lines + [f'Written to {each}.' for each in (given.picture, given.out) if each]
 
 
 def _line(symbol: str, figure: Figure) -> str:
     unit, factor = UNITS[symbol]
-    name = f'{figure.part.name.replace("_", " ").capitalize()} {symbol}'
+    name = 'Flicker, what of B the others do not explain' if symbol == 'B' else f'{_words(figure).capitalize()} {symbol}'
     if not figure.value:
         return f'{name}: not seen; below {figure.upper * factor:.3g} {unit} ({figure.upper:.3g} {figure.part.unit}).'
     return (f'{name}: {figure.value * factor:.4g} {unit}, 95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
@@ -86,19 +81,23 @@ def _line(symbol: str, figure: Figure) -> str:
 
 def _named(symbol: str, figure: Figure) -> str:
     unit, factor = UNITS[symbol]
-    return f'{figure.part.name.replace("_", " ")} {symbol} = {figure.value * factor:.3g} {unit}'
+    return f'{_words(figure)} {symbol} = {figure.value * factor:.3g} {unit}'
+
+
+def _words(figure: Figure) -> str:
+    return figure.part.name.replace('_', ' ')
 
 
 def _said_of_floor(fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
-    deviation, time = fit.floor
-    text = (f'Lowest Allan deviation: {deviation * factor:.4g} {unit} ({deviation:.4g} rad/s) at {time:.4g} s; all of it taken for bias '
-            f'instability, that is {deviation / ALLAN_FLOOR * factor:.4g} {unit}.')
+    floor = fit.floor
+    value, lower, upper = floor.bias_instability
+    where = f'the lowest Allan deviation, {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, over 0.664'
     if fit.floor_reached:
-        return text
-    bound = f'is only known to be below {fit.figures["B"].upper * factor:.3g} {unit}'
-    seen = 'rests on the bend above the floor' if fit.figures['B'].value else bound
-    return f'{text} The deviation still falls at the end of the chart: the bias instability {seen}; record longer to reach the floor.'
+        return (f'Bias instability B: {value * factor:.4g} {unit}, 95 %: {lower * factor:.4g} to {upper * factor:.4g} ({value:.4g} rad/s): '
+                f'{where}.')
+    return (f'Bias instability B: below {upper * factor:.4g} {unit} ({upper:.3g} rad/s): {where}, and the deviation still falls at the end '
+            'of the chart; record longer to reach the floor.')
 
 
 def _said_of_fit(fit: NoiseFit) -> str:
@@ -114,7 +113,7 @@ def _said_of_fit(fit: NoiseFit) -> str:
 
 
 def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> dict[str, Any]:
-    deviation, time = fit.floor
+    value, lower, upper = fit.floor.bias_instability
     figures = {figure.part.name: {'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
                                   'upper': figure.upper, 'seen': bool(figure.value),
                                   'standard_deviation': None if math.isnan(figure.standard_deviation) else figure.standard_deviation}
@@ -122,6 +121,7 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: Noi
     columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower, 'upper': chart.upper,
                'degrees_of_freedom': chart.degrees_of_freedom, 'differences': chart.differences, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval, 'remarks': list(record.remarks), **figures,
-            'floor': {'deviation': deviation, 'time_s': time, 'bias_instability': deviation / ALLAN_FLOOR, 'reached': fit.floor_reached},
+            'bias_instability': {'symbol': 'B', 'unit': 'rad/s', 'value': value, 'lower': lower, 'upper': upper, 'seen': fit.floor_reached},
+            'floor': {**vars(fit.floor), 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit, 'rivals': list(fit.rivals),
             'chart': {name: values.tolist() for name, values in columns.items()}, 'picture': given.picture, 'out': given.out}
