@@ -233,6 +233,29 @@ def _said_of_stamps(time: Array, lost: Integers, interval: float, wander: float)
 
 
 @dataclass(frozen=True)
+class Floor:
+    """
+    The lowest point of a chart; at its end, where single points are low by chance, it is the one of the lowest upper bound.
+
+    Attributes
+    ----------
+    time : averaging time, s
+    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
+
+    """
+
+    time: float
+    deviation: float
+    lower: float
+    upper: float
+
+    @property
+    def bias_instability(self) -> tuple[float, float, float]:
+        """Return B as IEEE Std 952 reads it off the floor, which is 0.664 B, and its bounds, rad/s."""
+        return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
+
+
+@dataclass(frozen=True)
 class AllanChart:
     """
     The overlapping Allan deviation, each array of shape (n,).
@@ -257,6 +280,12 @@ class AllanChart:
     degrees_of_freedom: Array
     lower: Array
     upper: Array
+
+    @property
+    def floor(self) -> Floor:
+        """Return the lowest point."""
+        lowest = int(np.argmin(self.upper))
+        return Floor(*(float(values[lowest]) for values in (self.time, self.deviation, self.lower, self.upper)))
 
     @property
     def time(self) -> Array:
@@ -522,29 +551,6 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Floor:
-    """
-    The lowest point of a chart.
-
-    Attributes
-    ----------
-    time : averaging time, s
-    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
-
-    """
-
-    time: float
-    deviation: float
-    lower: float
-    upper: float
-
-    @property
-    def bias_instability(self) -> tuple[float, float, float]:
-        """Return B as IEEE Std 952 reads it off the floor, which is 0.664 B, and its bounds, rad/s."""
-        return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
-
-
-@dataclass(frozen=True)
 class NoiseFit:
     """
     The noise figures of a record.
@@ -574,12 +580,6 @@ class NoiseFit:
     def deviation(self, time: Array) -> Array:
         """Return the Allan deviation, rad/s, that the figures add up to."""
         return np.sqrt(sum(figure.value ** 2 * figure.part.variance(time) for figure in self.figures.values()))
-
-    @property
-    def floor(self) -> Floor:
-        """Return the lowest point of the chart."""
-        lowest = int(np.argmin(self.chart.deviation))
-        return Floor(*(float(values[lowest]) for values in (self.chart.time, self.chart.deviation, self.chart.lower, self.chart.upper)))
 
     @property
     def floor_reached(self) -> bool:

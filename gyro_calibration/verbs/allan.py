@@ -64,7 +64,7 @@ def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: No
     lost = int(np.isnan(record.rate).sum())
     lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
              f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks]
-    lines += [_said_of_floor(fit), *(_line(symbol, figure) for symbol, figure in fit.figures.items()), _said_of_fit(fit)]
+    lines += [_said_of_floor(chart, fit), *(_line(symbol, figure) for symbol, figure in fit.figures.items()), _said_of_fit(fit)]
     if given.out:
         lines.append('The model gets the flicker as its bias instability, for it adds N and K to it.')
     return lines + [f'Written to {each}.' for each in (given.picture, given.out) if each]
@@ -88,9 +88,9 @@ def _words(figure: Figure) -> str:
     return figure.part.name.replace('_', ' ')
 
 
-def _said_of_floor(fit: NoiseFit) -> str:
+def _said_of_floor(chart: AllanChart, fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
-    floor = fit.floor
+    floor = chart.floor
     value, lower, upper = floor.bias_instability
     where = f'the lowest Allan deviation, {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, over 0.664'
     if fit.floor_reached:
@@ -113,7 +113,7 @@ def _said_of_fit(fit: NoiseFit) -> str:
 
 
 def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> dict[str, Any]:
-    value, lower, upper = fit.floor.bias_instability
+    value, lower, upper = chart.floor.bias_instability
     figures = {figure.part.name: {'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
                                   'upper': figure.upper, 'seen': bool(figure.value),
                                   'standard_deviation': None if math.isnan(figure.standard_deviation) else figure.standard_deviation}
@@ -122,6 +122,6 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: Noi
                'degrees_of_freedom': chart.degrees_of_freedom, 'differences': chart.differences, 'fit': fit.deviation(chart.time)}
     return {'samples': len(record.rate), 'interval_s': record.interval, 'remarks': list(record.remarks), **figures,
             'bias_instability': {'symbol': 'B', 'unit': 'rad/s', 'value': value, 'lower': lower, 'upper': upper, 'seen': fit.floor_reached},
-            'floor': {**vars(fit.floor), 'reached': fit.floor_reached},
+            'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit, 'rivals': list(fit.rivals),
             'chart': {name: values.tolist() for name, values in columns.items()}, 'picture': given.picture, 'out': given.out}
