@@ -59,8 +59,7 @@ class Drift:
     time, rate : middles of the intervals between pieces of the log, s, and how the heading drifts there, rad/s, shape (m,)
     angle_random_walk : rad/√s, over times longer than a piece
     mean : standard deviation of the mean bias over the log, rad/s
-    wander : standard deviation of what the mean bias differs by from the bias at the beginning, or half of what it differs by in another
-        log as long, rad/s
+    wander : standard deviation of what the mean bias differs by from the bias at the beginning, rad/s
 
     """
 
