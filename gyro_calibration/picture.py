@@ -32,11 +32,7 @@ def draw_headings(path: str | Path, time: Array, true: Array, headings: Mapping[
     headings : by name, rad, shape (n,) each
 
     """
-    import matplotlib  # not needed on a robot, and slow to load
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-
-    figure, (above, below) = pyplot.subplots(2, sharex=True, figsize=(9, 7), layout='constrained', height_ratios=(1, 1.3))
+    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), sharex=True, height_ratios=(1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
     for (name, heading), style in zip(headings.items(), _STYLES * len(headings)):
         above.plot(time, heading / DEGREE, style, linewidth=1)
@@ -48,8 +44,7 @@ def draw_headings(path: str | Path, time: Array, true: Array, headings: Mapping[
     below.legend(loc='best')
     for axes in (above, below):
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    _save(figure, path)
 
 
 def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit, names: Mapping[str, str]) -> None:
@@ -64,12 +59,8 @@ def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit, names: Mappin
     names : of the parts that are seen, by symbol, such as 'angle random walk N = 2.3 deg/√h'
 
     """
-    import matplotlib  # not needed on a robot, and slow to load
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-
     hour = 3600.0 / DEGREE
-    figure, axes = pyplot.subplots(figsize=(9, 6.5), layout='constrained')
+    figure, ((axes,),) = _panels(1, 1, (9, 6.5))
     axes.fill_between(chart.time, chart.lower * hour, chart.upper * hour, color='black', alpha=0.15, linewidth=0, label='95 % confidence')
     axes.loglog(chart.time, chart.deviation * hour, 'o', color='black', markersize=3.5, label='Allan deviation')
     times = np.geomspace(chart.time[0], chart.time[-1], 200)
@@ -84,8 +75,7 @@ def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit, names: Mappin
              title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    _save(figure, path)
 
 
 #: Of the parts of the noise; a dot and dashes of other lengths tell them apart without colour.
@@ -243,12 +233,12 @@ def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> No
     _save(figure, path)
 
 
-def _panels(rows: int, columns: int, inches: tuple[float, float]) -> tuple[Any, Any]:
+def _panels(rows: int, columns: int, inches: tuple[float, float], **how: Any) -> tuple[Any, Any]:
     """Return a figure and its panels, shape (rows, columns)."""
     import matplotlib  # not needed on a robot, and slow to load
     matplotlib.use('Agg')
     from matplotlib import pyplot
-    return pyplot.subplots(rows, columns, figsize=inches, layout='constrained', squeeze=False)
+    return pyplot.subplots(rows, columns, figsize=inches, layout='constrained', squeeze=False, **how)
 
 
 def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None) -> Any:
