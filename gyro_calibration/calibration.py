@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from gyro_calibration.dwells import Dwells
 from gyro_calibration.effects import Channels, Effect, Parameter
-from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import (
     SMALLEST_TEMPERATURE_SPREAD,
@@ -24,8 +23,9 @@ from gyro_calibration.scatter import (
     Uncertainty,
     Whitener,
     find_scatter,
+    parts_of,
     rms,
-    sweeps_of,
+    summed,
     take,
 )
 
@@ -105,6 +105,12 @@ class Calibration:
         return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns, self.residual[self.scatter.kept])
 
     @property
+    def folded_beyond(self) -> float | None:
+        """Return the slowest rate of a dwell, rad/s, beyond which the output does not grow with the rate; None where it always does."""
+        folded = self.model.steepness(channels_of(self.dwells)) + np.zeros(len(self.dwells)) <= 0.1
+        return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
+
+    @property
     def before_rms(self) -> float:
         """Return the root mean square of output less rate of what was fitted, rad/s."""
         return rms((self.dwells.output - self.dwells.rate)[self.scatter.kept])
@@ -119,10 +125,11 @@ class Calibration:
         """Return the root mean square of the errors of sweeps left out, rad/s."""
         return rms(self.left_out[self.scatter.kept])
 
-    def predicted_misfit(self) -> Array:
-        """Return the mean squared error of each sweep when it is left out, in variances of a dwell, shape (sweeps,)."""
-        squares, used = (self.left_out / self.deviation) ** 2, take(self.dwells, self.scatter.kept)
-        return np.array([squares[self.scatter.kept][rows].mean() for rows in sweeps_of(used)])
+    def predicted_misfit(self) -> float:
+        """Return the mean over the sweeps of the mean squared error when the sweep is left out, in variances of a dwell."""
+        parts = parts_of(take(self.dwells, self.scatter.kept))
+        squares = (self.left_out / self.deviation)[self.scatter.kept] ** 2
+        return float(np.mean(summed(squares, parts) / np.bincount(parts)))
 
 
 def channels_of(dwells: Dwells) -> Channels:
@@ -256,14 +263,13 @@ def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter, whit
 
 def _left_out(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
     """Return what a fit without its sweep leaves of each dwell's error: the deleted residuals, block by block."""
-    left_out, alone = whitened.copy(), np.zeros(len(whitened), dtype=bool)
-    for rows, *_ in whitener.sweeps:
-        own = orthogonal[rows]
-        rest = np.eye(own.shape[1]) - own.T @ own
-        alone[rows] = np.linalg.eigvalsh(rest)[0] < 1e-9  # only this sweep shows some value
-        if not alone[rows[0]]:
-            left_out[rows] += own @ np.linalg.solve(rest, own.T @ whitened[rows])
-    return np.where(alone, math.inf, whitener.restore(left_out))
+    parts = whitener.parts
+    rest = np.eye(orthogonal.shape[1]) - summed(orthogonal[:, :, None] * orthogonal[:, None, :], parts)
+    alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9  # only this sweep shows some value
+    rest[alone] = np.eye(len(rest[0]))
+    changes = np.linalg.solve(rest, summed(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
+    left_out = whitened + np.einsum('nm,nm->n', orthogonal, changes[parts])
+    return np.where(alone[parts], math.inf, whitener.restore(left_out))
 
 
 def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
@@ -337,11 +343,14 @@ def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
     """Return the errors over one quantity, shape (n,), in bins of equal width that hold something."""
     edges = np.linspace(values.min(), values.max(), min(most, len(np.unique(values))) + 1)
     place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    rows = [np.flatnonzero((place == number) & fit.scatter.kept) for number in range(len(edges) - 1)]
-    return [_bin(fit, float(low), float(high), part) for low, high, part in zip(edges, edges[1:], rows) if len(part)]
+    chosen = [(place == number) & fit.scatter.kept for number in range(len(edges) - 1)]
+    return [_bin(fit, float(low), float(high), part) for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
 
 
-def _bin(fit: Calibration, low: float, high: float, rows: NDArray[np.intp]) -> Bin:
-    before, residual = (fit.dwells.output - fit.dwells.rate)[rows], fit.residual[rows]
-    deviation = math.sqrt(float(np.sum(fit.deviation[rows] ** 2))) / len(rows)
-    return Bin(low, high, len(rows), float(before.mean()), float(residual.mean()), deviation, rms(residual))
+def _bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
+    part, residual = take(fit.dwells, chosen), fit.residual[chosen]
+    # What a sweep shares does not average out within it.
+    sweeps = np.unique(part.sweep, return_inverse=True)[1]
+    variance = np.sum(fit.deviation[chosen] ** 2) + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2)
+    before = float((part.output - part.rate).mean())
+    return Bin(low, high, len(part), before, float(residual.mean()), math.sqrt(float(variance)) / len(part), rms(residual))

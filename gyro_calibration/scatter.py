@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.dwells import Dwells, Numbers
 from gyro_calibration.likelihood import _robust_residual
 from gyro_calibration.log import Array, Mask
 
@@ -26,6 +26,8 @@ OUTLYING = 6.0
 SMALLEST_TEMPERATURE_SPREAD = 1.0
 #: With fewer, what the dwells of a sweep have in common cannot be told from chance.
 _FEWEST_SWEEPS = 4
+#: So many blocks stand for sweeps where there are fewer.
+_MOST_BLOCKS = 60
 #: With fewer, an outlying dwell cannot be told from a gyro that is not linear.
 _FEWEST_DWELLS = 12
 
@@ -82,37 +84,49 @@ def take(dwells: Dwells, which: Mask) -> Dwells:
                    deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places)
 
 
-def sweeps_of(dwells: Dwells) -> list[Mask]:
-    """Return a mask for each sweep; a single sweep counts as one a dwell, so that something can be left out."""
-    numbers = np.unique(dwells.sweep)
-    if len(numbers) == 1:
-        return list(np.eye(len(dwells), dtype=bool))
-    return [dwells.sweep == number for number in numbers]
+def parts_of(dwells: Dwells) -> Numbers:
+    """
+    Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
+
+    It is the sweep, as what its dwells have in common does not predict other sweeps. Fewer than four sweeps show too little of the gyro
+    without one of them, two temperatures nothing of the slope between them: then parts are blocks of time, or the dwells.
+
+    """
+    parts = np.unique(dwells.sweep, return_inverse=True)[1]
+    return parts if parts.max() + 1 >= _FEWEST_SWEEPS else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells)
+
+
+def summed(values: Array, parts: Numbers) -> Array:
+    """Return the sums of values of shape (n, ...) over each part, shape (parts, ...)."""
+    order = np.argsort(parts, kind='stable')
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(parts[order], prepend=-1)))
 
 
 class Whitener:
     """The covariance of the errors of dwells; sweeps are independent of each other, and what one shares has two directions."""
 
     def __init__(self, dwells: Dwells, scatter: Scatter):
-        """Find the directions of each sweep."""
+        """Find the directions of each sweep, and how much the dwells of a sweep vary along them."""
+        self.parts = parts_of(dwells)
         self.deviation = scatter.deviation(dwells)
-        shared = scatter.shared(dwells) / self.deviation[:, None]
-        self.sweeps = [(rows, *np.linalg.svd(shared[rows], full_matrices=False)[:2]) for rows in map(np.flatnonzero, sweeps_of(dwells))]
+        self._shared = scatter.shared(dwells) / self.deviation[:, None]
+        self._sizes, self._directions = np.linalg.eigh(summed(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
-        whitened = (values.T / self.deviation).T
-        for rows, directions, sizes in self.sweeps:
-            along = directions.T @ whitened[rows]
-            whitened[rows] -= directions @ ((1.0 - 1.0 / np.sqrt(1.0 + sizes ** 2)) * along.T).T
-        return whitened
+        return self._stretched((values.T / self.deviation).T, -0.5)
 
     def restore(self, whitened: Array) -> Array:
         """Return what `whiten` was given, shape (n,)."""
-        values = whitened.copy()
-        for rows, directions, sizes in self.sweeps:
-            values[rows] += directions @ ((np.sqrt(1.0 + sizes ** 2) - 1.0) * (directions.T @ whitened[rows]))
-        return values * self.deviation
+        return self._stretched(whitened, 0.5) * self.deviation
+
+    def _stretched(self, values: Array, power: float) -> Array:
+        """Multiply by a power of the covariance in units of the dwells' own: the identity, and the products of two columns a sweep."""
+        sizes = np.maximum(self._sizes, 1e-12)
+        inner = self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :] @ self._directions.swapaxes(1, 2)
+        columns = values.reshape(len(values), -1)
+        along = inner @ summed(self._shared[:, :, None] * columns[:, None, :], self.parts)
+        return values + np.einsum('ni,nim->nm', self._shared, along[self.parts]).reshape(values.shape)
 
 
 # how large it is
@@ -197,9 +211,7 @@ class _Sums:
         """Sum over each sweep."""
         columns = columns / deviation[:, None]
         shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
-        order = np.argsort(dwells.sweep, kind='stable')
-        first = np.flatnonzero(np.diff(dwells.sweep[order], prepend=-1))
-        inner, outer = (np.add.reduceat(shared[order, :, None] * each[order, None, :], first) for each in (shared, columns))
+        inner, outer = (summed(shared[:, :, None] * each[:, None, :], parts_of(dwells)) for each in (shared, columns))
         return cls(columns.T @ columns, inner, outer)
 
     def reduced(self, sizes: Array) -> tuple[Array, Array]:

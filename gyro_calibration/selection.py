@@ -16,7 +16,17 @@ import numpy as np
 
 from gyro_calibration.calibration import Calibration, Scatter, find_scatter, fit_effects
 from gyro_calibration.dwells import Dwells
-from gyro_calibration.effects import BIAS, CATALOGUE, CUBIC_NONLINEARITY, SCALE_FACTOR_ERROR, SINE_RESPONSE, Channels, Effect
+from gyro_calibration.effects import (
+    BIAS,
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CATALOGUE,
+    CUBIC_NONLINEARITY,
+    SCALE_FACTOR_ERROR,
+    SINE_RESPONSE,
+    Channels,
+    Effect,
+)
 from gyro_calibration.log import DataRefused
 
 #: How often an effect is taken that is not there, in one calibration.
@@ -27,7 +37,7 @@ PARTED = 4.0
 TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY, 'mems': CUBIC_NONLINEARITY}
 _TWINS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
 #: An effect that is of no use without another one.
-_NEEDS = {'bias_temperature_quadratic': 'bias_temperature'}
+_NEEDS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
 
 
 @dataclass(frozen=True)
@@ -127,36 +137,41 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
         return None
 
 
-def _supported(smaller: Calibration, larger: Calibration, effect: Effect, tried: int) -> bool:
-    """Tell whether left-out sweeps are predicted better with an effect, and the evidence is beyond chance."""
-    predicts = larger.predicted_misfit().mean() < smaller.predicted_misfit().mean()
-    return bool(predicts) and larger.chance_of(effect) < FALSE_ALARM_RATE / tried
+def _supported(smaller: Calibration, larger: Calibration, tried: int) -> bool:
+    """Tell whether left-out sweeps are predicted better with more effects, and the evidence of each is beyond chance."""
+    added = [effect for effect in larger.effects if effect not in smaller.effects]
+    predicts = larger.predicted_misfit() < smaller.predicted_misfit()
+    return predicts and all(larger.chance_of(effect) < FALSE_ALARM_RATE / tried for effect in added)
 
 
 def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter) -> Calibration:
     """Add the effect that predicts left-out sweeps best, again and again."""
     while True:
-        tried = [(effect, _try(fit.dwells, (*fit.effects, effect), scatter)) for effect in candidates if _may_join(effect, fit.effects)]
-        better = [each for effect, each in tried if each is not None and _supported(fit, each, effect, len(candidates))]
+        tried = [_try(fit.dwells, _joined(fit.effects, effect), scatter) for effect in candidates if _may_join(effect, fit.effects)]
+        better = [each for each in tried if each is not None and _supported(fit, each, len(candidates))]
         if not better:
             return fit
-        fit = min(better, key=lambda each: float(each.predicted_misfit().mean()))
+        fit = min(better, key=Calibration.predicted_misfit)
 
 
 def _may_join(effect: Effect, effects: Sequence[Effect]) -> bool:
-    names = {each.name for each in effects}
-    has_twin = any(effect in pair and any(each in effects for each in pair) for pair in _TWINS)
-    return effect.name not in names and not has_twin and _NEEDS.get(effect.name, effect.name) in names | {effect.name}
+    return effect not in effects and not any(effect in pair and any(each in effects for each in pair) for pair in _TWINS)
+
+
+def _joined(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
+    """Return the effects with one more, and with what that one needs: of a curve, the slope may be nothing at first sight."""
+    needed = _NEEDS.get(effect)
+    return (*effects, effect) if needed is None or needed in effects else (*effects, needed, effect)
 
 
 def _prune(fit: Calibration, base: Sequence[Effect], tried: int, scatter: Scatter) -> Calibration:
     """Take away what is of no use any more beside effects that came later."""
     for effect in fit.effects:
         rest = tuple(each for each in fit.effects if each is not effect)
-        if effect in base or effect.name in {_NEEDS.get(each.name) for each in rest}:
+        if effect in base or effect in map(_NEEDS.get, rest):
             continue
         smaller = _try(fit.dwells, rest, scatter)
-        if smaller is not None and not _supported(smaller, fit, effect, tried):
+        if smaller is not None and not _supported(smaller, fit, tried):
             return _prune(smaller, base, tried, scatter)
     return fit
 
@@ -226,11 +241,11 @@ def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]
     if taken and not rest:
         return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan, 'nothing else can be seen')
     try:
-        other = fit_effects(fit.dwells, rest if taken else (*rest, effect), scatter)
+        other = fit_effects(fit.dwells, rest if taken else _joined(rest, effect), scatter)
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = _reason(effect, taken, _supported(smaller, larger, effect, tried))
+    reason = _reason(taken, _supported(smaller, larger, tried))
     return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, larger.chance_of(effect), reason)
 
 
@@ -238,10 +253,7 @@ def _swapped(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[E
     return tuple(other if each is taken else each for each in effects)
 
 
-def _reason(effect: Effect, taken: bool, supported: bool) -> str:
+def _reason(taken: bool, supported: bool) -> str:
     if taken:
         return 'predicts left-out sweeps better' if supported else 'belongs to every model'
-    needed = _NEEDS.get(effect.name)
-    if supported and needed:
-        return f'is of no use without {needed}'
     return 'no better than chance'
