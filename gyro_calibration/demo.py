@@ -38,15 +38,13 @@ from gyro_calibration.node import SENSOR_QUALITY
 from gyro_calibration.noise import simulate_noise
 from gyro_calibration.picture import draw_headings
 from gyro_calibration.protocols import Sample, find
+from gyro_calibration.reproduction.hong_park import TABLE_1
 
 PROTOCOL = 'kvh_dsp3000'
 NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
 INTERVAL = 0.01  # s between samples
 ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20), (4, 0), (1, 0)])
-#: Table 1 of Hong and Park (2008): mean and standard deviation of the heading error over 160 s, deg.
-PUBLISHED = {'pure integration': (1.6675, 1.5075), 'self-calibration': (1.1511, 1.1675),
-             'threshold filter': (0.7768, 1.2653), 'both': (0.5985, 1.2998)}
 
 
 @dataclass(frozen=True)
@@ -274,9 +272,9 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
 def _table(errors: dict[str, Array]) -> str:
     """Return the table as Markdown, beside that of Hong and Park."""
     lines = ['| heading | mean error | standard deviation | off pure integration | Hong and Park, table 1 |', '|---|---|---|---|---|']
-    pure, published = errors['pure integration'].mean(), PUBLISHED['pure integration'][0]
+    pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]
     for name, error in errors.items():
-        mean, deviation = PUBLISHED[name]
+        mean, deviation = TABLE_1[name]
         lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg | {100 * (1 - error.mean() / pure):.0f} % '
                      f'| {mean:.3f} deg, {deviation:.3f} deg, {100 * (1 - mean / published):.0f} % |')
     return '\n'.join(lines) + '\n'
