@@ -245,7 +245,7 @@ def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = _reason(taken, _supported(smaller, larger, tried))
+    reason = _reason(taken, _supported(smaller, larger, tried)) if larger.freedom else 'as many values as dwells tell nothing from chance'
     return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, larger.chance_of(effect), reason)
 
 
