@@ -153,7 +153,8 @@ def quality_lines(fit: Calibration) -> Iterator[str]:
            + (f'{fit.left_out_rms / DEGREE:.4f} in sweeps that were left out.' if math.isfinite(fit.left_out_rms)
               else 'some values show in one sweep only, which cannot be left out.'))
     yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s and {100.0 * scatter.dwell_scale:.3f} % of the rate, sweeps '
-                   f'by {scatter.sweep_bias / DEGREE:.4f} deg/s and {100.0 * scatter.sweep_scale:.3f} %. Condition number {fit.condition:.1f}.')
+                   f'by {scatter.sweep_bias / DEGREE:.4f} deg/s and {100.0 * scatter.sweep_scale:.3f} %. '
+                   f'Condition number {fit.condition:.1f}.')
     yield from map(_wrapped, _warnings(fit))
 
 

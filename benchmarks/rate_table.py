@@ -1,0 +1,95 @@
+"""
+How well calibrations predict a measured rate table of an open-loop fibre-optic gyro.
+
+    GYRO_CALIBRATION_DATA=FOLDER python benchmarks/rate_table.py
+
+Each is fitted without one sweep and tested on it, for all 24 sweeps; and fitted to the dwells slower than 60 deg/s and tested on the others,
+up to 101 deg/s. The default chooses the effects anew from what it may see. Prints a table in Markdown, root mean squares in deg/s.
+
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gyro_calibration.calibration import fit_effects, take
+from gyro_calibration.compensation import compensate
+from gyro_calibration.dwells import Dwells, from_table
+from gyro_calibration.effects import (
+    BIAS,
+    CUBIC_NONLINEARITY,
+    SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE,
+    SINE_RESPONSE,
+    Effect,
+    rate_temperature_polynomial,
+)
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.model import GyroModel
+from gyro_calibration.scatter import rms
+from gyro_calibration.selection import TECHNOLOGIES, select_effects
+
+#: Slower dwells are seen, faster ones predicted, rad/s.
+SEEN = 60.0 * DEGREE
+THERMAL = (BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_TEMPERATURE)
+Fit = Callable[[Dwells], GyroModel]
+
+
+def of(*effects: Effect) -> Fit:
+    """Return a calibration with some effects."""
+    return lambda dwells: fit_effects(dwells, effects).model
+
+
+def chosen(technology: str | None) -> Fit:
+    """Return the calibration with the effects that the dwells support."""
+    return lambda dwells: select_effects(dwells, technology).calibration.model
+
+
+FITS = {
+    'bias': of(BIAS),
+    'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
+    '... and scale factor over temperature, cubic': of(*THERMAL, CUBIC_NONLINEARITY),
+    '... and scale factor over temperature, sine': of(*THERMAL, SINE_RESPONSE),
+    'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
+    'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
+    **{f'default, {technology or "no technology said"}': chosen(technology) for technology in (None, *TECHNOLOGIES)},
+}
+
+
+def table(data: Path) -> Dwells:
+    """Return the dwells of the recording, all of them: those that are outlying are not fitted, but tested on."""
+    return from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
+
+
+def error(model: GyroModel, dwells: Dwells) -> np.ndarray:
+    """Return the error of compensated rates, rad/s, without clipping the temperature."""
+    return compensate(replace(model, temperature_range=(-np.inf, np.inf)), dwells.output, dwells.temperature).rate - dwells.rate
+
+
+def left_out(fit: Fit, dwells: Dwells) -> float:
+    """Return the root mean square error in sweeps that were left out, rad/s."""
+    parts = [(take(dwells, dwells.sweep != number), take(dwells, dwells.sweep == number)) for number in np.unique(dwells.sweep)]
+    return rms(np.concatenate([error(fit(seen), unseen) for seen, unseen in parts]))
+
+
+def beyond(fit: Fit, dwells: Dwells) -> float:
+    """Return the root mean square error at rates beyond those that were seen, rad/s."""
+    slow = np.abs(dwells.rate) < SEEN
+    return rms(error(fit(take(dwells, slow)), take(dwells, ~slow)))
+
+
+def main() -> None:
+    """Print the table."""
+    dwells = table(Path(os.environ['GYRO_CALIBRATION_DATA']))
+    print('| calibration | left-out sweeps | slower than 60 deg/s seen, 60 to 101 predicted |\n|---|---|---|')
+    for name, fit in FITS.items():
+        print(f'| {name} | {left_out(fit, dwells) / DEGREE:.4f} | {beyond(fit, dwells) / DEGREE:.4f} |', flush=True)
+
+
+if __name__ == '__main__':
+    main()
