@@ -11,7 +11,8 @@ command line), where the name says so: ``gyro_dps``.
 
 Reading order: `log`, `effects`, `noise`, `model`, `model_file`, `motion`, `simulation`, `compensation`, `heading`,
 `likelihood`, `self_calibration`;
-`allan`, `dwells`, `scatter`, `calibration`, `selection`, `encoder`, `turn`;
+`allan`; `samples`, `steadiness`, `straightness`, `cleaning`, `settling`, `stretches`, `averaging`, `sweeps`, `dwells`;
+`scatter`, `calibration`, `selection`, `encoder`, `turn`;
 then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then `reproduction`; then `verbs`, `command_line`.
 
 """

@@ -1,0 +1,60 @@
+"""
+Sweeps: which dwells belong to one pass through the rates.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.samples import Numbers
+
+#: Sweeps shorter than this on the whole are no sweeps but chance.
+_SHORTEST = 4
+#: Blocks of consecutive dwells, where the order tells no sweeps.
+_BLOCKS = 9
+
+
+def numbered(names: Sequence[str]) -> Numbers:
+    """Number the sweeps that have names, in the order in which they come."""
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return np.array([numbers[name] for name in names])
+
+
+def sweeps(rate: Array) -> Numbers:
+    """
+    Return the number of the sweep that each dwell belongs to, by the order of the rates, shape (n,).
+
+    Tables go through the rates in one direction, or through their sizes with changing sign, with or without a rest between them. Where
+    the order tells nothing, blocks of consecutive dwells stand for sweeps: they are as far apart in time.
+
+    """
+    turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
+    for used in (np.full(len(rate), True), turning) if turning.any() else ():
+        for value in (rate, np.abs(rate)):
+            sweep = np.zeros(len(rate), dtype=int)
+            sweep[used] = _passes(value[used])
+            # A rest belongs to the dwell before it.
+            sweep = np.maximum.accumulate(np.where(used, sweep, 0))
+            lengths = np.bincount(sweep[used])
+            if len(lengths) > 1 and np.median(lengths) >= _SHORTEST:
+                return sweep
+    return np.arange(len(rate)) * min(_BLOCKS, len(rate)) // len(rate)
+
+
+def _passes(value: Array) -> Numbers:
+    """Number the passes through some values: a new one begins where the direction of travel turns back or the values start anew."""
+    change = np.diff(value)
+    # Found rates of opposite sign are not of the same size to the last digit.
+    steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
+    numbers = np.zeros(len(value), dtype=int)
+    direction = 0.0
+    for place, step in enumerate(steps, 1):
+        turned = step * direction < 0.0
+        numbers[place] = numbers[place - 1] + turned
+        # The jump back to the start of the next pass says nothing about its direction.
+        direction = 0.0 if turned else direction or step
+    return numbers
