@@ -1,0 +1,21 @@
+"""
+Allan deviation of a gyro at rest, and the noise figures in it: what IEEE Std 952, annex C, calls N, B, K, Q and R.
+
+A gyro at rest says nothing but its bias and its noise. The Allan variance at the averaging time tau is half the mean square of the
+difference between neighbouring means over tau. It is taken here at every sample (overlapping), and its uncertainty is computed and not
+assumed: second differences of the angle are Gaussian, so that variances and covariances of their mean squares follow from theirs.
+
+Reading order, each imports only from those before it: `angle` (of samples, some of them lost), `stamps` (by which samples are numbered),
+`rest` (what is no gyro at rest), `record` (samples on an even grid); `parts` (of the noise), `covariance` (of Allan variances), `freedom`
+(degrees of it, and bounds), `chart` (the Allan deviation); `octaves` (those that are fitted), `description` (a combination of parts,
+fitted), `ranking` (of all combinations), `figures` (of the likeliest).
+
+"""
+
+from gyro_calibration.allan.chart import AllanChart, Floor, allan_deviation, averaging_sizes
+from gyro_calibration.allan.figures import Figure, NoiseFit, fit_noise
+from gyro_calibration.allan.parts import PARTS, Part
+from gyro_calibration.allan.record import Record, even_record
+
+__all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record', 'allan_deviation', 'averaging_sizes', 'even_record',
+           'fit_noise']

@@ -1,0 +1,65 @@
+"""The angle of rate samples, some of which are lost: nan stands in their place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyro_calibration.log import Array, DataRefused
+
+Integers = NDArray[np.integer[Any]]
+Truths = NDArray[np.bool_]
+
+#: Fewer samples than this show no noise figure.
+FEWEST = 100
+
+#: Share of a window that may be lost samples: it changes the variance of the window's mean by as much at most.
+LOST_SHARE = 0.01
+
+
+def refuse_few(count: int, samples: str = 'samples') -> None:
+    if count < FEWEST:
+        raise DataRefused(f'{count} {samples}; an Allan deviation wants at least {FEWEST}: record longer')
+
+
+def angle_of(rate: Array) -> Array:
+    """Return the angle before each sample and after the last, less the mean rate, in rate units times samples, shape (n + 1,)."""
+    angle = np.empty(len(rate) + 1)
+    angle[0] = 0.0
+    np.cumsum(filled(rate), out=angle[1:])
+    return angle
+
+
+def filled(rate: Array) -> Array:
+    """Return the rate less its mean, with each gap filled by the mean of what is about it, five times as long on either side."""
+    known = np.isfinite(rate)
+    values = rate - rate[known].mean()
+    if known.all():
+        return values
+    values[~known] = 0.0
+    begins, ends = gaps(known)
+    margin = 5 * (ends - begins) + 5
+    low, high = np.maximum(begins - margin, 0), np.minimum(ends + margin, len(rate))
+    sums, counts = (np.concatenate([[0.0], np.cumsum(each)]) for each in (values, known))
+    means = (sums[high] - sums[low]) / np.maximum(counts[high] - counts[low], 1.0)
+    values[~known] = np.repeat(means, ends - begins)
+    return values
+
+
+def gaps(known: Truths) -> tuple[Integers, Integers]:
+    """Return where each stretch of unknown samples begins, and where it has ended."""
+    edges = np.diff(np.concatenate([[1], known.astype(np.int8), [1]]))
+    return np.nonzero(edges < 0)[0], np.nonzero(edges > 0)[0]
+
+
+def lost_before(rate: Array) -> Integers | None:
+    """Return how many samples are lost before each one, shape (n + 1,), or None if none is."""
+    lost = np.isnan(rate)
+    return np.concatenate([[0], np.cumsum(lost)]) if lost.any() else None
+
+
+def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Truths:
+    """Tell which second differences over `size` samples, from `begin` to `end`, miss few enough samples; `lost` as `lost_before` has it."""
+    return lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step] <= LOST_SHARE * 2 * size

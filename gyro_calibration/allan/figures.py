@@ -1,0 +1,144 @@
+"""The noise figures of a record: how much there is of each part of the noise, and how sure that is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_calibration.allan.chart import AllanChart, allan_deviation
+from gyro_calibration.allan.octaves import Octaves
+from gyro_calibration.allan.parts import BEND_PLACE, PARTS, Part
+from gyro_calibration.allan.ranking import Ranking, rank
+from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.noise import Noise
+
+#: A slope and its end cannot be seen in fewer.
+_FEWEST_OCTAVES = 4
+
+
+@dataclass(frozen=True)
+class Figure:
+    """
+    How much there is of one part of the noise.
+
+    Attributes
+    ----------
+    part : which
+    value : its coefficient, in the part's unit; 0 where the record shows none
+    standard_deviation : of the coefficient, if the parts that are seen are all there are; nan where the record shows none
+    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the record shows none, 0 and how much it
+        may hide
+
+    """
+
+    part: Part
+    value: float
+    standard_deviation: float
+    lower: float
+    upper: float
+
+    def variance(self, time: Array) -> Array:
+        """Return the Allan variance that it makes, (rad/s)²."""
+        return self.value ** 2 * self.part.variance(time)
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """
+    The noise figures of a record.
+
+    Attributes
+    ----------
+    figures : by symbol: N, B, K, Q, R
+    chart : the Allan deviations that were fitted, at octaves
+    shortest, longest : the averaging times that the fit holds for, s
+    misfit : how much further the Allan deviations are off the sum of the parts than chance allows, as a share of them
+    rivals : the symbols of other combinations of parts that would explain the record nearly as well
+
+    """
+
+    figures: dict[str, Figure]
+    chart: AllanChart
+    shortest: float
+    longest: float
+    misfit: float
+    rivals: tuple[str, ...] = ()
+
+    @property
+    def noise(self) -> Noise:
+        """Return the figures that a model holds."""
+        return Noise(*(self.figures[symbol].value for symbol in 'NBK'))
+
+    def deviation(self, time: Array) -> Array:
+        """Return the Allan deviation, rad/s, that the figures add up to."""
+        return np.sqrt(sum(figure.variance(time) for figure in self.figures.values()))
+
+    @property
+    def floor_reached(self) -> bool:
+        """Tell whether what falls with the averaging time is less than half of the variance, one octave before the end of the chart."""
+        time = self.chart.time[-2]
+        falling = sum(figure.variance(time) for figure in self.figures.values() if figure.part.slope < 0.0)
+        return bool(falling < 0.5 * self.deviation(time) ** 2)
+
+
+def fit_noise(rate: Array, interval: float) -> NoiseFit:
+    """
+    Fit the parts of the noise to the Allan variances at octaves, and keep those that the record shows.
+
+    The squared coefficients are found by generalized least squares (as in the generalized method of wavelet moments of Guerrier, Skaloud,
+    Stebler and Victoria-Feser, JASA 2013), none of them negative, with the covariance that the fitted noise itself implies. Of all
+    combinations the likeliest is kept, if each further part makes the data likelier by more than chance does. The shortest averaging
+    times are left out until the sum of the parts describes the rest, because the filters of a gyro bend that end.
+
+    Parameters
+    ----------
+    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
+    interval : s
+
+    Raises
+    ------
+    DataRefused : too few samples, or no sum of the parts describes them
+
+    """
+    chart = allan_deviation(rate, interval, 2.0 ** np.arange(max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
+    if len(chart.size) < _FEWEST_OCTAVES or not chart.deviation.all():
+        raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the lowest Allan deviation '
+                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted {_FEWEST_OCTAVES} octaves, all above 0: record longer '
+                          'and without losses')
+    ranking = rank(Octaves.of(chart))
+    figures = {part.symbol: _in_seconds(_figure(ranking, place), interval) for place, part in enumerate(PARTS)}
+    return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]), ranking.misfit, _rivals(ranking))
+
+
+def _figure(ranking: Ranking, place: int) -> Figure:
+    return _held(ranking, place) if place in ranking.seen else _absent(ranking, place)
+
+
+def _held(ranking: Ranking, place: int) -> Figure:
+    """Return a figure with bounds that hold whether or not parts are there that the evidence does not suffice for."""
+    lower, upper = zip(*(each.bounds(place) for each in ranking.tempting if place in each.held))
+    value = math.sqrt(ranking.best.squares[place])
+    return Figure(PARTS[place], value, 0.5 * ranking.best.deviation(place) / value, min(lower), max(upper))
+
+
+def _absent(ranking: Ranking, place: int) -> Figure:
+    """Return how much of a part there can be besides those that are seen."""
+    best = ranking.best
+    places = [*(each for each in best.held if each not in (place, BEND_PLACE)), place]
+    estimates = [each.estimate(places) for each in ranking.descriptions if each is best or set(each.held) == set(places)]
+    limits = [squares[-1] + 1.96 * deviations[-1] for squares, deviations in estimates]
+    limits += [each.bounds(place)[1] ** 2 for each in ranking.rivals if place in each.held]
+    return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
+
+
+def _in_seconds(figure: Figure, interval: float) -> Figure:
+    """Return a figure that was found in samples in the part's unit."""
+    unit = interval ** -figure.part.slope
+    return Figure(figure.part, *(value * unit for value in (figure.value, figure.standard_deviation, figure.lower, figure.upper)))
+
+
+def _rivals(ranking: Ranking) -> tuple[str, ...]:
+    """Return the symbols of the rivals' parts."""
+    return tuple(sorted({''.join(PARTS[place].symbol for place in each.held if place != BEND_PLACE) for each in ranking.rivals}))

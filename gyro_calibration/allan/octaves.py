@@ -1,0 +1,61 @@
+"""Allan variances at octaves, and what their covariance is made of."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from gyro_calibration.allan.chart import AllanChart
+from gyro_calibration.allan.covariance import covariance_form
+from gyro_calibration.allan.parts import BEND_PLACE, PARTS, QUANTIZATION
+from gyro_calibration.log import Array
+
+
+@dataclass(frozen=True)
+class Octaves:
+    """
+    Allan variances at octaves with what their covariance is made of; all in samples and in units of their own size.
+
+    Attributes
+    ----------
+    variance : shape (n,)
+    columns : of each part, and of a bend, for a coefficient of 1, shape (n, 6)
+    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5)
+
+    """
+
+    variance: Array
+    columns: Array
+    forms: Array
+
+    @classmethod
+    def of(cls, chart: AllanChart) -> Octaves:
+        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS), -QUANTIZATION.variance(chart.size)])
+        scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
+        forms = _forms(chart.samples, tuple(chart.size.tolist())) * np.outer(scarcity, scarcity)[:, :, None, None]
+        return cls(chart.deviation ** 2, columns, forms)
+
+    def since(self, start: int) -> Octaves:
+        """Leave out the shortest averaging times."""
+        return Octaves(self.variance[start:], self.columns[start:], self.forms[start:, start:])
+
+    def covariance(self, squares: Array) -> Array:
+        """Return the covariance of the variances, shape (n, n), if the squared coefficients are these."""
+        return np.einsum('ijpq,p,q->ij', self.forms, squares[:BEND_PLACE], squares[:BEND_PLACE])
+
+    def model(self, squares: Array) -> Array:
+        """Return the variances that the squared coefficients add up to; above zero, however deep the bend."""
+        return np.maximum(self.columns @ squares, 1e-3 * self.variance)
+
+
+@lru_cache(maxsize=8)
+def _forms(samples: int, sizes: tuple[int, ...]) -> Array:
+    """Return the covariance of Allan variances as a quadratic form of squared coefficients, shape (n, n, 5, 5)."""
+    forms = np.zeros((len(sizes),) * 2 + (len(PARTS),) * 2)
+    for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
+        form = covariance_form(samples, sizes[i], sizes[j])
+        forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
+    return forms

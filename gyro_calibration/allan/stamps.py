@@ -1,0 +1,140 @@
+"""
+Stamps of samples, and the even grid that they belong to.
+
+A gyro samples by its own clock, whatever a host's stamps say: so the samples are numbered, and a straight line through the stamps
+gives the interval. Samples are lost where the stamps stay late after a long step. Where they catch up again, they only came late.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_calibration.allan.angle import LOST_SHARE, Integers
+from gyro_calibration.log import Array, DataRefused
+
+#: Share of intervals below half of the usual one from which on the stamps are taken to come in bursts.
+_BURSTS = 0.02
+
+#: Share of intervals that are alike from which on stamps are not taken to come in bursts.
+_STEADY = 0.9
+
+#: Samples over which delayed stamps catch up again: for single late ones, and for bursts of packets on their way through a host.
+_CATCH_UP, _CATCH_UP_BURSTS = 10, 300
+
+#: Lost samples that can be told from the wander of delayed stamps.
+_SURELY_LOST = 10
+
+#: A gap of more than this part of the record is crossed by no window; a window of more than this part is too long to tell a motion by.
+LONG = 50
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """
+    Stamps on an even grid.
+
+    Attributes
+    ----------
+    time : s, shape (n,)
+    number : of each sample on the grid, shape (n,); long gaps are cut down to `longest_gap`
+    interval : of the grid, s
+    remarks : what was found on the way, one sentence each
+
+    """
+
+    time: Array
+    number: Integers
+    interval: float
+    remarks: tuple[str, ...]
+
+    @property
+    def longest_gap(self) -> int:
+        """Return how many samples of a gap are kept: as no window reaches across them, more would only take memory."""
+        return _longest_gap(self.time)
+
+    def at(self, number: int | np.integer) -> float:
+        """Return the time of a place on the grid, s."""
+        return float(np.interp(number, self.number, self.time))
+
+
+def number_stamps(time: Array) -> Stamps:
+    """
+    Find the even grid that stamps belong to.
+
+    Raises
+    ------
+    DataRefused : there is none
+
+    """
+    steps = np.diff(time)
+    usual = _usual_interval(time, steps)
+    bursts = float((steps < 0.5 * usual).mean()) > _BURSTS
+    lost = _lost_samples(time, steps, usual, bursts)
+    interval, wander = _line(time, _numbers(lost))
+    uneven = not bursts and float((np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
+    if uneven or wander > 0.05 * len(time) * interval:
+        raise DataRefused(f'the stamps belong to no even interval (about {usual:g} s; up to {wander:g} s off); if the samples are even, '
+                          'say with --rate how many there are a second')
+    remarks = [*(_said_of_bursts(interval, wander) if bursts else []), *_said_of_lost(time, lost)]
+    return Stamps(time, _numbers(np.minimum(lost, _longest_gap(time))), interval, tuple(remarks))
+
+
+def _longest_gap(time: Array) -> int:
+    return len(time) // LONG + 1
+
+
+def _usual_interval(time: Array, steps: Array) -> float:
+    """Return the interval as most stretches of 100 samples have it, s."""
+    lag = min(100, len(time) // 4)
+    interval = float(np.median(time[lag:] - time[:-lag])) / lag
+    usual = float(np.median(steps))
+    if not 0.8 < interval / usual < 1.25 and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > _STEADY:
+        raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take {100 * interval:.4g} s: either most samples '
+                          'are lost, or they come in long bursts; say with --rate how many there are a second, or record again')
+    return interval
+
+
+def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> Integers:
+    """Return how many samples are lost in each step: those by which the stamps are late before they have caught up."""
+    lost: Integers = np.zeros(len(steps), dtype=np.int64)
+    shift, done = 0, 0
+    span, least = (_CATCH_UP_BURSTS, _SURELY_LOST) if bursts else (_CATCH_UP, 1)
+    late = (time - time[0]) / interval - np.arange(len(time))
+    for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
+        late[done:step + 1] -= shift
+        done = step + 1
+        missing = round(late[done:done + span].min() - shift - late[max(done - span, 0):done].min())
+        if missing >= least:
+            lost[step] = missing
+            shift += missing
+    return lost
+
+
+def _numbers(lost: Integers) -> Integers:
+    """Return the number of each sample, if so many are lost before each but the first."""
+    return np.arange(len(lost) + 1) + np.cumsum(np.concatenate([[0], lost]))
+
+
+def _line(time: Array, number: Integers) -> tuple[float, float]:
+    """Return the slope of a straight line through the stamps, and how far they are off it at most, s."""
+    slope = float(np.polyfit(number, time - time[0], 1)[0])
+    off = time - time[0] - slope * number
+    return slope, float(np.abs(off - np.median(off)).max())
+
+
+def _said_of_bursts(interval: float, wander: float) -> list[str]:
+    if not wander:
+        return []
+    return [f'The stamps come in bursts or with jitter, up to {wander:.3g} s off an even interval of {1000 * interval:.5g} ms, '
+            'which is used.']
+
+
+def _said_of_lost(time: Array, lost: Integers) -> list[str]:
+    if not lost.any():
+        return []
+    longest, gaps = int(np.argmax(lost)), int(np.count_nonzero(lost))
+    return [f'{lost.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; the longest, of {lost[longest]}, is at '
+            f'{time[longest]:.3f} s. Windows with more than {100 * LOST_SHARE:g} % lost are not used.']
