@@ -3,7 +3,7 @@ How well calibrations predict a measured rate table of an open-loop fibre-optic 
 
     GYRO_CALIBRATION_DATA=FOLDER python benchmarks/rate_table.py
 
-Each is fitted without one sweep and tested on it, for all 24 sweeps; and fitted to the dwells slower than 60 deg/s and tested on the others,
+Each is fitted without one sweep and tested on it, for all 24 sweeps; and fitted to dwells slower than 60 deg/s and tested on the others,
 up to 101 deg/s. The default chooses the effects anew from what it may see. Prints a table in Markdown, root mean squares in deg/s.
 
 """

@@ -216,15 +216,17 @@ def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
 
 
 def _separation(fit: Calibration, swapped: Calibration, rate: float) -> float:
-    """Return by how many standard deviations two fits differ in two dwells each way at a rate."""
-    total = 0.0
-    for way in (rate, -rate):
-        channels = Channels(way, way, fit.model.reference_temperature)
-        difference = fit.model.error(channels) - swapped.model.error(channels)
-        row = np.array([value for term in fit.model.terms for value in term.sensitivity(channels)])
-        uncertain = 0.0 if fit.model.covariance is None else float(row @ fit.model.covariance @ row)
-        total += difference ** 2 / (uncertain + float(np.nanmedian(fit.deviation)) ** 2 / 2.0)
-    return math.sqrt(total)
+    """Return by how many standard deviations two fits differ in a sweep of two dwells each way at a rate."""
+    ways = np.array([rate, rate, -rate, -rate])
+    known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
+    sweep = Dwells(ways, ways, None, np.full(4, np.median(known) if len(known) else np.nan), np.zeros(4, dtype=int), ('',) * 4)
+    channels = Channels(ways, ways, np.full(4, fit.model.reference_temperature))
+    rows = np.column_stack([row for term in fit.terms for row in term.sensitivity(channels)])
+    uncertain = 0.0 if fit.model.covariance is None else rows @ fit.model.covariance @ rows.T
+    shared = fit.scatter.shared(sweep)
+    covariance = uncertain + np.diag(fit.scatter.deviation(sweep) ** 2) + shared @ shared.T
+    difference = np.asarray(fit.model.error(channels) - swapped.model.error(channels))
+    return math.sqrt(float(difference @ np.linalg.solve(covariance, difference)))
 
 
 # reasons
