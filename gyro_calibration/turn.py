@@ -16,9 +16,8 @@ import numpy as np
 
 from gyro_calibration.calibration import Calibration, fit_effects, take
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.dwells import Dwells, Numbers
 from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
-from gyro_calibration.samples import Numbers
 from gyro_calibration.self_calibration import refuse_scale
 
 #: Slower turns take so long that their error says more of the bias than of the gyro's scale; as published.

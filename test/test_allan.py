@@ -5,14 +5,11 @@ Allan deviation, and the noise figures in it, against textbook definitions, simu
 
 import json
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from gyro_calibration import allan
 from gyro_calibration.allan import PARTS, allan_deviation, even_record, fit_noise
 from gyro_calibration.command_line import main
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
@@ -23,15 +20,6 @@ INTERVAL = 0.01
 WHITE = Noise(1e-3)
 FLICKER = Noise(1e-3, 1e-3)
 WALK = Noise(1e-3, 0.0, 5e-4)
-
-
-def test_each_file_imports_only_from_those_before_it_in_the_reading_order():
-    order = re.findall(r'`(\w+)`', allan.__doc__.partition('Reading order')[2])
-    folder = Path(allan.__file__).parent
-    assert sorted(order) == sorted(path.stem for path in folder.glob('*.py') if path.stem != '__init__')
-    for place, name in enumerate(order):
-        used = re.findall(r'gyro_calibration\.allan\.(\w+)', (folder / f'{name}.py').read_text())
-        assert set(used) <= set(order[:place]), (name, used)
 
 
 def textbook(rate, size):

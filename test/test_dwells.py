@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from gyro_calibration.averaging import moderated
 from gyro_calibration.dwells import dwells, find_dwells, from_table, join
+from gyro_calibration.dwells.averaging import moderated
+from gyro_calibration.dwells.samples import code_step
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
 from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.samples import code_step
 
 RATES = (0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1)))
 RUN = turns([(16.0, rate) for rate in RATES])

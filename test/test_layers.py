@@ -4,6 +4,7 @@ The house: imports go in one direction, ROS 2 stays in the nodes, and the core n
 """
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
@@ -57,6 +58,16 @@ def test_a_module_imports_only_what_is_read_before_it(module):
     known |= {'demo', 'picture'} if module == 'verbs' else set()
     paths = files(module)
     assert paths and all(own(imports(path)) <= known for path in paths), [(path.name, own(imports(path)) - known) for path in paths]
+
+
+@pytest.mark.parametrize('folder', ['allan', 'dwells'])
+def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
+    order = re.findall(r'`(\w+)`', importlib.import_module(f'gyro_calibration.{folder}').__doc__.partition('Reading order')[2])
+    inside = f'gyro_calibration.{folder}.'
+    assert sorted(order) == sorted(path.stem for path in files(folder) if path.stem != '__init__')
+    for place, name in enumerate(order):
+        used = {each.removeprefix(inside).split('.')[0] for each in imports(PACKAGE / folder / f'{name}.py') if each.startswith(inside)}
+        assert used <= set(order[:place]), (name, used)
 
 
 def test_files_stands_on_nothing():

@@ -50,7 +50,7 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
     """
     refuse_few(len(output))
     known = np.isfinite(output) if moving is None else np.isfinite(output) & (moving == 0.0)
-    refuse_dead(time, output[known])
+    refuse_dead(time[known], output[known])
     stamps = number_stamps(time)
     rate = np.full(int(stamps.number[-1]) + 1, np.nan)
     rate[stamps.number[known]] = output[known]

@@ -47,7 +47,7 @@ def refuse_motion(rate: Array, stamps: Stamps) -> None:
     moved, worst, over = _motion(rate)
     if not moved.any():
         return
-    first, window = int(np.argmax(moved)), over * (stamps.time[-1] - stamps.time[0]) / stamps.number[-1]
+    first, window = int(np.argmax(moved)), over * stamps.interval
     raise DataRefused(
         f'the gyro was moved, or its output jumped: from {stamps.at(first):.2f} s on means over {window:.3g} s change up to {worst:.0f} '
         f'standard deviations; it is {_longest_rest(moved, stamps)}: use that part, or record again')
