@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.special import digamma, polygamma
 
+from gyro_calibration.dwells.samples import Numbers, Samples, code_step, duration, integral, slope
 from gyro_calibration.log import Array
-from gyro_calibration.samples import Numbers, Samples, code_step, duration, integral, slope
 
 #: A dwell is divided into so many batches, whose scatter gives the deviation of the mean: fewer, where they got shorter than a vibration
 #: of the table, or an answer of the gyro's filter, needs to average out, s.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gyro_calibration.dwells.samples import Numbers, Samples, code_step, inside, length, listed, runs, times
 from gyro_calibration.log import Array, Mask
-from gyro_calibration.samples import Numbers, Samples, code_step, inside, length, listed, runs, times
 
 
 class Cleaned(NamedTuple):

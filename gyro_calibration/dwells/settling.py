@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from gyro_calibration.dwells.samples import Numbers, Samples, duration, integral
+from gyro_calibration.dwells.steadiness import Steadiness
 from gyro_calibration.log import Array
-from gyro_calibration.samples import Numbers, Samples, duration, integral
-from gyro_calibration.steadiness import Steadiness
 
 #: Where more time than this passes between two dwells, what happened there is not the change from one to the other, s.
 _APART = 5.0

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
+from gyro_calibration.dwells.samples import count, runs
 from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.samples import count, runs
 
 
 @dataclass(frozen=True)

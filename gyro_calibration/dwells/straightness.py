@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from gyro_calibration.dwells.samples import Numbers, code_step, duration, length, slope
+from gyro_calibration.dwells.steadiness import Steadiness
 from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.samples import Numbers, code_step, duration, length, slope
-from gyro_calibration.steadiness import Steadiness
 
 #: The heading is looked at in blocks, s.
 _BLOCK = 0.1

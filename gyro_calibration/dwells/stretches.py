@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gyro_calibration.cleaning import clean, left_out
+from gyro_calibration.dwells.cleaning import clean, left_out
+from gyro_calibration.dwells.samples import FEWEST, Numbers, Samples, duration, missing, slope, usable
+from gyro_calibration.dwells.settling import settled
+from gyro_calibration.dwells.steadiness import Steadiness, steady
+from gyro_calibration.dwells.straightness import straight
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
-from gyro_calibration.samples import FEWEST, Numbers, Samples, duration, missing, slope, usable
-from gyro_calibration.settling import settled
-from gyro_calibration.steadiness import Steadiness, steady
-from gyro_calibration.straightness import straight
 
 #: The warming of a dwell is seen between so many parts of it.
 _PARTS = 12

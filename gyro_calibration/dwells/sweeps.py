@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gyro_calibration.dwells.samples import Numbers
 from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.samples import Numbers
 
 #: Sweeps shorter than this on the whole are no sweeps but chance.
 _SHORTEST = 4

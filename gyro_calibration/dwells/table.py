@@ -1,10 +1,4 @@
-"""
-Dwells: stretches of constant rate, each one row of means, out of which a rate table's calibration is made.
-
-A rate table without time holds them already. In a log in time they are found: where the reference is steady, without the ramps and
-the settling after them.
-
-"""
+"""Dwells as a table: the rows of a rate table, or what is found in a log in time."""
 
 from __future__ import annotations
 
@@ -13,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyro_calibration.averaging import averaged
+from gyro_calibration.dwells.averaging import averaged
+from gyro_calibration.dwells.samples import Numbers, listed, output_of
+from gyro_calibration.dwells.steadiness import Steadiness
+from gyro_calibration.dwells.stretches import find_stretches
+from gyro_calibration.dwells.sweeps import numbered, sweeps
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask
-from gyro_calibration.samples import Numbers, listed, output_of
-from gyro_calibration.steadiness import Steadiness
-from gyro_calibration.stretches import find_stretches
-from gyro_calibration.sweeps import numbered, sweeps
 
 
 @dataclass(frozen=True)
