@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gyro_calibration.calibration import fit_effects, take
+from gyro_calibration.calibration import fit_effects
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, from_table
+from gyro_calibration.dwells import Dwells, from_table, take
 from gyro_calibration.effects import (
     BIAS,
     CUBIC_NONLINEARITY,

@@ -34,8 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'gyro_calibration: {error}', file=sys.stderr)
         return WRONG_USE
     if answer is not None:
-        print(json.dumps(answer.data) if given.json else answer.text)
+        _show(json.dumps(answer.data, allow_nan=False) if given.json else answer.text)
     return DONE
+
+
+def _show(text: str) -> None:
+    """Print; a reader that has gone, as `head` does, is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -26,6 +26,8 @@ from gyro_calibration.files import replacing
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
+#: Goes through some items, and may show how far it has come.
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
 Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0

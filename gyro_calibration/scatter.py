@@ -10,13 +10,13 @@ likelihood, so that thirty dwells of one sweep do not count as thirty independen
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
-from gyro_calibration.dwells import Dwells, Numbers
+from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.likelihood import _robust_residual
 from gyro_calibration.log import Array, Mask
 
@@ -74,14 +74,6 @@ def _own_deviation(dwells: Dwells) -> Array:
 def rms(values: Array) -> float:
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(values ** 2)))
-
-
-def take(dwells: Dwells, which: Mask) -> Dwells:
-    """Return some of the dwells, by a mask of shape (n,)."""
-    temperature = None if dwells.temperature is None else dwells.temperature[which]
-    places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
-    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which], temperature=temperature,
-                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places)
 
 
 def parts_of(dwells: Dwells) -> Numbers:

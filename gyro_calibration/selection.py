@@ -27,7 +27,7 @@ from gyro_calibration.effects import (
     Channels,
     Effect,
 )
-from gyro_calibration.log import DataRefused
+from gyro_calibration.log import DataRefused, Progress
 
 #: How often an effect is taken that is not there, in one calibration.
 FALSE_ALARM_RATE = 0.01
@@ -98,7 +98,7 @@ class Selection:
     twins: tuple[Twins, ...]
 
 
-def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
+def select_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter) -> Selection:
     """
     Fit the effects that the dwells support.
 
@@ -106,6 +106,7 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     ----------
     dwells : of a rate table or a log
     technology : one of `TECHNOLOGIES`, what the instrument is; it decides where causes tie
+    progress : is given the effects to go through, such as a progress bar
 
     Raises
     ------
@@ -115,10 +116,11 @@ def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
     candidates = [effect for effect in CATALOGUE.values() if effect not in base.effects]
-    best = _grow(base, candidates, scatter)
+    best = _grow(base, candidates, scatter, progress)
     best = _prune(best, base.effects, len(candidates), scatter)
     best, twins = _part(best, technology, scatter)
-    return Selection(best, tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in CATALOGUE.values()), twins)
+    choices = tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in progress(list(CATALOGUE.values())))
+    return Selection(best, choices, twins)
 
 
 def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
@@ -144,10 +146,11 @@ def _supported(smaller: Calibration, larger: Calibration, tried: int) -> bool:
     return predicts and all(larger.chance_of(effect) < FALSE_ALARM_RATE / tried for effect in added)
 
 
-def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter) -> Calibration:
+def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter, progress: Progress) -> Calibration:
     """Add the effect that predicts left-out sweeps best, again and again."""
     while True:
-        tried = [_try(fit.dwells, _joined(fit.effects, effect), scatter) for effect in candidates if _may_join(effect, fit.effects)]
+        new = [effect for effect in candidates if _may_join(effect, fit.effects)]
+        tried = [_try(fit.dwells, _joined(fit.effects, effect), scatter) for effect in progress(new)]
         better = [each for each in tried if each is not None and _supported(fit, each, len(candidates))]
         if not better:
             return fit

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gyro_calibration.calibration import Calibration, fit_effects, take
+from gyro_calibration.calibration import Calibration, fit_effects
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, Numbers
+from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
 from gyro_calibration.self_calibration import refuse_scale
 

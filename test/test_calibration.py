@@ -15,7 +15,7 @@ from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
 from gyro_calibration.calibration import EffectsNotParted, binned, channels_of, fit_effects
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -29,7 +29,7 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import Scatter, Whitener, find_scatter, take
+from gyro_calibration.scatter import Scatter, Whitener, find_scatter
 
 RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
 Table, LINEAR, CUBIC, SINE, run = (RECOVERY[name] for name in ('Table', 'LINEAR', 'CUBIC', 'SINE', 'run'))

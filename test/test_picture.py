@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gyro_calibration.calibration import fit_effects, take
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.calibration import fit_effects
+from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.log import DEGREE
 from gyro_calibration.picture import draw_error_surface, draw_headings, draw_residuals, draw_turn_errors

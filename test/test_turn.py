@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyro_calibration.calibration import fit_effects, take
+from gyro_calibration.calibration import fit_effects
 from gyro_calibration.command_line import main
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, dwells
+from gyro_calibration.dwells import Dwells, dwells, take
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE, rate_temperature_polynomial
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from gyro_calibration.allan.angle import Integers, Truths, angle_of, lost_before, refuse_few, whole
 from gyro_calibration.allan.freedom import chi_squared_bounds, degrees_of_freedom
-from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.noise import ALLAN_FLOOR
-
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 #: Samples in a block: its few arrays stay in the cache while all averaging times go over it.
 _BLOCK = 16384

@@ -65,6 +65,14 @@ def dwells(log: Log, name: str = '') -> Dwells:
                    remarks=tuple(f'{name}: {remark}' for remark in found.remarks))
 
 
+def take(dwells: Dwells, which: Mask) -> Dwells:
+    """Return some of the dwells, by a mask of shape (n,)."""
+    temperature = None if dwells.temperature is None else dwells.temperature[which]
+    places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
+    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which], temperature=temperature,
+                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places)
+
+
 def join(parts: Sequence[Dwells]) -> Dwells:
     """Return the dwells of several logs as one, their sweeps numbered apart; without temperature where one of them has none."""
     if not parts:

@@ -15,16 +15,14 @@ from scipy.stats import linregress
 from scipy.stats import t as student
 
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import DEGREE, Array, Progress
 from gyro_calibration.motion import CALIBRATION, Motion, from_headings, turns
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Progress,
     Reproduction,
     from_own_figures,
-    unseen,
 )
 from gyro_calibration.self_calibration import fit_rate
 
@@ -50,7 +48,7 @@ ASSUMED = (
 )
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress[int] = unseen) -> Reproduction:
+def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
     """
     Work through the blog.
 

@@ -3,18 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
-
-Item = TypeVar('Item')
-#: Goes through some repetitions, and may show how far it has come.
-Progress = Callable[[Iterable[Item]], Iterable[Item]]
-
-
-def unseen(items: Iterable[Item]) -> Iterable[Item]:
-    """Go through repetitions and show nothing."""
-    return items
+from typing import Any
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,15 @@ import numpy as np
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import Threshold, filter_rates, integrate
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import DEGREE, Array, Progress
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.motion import CALIBRATION, ROBOT, Motion, from_rates
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Progress,
     Reproduction,
     from_own_figures,
-    unseen,
 )
 from gyro_calibration.self_calibration import fit_heading, fit_rate, record
 
@@ -50,7 +48,7 @@ ASSUMED = (
 )
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress[int] = unseen) -> Reproduction:
+def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
     """
     Work through the paper.
 
@@ -304,7 +302,7 @@ def _kept_heading(part: float) -> float:
 
 # how near the estimators come to the bound
 
-def _efficiency(generator: np.random.Generator, runs: int, progress: Progress[int]) -> Contradiction:
+def _efficiency(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
     """Return the scatter of eq. 7 and of the likelihood over the Cramér-Rao bound, in white noise and with an exact heading."""
     white, found = Noise(XV3500.noise.angle_random_walk), []
     for _ in progress(range(runs)):

@@ -23,16 +23,14 @@ from gyro_calibration.effects import (
     Effect,
     rate_temperature_polynomial,
 )
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import DEGREE, Array, Progress
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Progress,
     Reproduction,
     from_own_figures,
-    unseen,
 )
 
 TITLE = 'Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for mobile robot navigation, ICRA 2000'
@@ -67,7 +65,7 @@ def rd2100(sagnac: float = SAGNAC) -> GyroModel:
     return GyroModel(terms, noise=Noise(ANGLE_RANDOM_WALK * DEGREE / 3600.0, STABILITY * DEGREE))
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress[int] = unseen) -> Reproduction:
+def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
     """
     Work through the paper.
 
@@ -290,7 +288,7 @@ def extrapolation(sagnac: float, generator: np.random.Generator) -> tuple[float,
     return polynomial, sine
 
 
-def _sine(generator: np.random.Generator, runs: int, progress: Progress[int]) -> Contradiction:
+def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
     found = [[extrapolation(sagnac, generator) for sagnac in (SAGNAC, STRONG_SAGNAC)] for _ in progress(range(runs))]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
     return Contradiction({'k': SAGNAC, 'weak': weak, 'weak_sine': weak_sine, 'strong_k': STRONG_SAGNAC, 'strong': strong,

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from gyro_calibration.allan import AllanChart, Figure, NoiseFit, Record, allan_deviation, even_record, fit_noise
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.picture import draw_allan
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, output_of, picture_file, read, time_of, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, time_of, verb
 
 #: Symbol -> unit that people use, and how many of it are one in SI.
 UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE), 'K': ('deg/h/√h', 216000.0 / DEGREE),
@@ -38,7 +37,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model) if given.model else GyroModel(), read(given)
     try:
         record = even_record(time_of(given, log), output_of(given, log), log.moving)
-        chart = allan_deviation(record.rate, record.interval, progress=_bar)
+        chart = allan_deviation(record.rate, record.interval, progress=partial(bar, what='Allan deviation'))
         fit = fit_noise(record.rate, record.interval)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
@@ -53,11 +52,6 @@ def _check(given: argparse.Namespace) -> None:
     """Refuse what cannot work before the work is done."""
     if given.model and not given.out:
         raise UsageError('--model says which model the figures are put in; say with --out where to write it')
-
-
-def _bar(blocks: Iterable[Any]) -> Iterable[Any]:
-    """Show on a terminal how far the work is, if it takes longer than two seconds."""
-    return tqdm(blocks, desc='Allan deviation', unit='block', delay=2.0, leave=False, disable=None)
 
 
 def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:

@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,12 @@ import numpy as np
 
 from gyro_calibration import __version__, picture
 from gyro_calibration.calibration import fit_effects
-from gyro_calibration.dwells import dwells, join
+from gyro_calibration.dwells import Dwells, dwells, join, take
 from gyro_calibration.effects import CATALOGUE, Effect, rate_temperature_polynomial
 from gyro_calibration.encoder import EncoderCalibration, calibrate_encoder
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import write_model
-from gyro_calibration.scatter import take
 from gyro_calibration.selection import TECHNOLOGIES, Selection, select_effects
 from gyro_calibration.verbs.fit_answer import (
     bin_lines,
@@ -37,7 +37,7 @@ from gyro_calibration.verbs.fit_answer import (
     value_data,
     value_lines,
 )
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, picture_file, read, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, picture_file, read, verb
 
 METHODS = ('dwells', 'likelihood', 'rate')
 
@@ -115,7 +115,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
     table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '') for path, log in logs.items()])
     effects = given.effects or given.polynomial
-    selection = Selection(fit_effects(table, effects), (), ()) if effects else select_effects(table, given.technology)
+    selection = Selection(fit_effects(table, effects), (), ()) if effects else _selected(table, given.technology)
     fit = selection.calibration
     model = _written(given, fit.model)
     if given.picture:
@@ -129,6 +129,10 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
+
+
+def _selected(table: Dwells, technology: str | None) -> Selection:
+    return select_effects(table, technology, progress=partial(bar, what='effects'))
 
 
 # a reference heading

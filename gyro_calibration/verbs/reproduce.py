@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import textwrap
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from gyro_calibration.reproduction import SOURCES
-from gyro_calibration.reproduction.finding import Comparison, Item, Reproduction
-from gyro_calibration.verbs.verb import Answer, verb
+from gyro_calibration.reproduction.finding import Comparison, Reproduction
+from gyro_calibration.verbs.verb import Answer, bar, verb
 
 HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
@@ -28,15 +27,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _reproduce(given: argparse.Namespace) -> Answer:
     """Give every source a generator of its own, so that it says the same alone and with the others."""
     names = [given.source] if given.source else list(SOURCES)
-    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=_bar(name)) for name in names}
+    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=partial(bar, what=name)) for name in names}
     text = '\n\n'.join(page(reproduction) for reproduction in found.values())
     return Answer(text, {'seed': given.seed, 'sources': {name: reproduction.data() for name, reproduction in found.items()}})
-
-
-def _bar(name: str) -> Any:
-    def bar(items: Iterable[Item]) -> Iterable[Item]:
-        return tqdm(items, desc=name, unit='run', file=sys.stderr, disable=None, leave=False)  # None: only on a terminal
-    return bar
 
 
 def page(reproduction: Reproduction) -> str:

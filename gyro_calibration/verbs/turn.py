@@ -13,9 +13,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gyro_calibration.calibration import take
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, dwells
+from gyro_calibration.dwells import Dwells, dwells, take
 from gyro_calibration.files import write_atomically
 from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.model import GyroModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,11 +67,16 @@ def read(given: argparse.Namespace) -> Log:
     return _turned(given, read_log(given.log, _sensitivity(given), given.rate))
 
 
+def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
+    """Show on a terminal how far the work on some items is, if it takes longer than two seconds."""
+    return tqdm(items, desc=what, delay=2.0, leave=False, disable=None)
+
+
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log that a verb was given block by block, with a bar that shows how far it is."""
     size = Path(given.log).stat().st_size if Path(given.log).is_file() else None
-    with tqdm(total=size, desc=given.log, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as bar:
-        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=lambda place: bar.update(place - bar.n)):
+    with tqdm(total=size, desc=given.log, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
+        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=lambda place: shown.update(place - shown.n)):
             yield _turned(given, log)
 
 
