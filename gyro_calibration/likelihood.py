@@ -76,7 +76,7 @@ class _Increments:
     ----------
     columns : reference increments, rad; intervals, s; what a time offset adds, rad/s; what a lag adds, rad/s²; what errors that several
         points share add, rad; shape (n, 4 + k)
-    prior : standard deviations that are known of the values beforehand, shape (4 + k,)
+    prior, expected : standard deviations that are known of the values beforehand, and around what, shape (4 + k,)
     turned : increments of the gyro's integral, rad, shape (n,)
     walk, neighbours : variance of the increments of a random walk, and covariance of each with the one before, s, shape (n,)
     reference : variance of the reference in each block, up to one factor, shape (n + 1,)
@@ -86,6 +86,7 @@ class _Increments:
 
     columns: Array
     prior: Array
+    expected: Array
     turned: Array
     walk: Array
     neighbours: Array
@@ -98,7 +99,7 @@ _BLOCK = 0.5
 
 
 class _Pairing:
-    """A run and a motion, brought together at any time offset."""
+    """A run and a motion, brought together at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
         self._time, self._rate = time, rate
@@ -108,29 +109,39 @@ class _Pairing:
         self._block = _block(motion)
         self._points = _points(motion, self._block)
 
-    def increments(self, offset: float) -> _Increments:
-        """Return the increments if the gyro is `offset` s late."""
-        points = self._points
-        kept = (points.time + offset >= self._time[0]) & (points.time + offset <= self._time[-1])
+    def increments(self, offset: float, lag: float = 0.0) -> _Increments:
+        """
+        Return the increments if the gyro is `offset` s late, part of it by a first-order lag, whose time constant has the square 2 `lag`.
+
+        What follows by such a lag, plus its rate times the constant, is what it follows, a delay apart.
+
+        """
+        points, constant = self._points, math.sqrt(2.0 * lag)
+        at = points.time + offset - constant
+        kept = (at >= self._time[0]) & (at <= self._time[-1])
         time, weight = points.time[kept], 1.0 / points.variance[kept]
         if len(time) < 2:
-            return _Increments(np.empty((0, 4)), self._prior, *np.empty((5, 0)))
+            return _Increments(np.empty((0, 4)), *np.empty((7, 0)))
         begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block + 1e-6), prepend=-1.0))
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
-        known = np.column_stack([points.heading[kept], time, *self._heard(time + offset), points.shared[kept]])
+        known = np.column_stack([points.heading[kept], time, *self._heard(at[kept], constant), points.shared[kept]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
         prior = np.append(self._prior, np.full(points.shared.shape[1], points.shared_deviation))
-        return _Increments(columns, prior, np.diff(means[:, 4]), *_random_walk(time, weight, begins), 1.0 / precision, means[:, 1])
+        expected = np.zeros(len(prior))
+        expected[3] = -lag
+        walk = _random_walk(time, weight, begins)
+        return _Increments(columns, prior, expected, np.diff(means[:, 4]), *walk, 1.0 / precision, means[:, 1])
 
-    def _heard(self, at: Array) -> tuple[Array, Array, Array]:
-        """Return rate, acceleration and integral of the rate that is linear between the samples."""
+    def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
+        """Return rate, acceleration and integral of the rate that is linear between the samples, the first and last without the lag."""
         rate, half = np.interp(at, self._time, self._rate), 0.5 * self._interval
         later, earlier = (np.interp(at + shift, self._time, self._rate) for shift in (half, -half))
         index = np.clip(np.searchsorted(self._time, at, side='right') - 1, 0, len(self._time) - 1)
         integral = self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
-        return rate, (later - earlier) / self._interval, integral
+        acceleration = (later - earlier) / self._interval
+        return rate + constant * acceleration, acceleration, integral + constant * rate
 
     def coarse_offset(self, largest: float) -> float:
         """Return the offset, s, at which most increments fit; a slip does not count more than the blocks that it is in."""
@@ -308,7 +319,7 @@ def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Esti
     rate_variance = 0.0
     for _ in range(3):
         regular = matrix + np.diag(rate_variance / data.prior ** 2)
-        values = np.linalg.lstsq(regular, vector, rcond=1e-14)[0]
+        values = np.linalg.lstsq(regular, vector + rate_variance * data.expected / data.prior ** 2, rcond=1e-14)[0]
         residual = data.turned - data.columns @ values
         rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
     inverse = np.linalg.pinv(regular, rcond=1e-14)
@@ -352,8 +363,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     ratio of the two is found by restricted likelihood. A heading that was measured is smoothed by what the gyro says before it serves as
     the regressor, which makes this the errors-in-variables likelihood.
 
-    A robot follows its profile late and smoothly, so delay and lag are fitted too, the lag to second order: left out, a first-order lag
-    of 0.2 s costs 0.9 % of scale.
+    A robot follows its profile late and smoothly, so delay and lag are fitted too: left out, a first-order lag of 0.2 s costs 0.9 % of
+    scale. The lag is of first order against a profile of rates, which a robot only follows; against headings, which were measured on the
+    robot itself, it is small and taken to second order.
 
     Parameters
     ----------
@@ -369,19 +381,20 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
 
     """
     pairing = _Pairing(time, rate, motion, lag)
-    offset = pairing.coarse_offset(largest_time_offset)
-    for _ in range(6):
-        data = pairing.increments(offset)
+    offset, found_lag = pairing.coarse_offset(largest_time_offset), 0.0
+    for _ in range(8):
+        data = pairing.increments(offset, found_lag)
         if len(data.turned) < 10:
             raise DataRefused('the samples cover less than ten blocks of the profile: record the whole motion')
         estimates, weights = _estimates(data)
         estimate = estimates[weights.argmax()]
         if pairing.sampled:
             estimate = _errors_in_variables(data, estimate)
-        step = float(np.clip(estimate.values[2], -0.02, 0.02))
-        if abs(step) < 1e-9:
+        late = float(np.clip(estimate.values[2], -0.02, 0.02))
+        lagging = 0.0 if pairing.sampled else max(float(estimate.values[3]), -found_lag)
+        if abs(late) < 1e-9 and abs(lagging) < 1e-9:
             break
-        offset -= step
+        offset, found_lag = offset - late, found_lag + lagging
     covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
     scale, bias = estimate.values[:2]
