@@ -6,6 +6,7 @@ Compare the three methods of self-calibration on simulated runs; the numbers are
 """
 
 import sys
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -24,10 +25,16 @@ TIME = np.arange(2001) / 100.0
 LAG = 0.2  # s
 
 
-def encoder() -> Motion:
-    """Return the motion as an encoder with steps of 0.5 deg sees it at 20 Hz."""
-    time = np.arange(401) / 20.0
-    return from_headings(time, np.round(CALIBRATION.heading_at(time) / DEGREE * 2.0) / 2.0 * DEGREE)
+def encoder(number: int) -> Motion:
+    """Return the motion as an encoder with steps of 0.5 deg sees it at 20 Hz, which begins elsewhere in a step in each run."""
+    time, step = np.arange(401) / 20.0, 0.5 * DEGREE
+    begin = np.random.default_rng([number, 1]).uniform(0.0, step)
+    return from_headings(time, np.round((CALIBRATION.heading_at(time) + begin) / step) * step)
+
+
+def profile(_: int) -> Motion:
+    """Return the profile, which is the same in each run."""
+    return CALIBRATION
 
 
 def lagging() -> Array:
@@ -36,24 +43,24 @@ def lagging() -> Array:
     return lfilter([1.0 - kept], [1.0, -kept], CALIBRATION.rate_at(TIME))
 
 
-def errors(true_rate: Array, reference: Motion, runs: int) -> dict[str, Array]:
-    """Return the errors of s and b of each method, shape (runs, 2)."""
+def errors(true_rate: Array, reference: Callable[[int], Motion], runs: int) -> dict[str, Array]:
+    """Return the errors of s and b of each method, shape (runs, 2), against the reference of each run."""
     found = {name: np.empty((runs, 2)) for name in METHODS}
     for number in range(runs):
         noise = simulate_noise(GYRO.noise, len(TIME), 0.01, np.random.default_rng(number))
         output = GYRO.output(true_rate, 25.0) + noise
         for name, method in METHODS.items():
-            fit = method(TIME, output, reference)
+            fit = method(TIME, output, reference(number))
             found[name][number] = fit.scale_factor_error, fit.bias
     return {name: values - TRUE for name, values in found.items()}
 
 
 def main(runs='200'):
     cases = {
-        'as the profile says': (CALIBRATION.rate_at(TIME), CALIBRATION),
-        'gyro 50 ms late': (CALIBRATION.rate_at(TIME - 0.05), CALIBRATION),
-        f'robot lags by {LAG} s': (lagging(), CALIBRATION),
-        'encoder, 0.5 deg, 20 Hz': (CALIBRATION.rate_at(TIME), encoder()),
+        'as the profile says': (CALIBRATION.rate_at(TIME), profile),
+        'gyro 50 ms late': (CALIBRATION.rate_at(TIME - 0.05), profile),
+        f'robot lags by {LAG} s': (lagging(), profile),
+        'encoder, 0.5 deg, 20 Hz': (CALIBRATION.rate_at(TIME), encoder),
     }
     print('| run | method | rms error of s | rms error of b |\n|---|---|---|---|')
     for case, (rate, reference) in cases.items():
