@@ -244,6 +244,16 @@ def test_pure_integration_errs_by_s_and_b_alone():
     assert ours('hong_park', 'mean error, pure integration').ours == pytest.approx(np.abs(error).mean(), rel=0.1)
 
 
+def test_calibration_and_filter_take_off_the_heading_error_what_the_first_page_says():
+    text = (Path(__file__).parents[1] / 'README.md').read_text()
+    for row, name in (('self-calibration', 'self-calibration by likelihood'),
+                      ('threshold filter, single samples, as published', 'threshold filter, single samples'),
+                      ('threshold filter, mean of 0.2 s', 'threshold filter, mean of 0.2 s'),
+                      ('both, single samples, as published', 'likelihood and filter, single samples'),
+                      ('both, mean of 0.2 s', 'likelihood and filter, mean of 0.2 s')):
+        assert f'| {row} | {ours("hong_park", f"off pure integration, {name}").ours:.0f} % |' in text
+
+
 def test_the_percentages_of_table_1_are_those_of_its_means():
     for name in ('self-calibration by likelihood', 'threshold filter, single samples', 'likelihood and filter, mean of 0.2 s'):
         part = ours('hong_park', f'mean error, {name}').ours / ours('hong_park', 'mean error, pure integration').ours
