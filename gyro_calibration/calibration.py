@@ -91,10 +91,10 @@ class Calibration:
 
     def chance_of(self, effect: Effect) -> float:
         """Return how likely the dwells would show as much of an effect, either way, where there is nothing of it."""
-        if not self.freedom:
-            return 1.0
         used = take(self.dwells, self.scatter.kept)
         term = next(each for each in self.terms if each.effect is effect)
+        if not self.freedom or not np.any(term.error(channels_of(used))):
+            return 1.0
         others = [each for each in self.terms if each is not term]
         # What it adds as a whole, not its derivative by a shape: near nothing, that of a sine's is nothing too.
         columns = [*columns_of(used, others).T, term.error(channels_of(used))] if others else [term.error(channels_of(used))]

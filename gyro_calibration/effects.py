@@ -188,7 +188,9 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
 
     def scaled(channels: Channels, output_centre: float, output_scale: float, temperature_centre: float,
                temperature_scale: float) -> tuple[Number, Number]:
-        return (channels.output - output_centre) / output_scale, (channels.temperature - temperature_centre) / temperature_scale
+        output = (channels.output - output_centre) / output_scale
+        # Of order 0, it does not look at the temperature, which need not be known.
+        return output, (channels.temperature - temperature_centre) / temperature_scale if temperature_order else 0.0 * output
 
     def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
         output, temperature = scaled(channels, *shapes)
@@ -205,7 +207,8 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
         frozenset({'output', 'temperature'} if temperature_order else {'output'}),
         tuple(Parameter(name, 'rad/s') for name in names), columns,
         (Parameter('output_centre', 'rad/s', 0.0), Parameter('output_scale', 'rad/s', 1.0, (1e-9, np.inf)),
-         Parameter('temperature_centre', 'degC', 0.0), Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))), nested=nested)
+         Parameter('temperature_centre', 'degC', 0.0), Parameter('temperature_scale', 'K', 1.0, (1e-9, np.inf))),
+        'turn at more rates, at more temperatures, or take lower orders', nested)
 
 
 def _powers(value: Number, order: int) -> list[Number]:

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
@@ -138,8 +139,8 @@ def find_scatter(dwells: Dwells) -> Scatter:
         return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)  # type: ignore[misc]
 
     best = minimize(lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
-                    np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='Nelder-Mead', bounds=[(-7.0, 2.0)] * len(units),
-                    options={'xatol': 0.02, 'fatol': 0.01})
+                    np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B', bounds=[(-7.0, 2.0)] * len(units),
+                    options={'eps': 1e-4, 'ftol': 1e-7})  # a simplex falls flat on a bound, and stays there
     return scatter(best.x)
 
 
@@ -176,9 +177,10 @@ def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, colum
     deviation = scatter.deviation(dwells)
     sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
     (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
-    factor = np.linalg.cholesky(gram)
-    log_determinant = float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
-    return -0.5 * (log_determinant + 2.0 * float(np.log(np.diag(factor)[:-1]).sum()) + float(factor[-1, -1]) ** 2)
+    factor = np.linalg.cholesky(gram[:-1, :-1])
+    explained = solve_triangular(factor, gram[:-1, -1], lower=True)
+    log_determinant = float(of_sweeps) + 2.0 * float(np.log(deviation).sum()) + 2.0 * float(np.log(np.diag(factor)).sum())
+    return -0.5 * (log_determinant + float(gram[-1, -1] - explained @ explained))
 
 
 @dataclass(frozen=True)
@@ -319,7 +321,7 @@ def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array
     gram, log_determinant = sums.reduced(sizes)
     inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
     values = np.einsum('kij,kj->ki', inverse, right)
-    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right), 1e-12 * sums.gram[-1, -1]) + 1e-300
+    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right), 1e-12 * sums.gram[-1, -1]) + 1e-200
     logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
     return logarithm, values, inverse * (misfit / freedom)[:, None, None]
 

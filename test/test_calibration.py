@@ -29,7 +29,7 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import Scatter, Whitener, find_scatter
+from gyro_calibration.scatter import Scatter, Whitener, _restricted_likelihood, _surface, find_scatter
 
 RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
 Table, LINEAR, CUBIC, SINE, run = (RECOVERY[name] for name in ('Table', 'LINEAR', 'CUBIC', 'SINE', 'run'))
@@ -160,6 +160,27 @@ def test_the_scatter_of_sweeps_is_found():
     assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
 
+@pytest.mark.parametrize('sweeps, rates', [(1, 41), (8, 21), (24, 60)])
+def test_the_scatter_that_is_found_is_likelier_than_the_true_one(sweeps, rates):
+    for seed in range(5):
+        shape = Table(sweeps=sweeps, rates=rates)
+        table = shape.measure(GyroModel(SINE), np.random.default_rng(seed))
+        found = find_scatter(table)
+        used = take(table, found.kept)
+        surface, error = _surface(used), used.output - used.rate
+        error = error - surface @ (surface.T @ error)
+        true = Scatter(shape.dwell, 0.0, 0.0, 0.0, found.kept)
+        best, as_simulated = (_restricted_likelihood(used, each, error, surface) for each in (found, true))
+        assert best > as_simulated - 0.01
+
+
+@pytest.mark.parametrize('rates', [[0.0, 0.2], np.zeros(30), np.linspace(-0.3, 0.3, 41)])
+def test_a_table_without_any_error_is_fitted(rates):
+    fit = fit_effects(dwells(rates, 0.0), [BIAS])
+    assert fit.model.terms[0].values[0] == pytest.approx(0.0, abs=1e-15)
+    assert fit.chance_of(BIAS) == 1.0
+
+
 def test_whitening_is_by_the_whole_covariance():
     table = measured(SINE, sweeps=5, rates=6)
     scatter = Scatter(1e-3, 2e-3, 3e-3, 4e-3, np.ones(len(table), bool))
@@ -233,6 +254,17 @@ def test_two_temperatures_give_no_curve_over_temperature():
     with pytest.raises(EffectsNotParted, match='three temperatures') as refused:
         fit_effects(table, (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC))
     assert {'bias', 'bias_temperature_quadratic'} <= set(refused.value.effects)
+
+
+def test_a_polynomial_over_the_output_alone_needs_no_temperature():
+    table = measured(SINE)
+    fit = fit_effects(replace(table, temperature=None), [rate_temperature_polynomial(3, 0)])
+    assert fit.residual == pytest.approx(fit_effects(table, [rate_temperature_polynomial(3, 0)]).residual, abs=0.1 * fit.residual_rms)
+
+
+def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
+    with pytest.raises(EffectsNotParted, match=r'cannot be determined from these dwells; \w'):
+        fit_effects(dwells(np.repeat([-1.0, 0.0, 1.0], 8), 0.0), [rate_temperature_polynomial(4, 0)])
 
 
 def test_fewer_dwells_than_values_are_refused():
