@@ -163,13 +163,13 @@ def test_the_scatter_of_sweeps_is_found():
 @pytest.mark.parametrize('sweeps, rates', [(1, 41), (8, 21), (24, 60)])
 def test_the_scatter_that_is_found_is_likelier_than_the_true_one(sweeps, rates):
     for seed in range(5):
-        shape = Table(sweeps=sweeps, rates=rates)
+        shape = Table(sweeps=sweeps, rates=rates, fastest=200.0 * DEGREE, dwell=0.01 * DEGREE, dwell_scale=7e-4)
         table = shape.measure(GyroModel(SINE), np.random.default_rng(seed))
         found = find_scatter(table)
         used = take(table, found.kept)
         surface, error = _surface(used), used.output - used.rate
         error = error - surface @ (surface.T @ error)
-        true = Scatter(shape.dwell, 0.0, 0.0, 0.0, found.kept)
+        true = Scatter(shape.dwell, shape.dwell_scale, 0.0, 0.0, found.kept)
         best, as_simulated = (_restricted_likelihood(used, each, error, surface) for each in (found, true))
         assert best > as_simulated - 0.01
 

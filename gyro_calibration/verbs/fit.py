@@ -37,7 +37,7 @@ from gyro_calibration.verbs.fit_answer import (
     value_data,
     value_lines,
 )
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, picture_file, read, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, verb
 
 METHODS = ('dwells', 'likelihood', 'rate')
 
@@ -81,10 +81,16 @@ def _orders(text: str) -> list[Effect]:
 
 
 def _fit(given: argparse.Namespace) -> Answer:
-    logs = {path: read(argparse.Namespace(**{**vars(given), 'log': path})) for path in given.log}
+    logs = dict(_read(argparse.Namespace(**{**vars(given), 'log': path})) for path in given.log)
     if _method(given, logs) == 'dwells':
         return _fit_dwells(given, logs)
     return _fit_heading(given, logs)
+
+
+def _read(given: argparse.Namespace) -> tuple[str, Log]:
+    log = read(given)
+    output_of(given, log)
+    return given.log, log
 
 
 def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:

@@ -137,7 +137,8 @@ def dwell_lines(fit: Calibration) -> Iterator[str]:
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
     temperatures = '' if table.temperature is None else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC'
-    yield f'{len(table)} dwells in {len(np.unique(table.sweep))} sweeps, {slowest:.1f} to {fastest:.1f} deg/s{temperatures}.'
+    sweeps = len(np.unique(table.sweep))
+    yield f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, {slowest:.1f} to {fastest:.1f} deg/s{temperatures}.'
     outlying = np.flatnonzero(~fit.scatter.kept)
     if len(outlying):
         named = ', '.join(f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)' for row in outlying[:5])
