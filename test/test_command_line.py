@@ -194,3 +194,10 @@ def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run
     (tmp_path / 'lost.csv').write_text('\n'.join(','.join(row) for row in [header, *rows]) + '\n')
     answer = json.loads(run('self-calibrate', tmp_path / 'lost.csv', '--json')[1])
     assert answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6) and abs(answer['time_offset_s']) < 1e-3
+
+
+@pytest.mark.parametrize('words', [('reproduce', 'ojeda'), ('simulate', '--model', 'm.yaml', '--motion', 'rest', '--out', 'o.csv')])
+def test_a_seed_below_zero_is_wrong_use(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*words, '--seed', '-1'])
+    assert end.value.code == 2 and '-1 is below 0' in capsys.readouterr().err

@@ -7,13 +7,13 @@ import secrets
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.verbs.verb import Answer, UsageError, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, verb, whole
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'demo', _demo, 'emulated gyro, driver, compensation, self-calibration and a drive, on this machine', '--out demo')
     parser.add_argument('--out', default='demo', metavar='DIR', help='where picture, table and log go; default: %(default)s')
-    parser.add_argument('--seed', type=int, help='of the noise; default: another one each time')
+    parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
     return parser
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gyro_calibration.reproduction import SOURCES
 from gyro_calibration.reproduction.finding import Comparison, Reproduction
-from gyro_calibration.verbs.verb import Answer, bar, verb
+from gyro_calibration.verbs.verb import Answer, bar, verb, whole
 
 HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
@@ -20,7 +20,7 @@ HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'reproduce', _reproduce, "the sources' numbers beside ours, with a verdict on each", 'hong_park')
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE', help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=int, default=0, help='of the noise; default: 0, as in docs/reproduction.md')
+    parser.add_argument('--seed', type=whole, default=0, help='of the noise; default: 0, as in docs/reproduction.md')
     return parser
 
 

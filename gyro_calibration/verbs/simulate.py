@@ -14,14 +14,14 @@ from gyro_calibration.log import Log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import NAMED, read_motion
 from gyro_calibration.simulation import simulate
-from gyro_calibration.verbs.verb import Answer, UsageError, positive, time_of, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, positive, time_of, verb, whole
 
 
 def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
     parser.add_argument('--motion', metavar='FILE|NAME', help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
     parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ', help='default: 100')
     parser.add_argument('--temperature', type=float, metavar='DEGC', help='default: the reference temperature of the model')
-    parser.add_argument('--seed', type=int, help='of the noise; default: another one each time')
+    parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:

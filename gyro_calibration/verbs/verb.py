@@ -53,6 +53,14 @@ def not_negative(text: str) -> float:
     return 0.0 if float(text) == 0.0 else positive(text)
 
 
+def whole(text: str) -> int:
+    """Return a seed, as a numpy Generator takes it."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f'{text} is below 0; a seed is a whole number from 0 on')
+    return value
+
+
 def picture_file(text: str) -> str:
     """Return the name of a picture to draw, if one can be drawn."""
     if not text.endswith(('.png', '.svg')):
