@@ -26,7 +26,7 @@ OUTLYING = 6.0
 #: With a smaller spread, K, a sensor's own error looks like a change of temperature.
 SMALLEST_TEMPERATURE_SPREAD = 1.0
 #: With fewer, what the dwells of a sweep have in common cannot be told from chance.
-_FEWEST_SWEEPS = 4
+FEWEST_SWEEPS = 4
 #: So many blocks stand for sweeps where there are fewer.
 _MOST_BLOCKS = 60
 #: With fewer, an outlying dwell cannot be told from a gyro that is not linear.
@@ -86,7 +86,7 @@ def parts_of(dwells: Dwells) -> Numbers:
 
     """
     parts = np.unique(dwells.sweep, return_inverse=True)[1]
-    return parts if parts.max() + 1 >= _FEWEST_SWEEPS else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells)
+    return parts if parts.max() + 1 >= FEWEST_SWEEPS else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells)
 
 
 def summed(values: Array, parts: Numbers) -> Array:
@@ -148,7 +148,7 @@ def _sought(dwells: Dwells) -> int:
     """Return how many of the four scatters so many dwells and sweeps can show."""
     if len(dwells) < _FEWEST_DWELLS:
         return 1
-    return 4 if len(np.unique(dwells.sweep)) >= _FEWEST_SWEEPS else 2
+    return 4 if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 2
 
 
 def not_outlying(dwells: Dwells) -> Mask:

@@ -34,7 +34,8 @@ def leave_out_wild_samples(rate: Array, stamps: Stamps) -> list[str]:
     if not wild.size or wild.size > 0.001 * len(rate):
         return []
     rate[wild] = np.nan
-    return [f'{wild.size} samples far beyond the noise are left out, the first at {stamps.at(wild[0]):.3f} s.']
+    first = stamps.at(wild[0])
+    return [f'Far beyond the noise, and left out: {wild.size} single sample{"s" * (wild.size > 1)}, the first at {first:.3f} s.']
 
 
 def _scale(size: Array) -> float:

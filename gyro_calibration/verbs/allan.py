@@ -66,7 +66,7 @@ def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: No
 
 def _line(symbol: str, figure: Figure) -> str:
     unit, factor = UNITS[symbol]
-    name = 'Flicker, what of B the others do not explain' if symbol == 'B' else f'{_words(figure).capitalize()} {symbol}'
+    name = 'Flicker, in a fit of all parts together' if symbol == 'B' else f'{_words(figure).capitalize()} {symbol}'
     if not figure.value:
         return f'{name}: not seen; below {figure.upper * factor:.3g} {unit} ({figure.upper:.3g} {figure.part.unit}).'
     return (f'{name}: {figure.value * factor:.4g} {unit}, 95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '

@@ -15,8 +15,11 @@ from gyro_calibration.encoder import EncoderCalibration
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import POLYNOMIAL
+from gyro_calibration.scatter import FEWEST_SWEEPS
 from gyro_calibration.selection import Choice, Selection, Twins
 
+#: A heading that is further off after calibration, rad, is worth a word.
+_MUCH_LEFT = 5.0 * DEGREE
 #: Lines for people are not longer.
 _WIDTH = 120
 #: What people read instead of the unit of the file, and the factor to it.
@@ -149,12 +152,14 @@ def dwell_lines(fit: Calibration) -> Iterator[str]:
 
 def quality_lines(fit: Calibration) -> Iterator[str]:
     """Say how large the errors are, and what to mistrust."""
-    scatter = fit.scatter
+    scatter, several = fit.scatter, len(np.unique(fit.dwells.sweep)) >= FEWEST_SWEEPS
+    part = 'sweeps' if several else 'blocks of time'
     yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, {fit.residual_rms / DEGREE:.4f} after; '
-           + (f'{fit.left_out_rms / DEGREE:.4f} in sweeps that were left out.' if math.isfinite(fit.left_out_rms)
-              else 'some values show in one sweep only, which cannot be left out.'))
-    yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s and {100.0 * scatter.dwell_scale:.3f} % of the rate, sweeps '
-                   f'by {scatter.sweep_bias / DEGREE:.4f} deg/s and {100.0 * scatter.sweep_scale:.3f} %. '
+           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} that were left out.' if math.isfinite(fit.left_out_rms)
+              else f'some values show in one of the {part} only, which cannot be left out.'))
+    wander = f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s and {100.0 * scatter.sweep_scale:.3f} %' if several \
+        else f'how sweeps scatter takes at least {FEWEST_SWEEPS} of them'
+    yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
                    f'Condition number {fit.condition:.1f}.')
     yield from map(_wrapped, _warnings(fit))
 
@@ -218,3 +223,6 @@ def heading_lines(found: EncoderCalibration) -> Iterator[str]:
         yield f'The gyro lags the reference by {1000.0 * found.fit.time_offset:.1f} ms; that is taken out.'
     for name, residual in (('before', found.before), ('after', found.after)):
         yield f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, {residual.largest / DEGREE:.3f} deg at most.'
+    if found.after.rms > _MUCH_LEFT:
+        yield _wrapped('That is much. If the gyro is not linear, or changes with temperature, --method dwells finds the effects, provided '
+                       'that the log has stretches of steady rate.')
