@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import Channels, Effect, Parameter
 from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel, Term
@@ -26,7 +26,6 @@ from gyro_calibration.scatter import (
     parts_of,
     rms,
     summed,
-    take,
 )
 
 #: Beyond this condition number of the columns, each of length one, the data do not part the effects.

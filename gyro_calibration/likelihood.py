@@ -152,7 +152,7 @@ class _Pairing:
         data = self.increments(offset)
         if len(data.turned) < 10:
             return math.inf
-        return float(np.mean(np.abs(_robust_residual(data.columns[:, :2], data.turned, 3))))
+        return float(np.mean(np.abs(robust_residual(data.columns[:, :2], data.turned, 3))))
 
 
 def _block(motion: Motion) -> float:
@@ -246,7 +246,7 @@ def _random_walk(time: Array, weight: Array, begins: NDArray[np.intp]) -> tuple[
     return before[:-1] + gap[:-1] + after[1:], both[:-1]
 
 
-def _robust_residual(columns: Array, turned: Array, passes: int) -> Array:
+def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
     """Return what is left of a fit in which large residuals count by their size, not by its square (Huber)."""
     weights = np.ones(len(turned))
     for _ in range(passes):
@@ -410,7 +410,7 @@ def _worst_stretch(noise: _Covariance, data: _Increments) -> tuple[float, float]
     All stretches of a few lengths are looked at. Fit and scale are robust, so that a slip does not hide itself.
 
     """
-    residual = _robust_residual(data.columns[:, :4], data.turned, 20)
+    residual = robust_residual(data.columns[:, :4], data.turned, 20)
     whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(residual))])
     turned = np.concatenate([[0.0], np.cumsum(residual)])
     scale = max(float(np.median(np.abs(np.diff(whitened)))) / 0.6745, 1e-15)

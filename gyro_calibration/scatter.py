@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.stats import t as student
 
 from gyro_calibration.dwells import Dwells, Numbers, take
-from gyro_calibration.likelihood import _robust_residual
+from gyro_calibration.likelihood import robust_residual
 from gyro_calibration.log import Array, Mask
 
 #: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
@@ -154,7 +154,7 @@ def _sought(dwells: Dwells) -> int:
 def not_outlying(dwells: Dwells) -> Mask:
     """Return which dwells lie as the others do, by a fit in which a large residual counts by its size, not its square."""
     surface = _surface(dwells)
-    residual = np.abs(_robust_residual(surface, dwells.output - dwells.rate, 20))
+    residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
     # Such a fit passes through as many dwells as it has columns, which say nothing of the scatter.
     spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
     return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)

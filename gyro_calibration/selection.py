@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyro_calibration.calibration import Calibration, Scatter, find_scatter, fit_effects
+from gyro_calibration.calibration import Calibration, fit_effects
 from gyro_calibration.dwells import Dwells
 from gyro_calibration.effects import (
     BIAS,
@@ -28,6 +28,7 @@ from gyro_calibration.effects import (
     Effect,
 )
 from gyro_calibration.log import DataRefused, Progress
+from gyro_calibration.scatter import Scatter, find_scatter
 
 #: How often an effect is taken that is not there, in one calibration.
 FALSE_ALARM_RATE = 0.01

@@ -90,6 +90,20 @@ def data():
 
 
 @pytest.fixture
+def run(capsys):
+    """Return a function that runs the program and gives its exit code, standard output and standard error."""
+    from gyro_calibration.command_line import main  # not before the environment is prepared
+
+    def run(*words):
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as end:  # argparse
+            code = end.code
+        return code, *capsys.readouterr()
+    return run
+
+
+@pytest.fixture
 def ros_domain(monkeypatch):
     """Keep the ROS traffic of a test apart from all others; skip where ROS 2 is missing."""
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')

@@ -22,18 +22,6 @@ NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
 
 
 @pytest.fixture
-def run(capsys):
-    """Return a function that runs the program and gives its exit code, standard output and standard error."""
-    def run(*words):
-        try:
-            code = main([str(word) for word in words])
-        except SystemExit as end:  # argparse
-            code = end.code
-        return code, *capsys.readouterr()
-    return run
-
-
-@pytest.fixture
 def model(tmp_path):
     path = tmp_path / 'model.yaml'
     path.write_text(GYRO)

@@ -10,25 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyro_calibration.command_line import main
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 
 RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
 Table, SINE = RECOVERY['Table'], RECOVERY['SINE']
-
-
-@pytest.fixture
-def run(capsys):
-    """Return a function that runs the program and gives its exit code, standard output and standard error."""
-    def run(*words):
-        try:
-            code = main([str(word) for word in words])
-        except SystemExit as end:  # argparse
-            code = end.code
-        return code, *capsys.readouterr()
-    return run
 
 
 def write(path, dwells):

@@ -5,12 +5,12 @@ import json
 import math
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from gyro_calibration.calibration import fit_effects
-from gyro_calibration.command_line import main
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, take
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE, rate_temperature_polynomial
@@ -179,15 +179,9 @@ def test_the_measured_gyro_errs_by_less_than_2_percent_and_one_order_of_magnitud
 # the program
 
 @pytest.fixture
-def run(capsys):
+def run(run):
     """Return a function that runs the verb and gives its exit code, standard output and standard error."""
-    def run(*words):
-        try:
-            code = main(['turn', *map(str, words)])
-        except SystemExit as end:  # argparse
-            code = end.code
-        return code, *capsys.readouterr()
-    return run
+    return partial(run, 'turn')
 
 
 @pytest.fixture

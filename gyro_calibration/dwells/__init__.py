@@ -10,7 +10,7 @@ reference rate), `straightness` (of a reference heading), `cleaning` (of wild an
 
 """
 
-from gyro_calibration.dwells.samples import Numbers
+from gyro_calibration.dwells.samples import Numbers, listed
 from gyro_calibration.dwells.table import Dwells, Steadiness, dwells, find_dwells, from_table, join, take
 
-__all__ = ['Dwells', 'Numbers', 'Steadiness', 'dwells', 'find_dwells', 'from_table', 'join', 'take']
+__all__ = ['Dwells', 'Numbers', 'Steadiness', 'dwells', 'find_dwells', 'from_table', 'join', 'listed', 'take']

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from gyro_calibration.dwells.samples import Numbers, Samples, code_step, duration, integral, slope
+from gyro_calibration.dwells.samples import Numbers, Samples, code_step, duration, slope
+from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array
 
 #: A dwell is divided into so many batches, whose scatter gives the deviation of the mean: fewer, where they got shorter than a vibration
@@ -50,7 +51,7 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers], batches: Number
     assert samples.heading is not None
     step = code_step(samples.heading)
     time, output, heading = ([values[rows] for rows in dwells] for values in (samples.time, samples.output, samples.heading))
-    turned = list(map(integral, time, output))
+    turned = list(map(integrate, time, output))
     errors = [angle - samples.scale * reference for angle, reference in zip(turned, heading)]
     # Both scatters hold too much: what the table does, or the encoder's steps. The smaller one holds less of it.
     variance = min((_each(_scatter_of_slopes, time, angles, batches) for angles in (turned, errors)), key=np.median)

@@ -117,11 +117,6 @@ def slope(place: Array, values: Array) -> float:
     return float(centred @ values / (centred @ centred))
 
 
-def integral(time: Array, values: Array) -> Array:
-    """Return the integral from the first sample to each."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (values[1:] + values[:-1]))])
-
-
 def runs(mask: Mask) -> list[slice]:
     """Return each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))

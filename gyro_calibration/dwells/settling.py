@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from gyro_calibration.dwells.samples import Numbers, Samples, duration, integral
+from gyro_calibration.dwells.samples import Numbers, Samples, duration
 from gyro_calibration.dwells.steadiness import Steadiness
+from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array
 
 #: Where more time than this passes between two dwells, what happened there is not the change from one to the other, s.
@@ -50,7 +51,7 @@ def _settling(time: Array, error: Array, dwells: Sequence[Numbers], change: Arra
 
 def _binned(time: Array, values: Array, edges: Array) -> Array:
     """Return the mean of some values in each bin; bridges gaps."""
-    return np.diff(np.interp(edges, time, integral(time, values))) / np.diff(edges)
+    return np.diff(np.interp(edges, time, integrate(time, values))) / np.diff(edges)
 
 
 def _answer(means: Array, change: Array) -> Array:

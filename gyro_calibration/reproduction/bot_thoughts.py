@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from scipy.stats import linregress
 from scipy.stats import t as student
 
+from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import fit_likelihood
 from gyro_calibration.log import DEGREE, Array, Progress
 from gyro_calibration.motion import CALIBRATION, Motion, from_headings, turns
@@ -49,16 +50,7 @@ ASSUMED = (
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
-    """
-    Work through the blog.
-
-    Parameters
-    ----------
-    generator : source of the noise
-    runs : of the simulated encoder turntable
-    progress : shows how many runs are done
-
-    """
+    """Work through the blog."""
     found = np.array([encoder_errors(generator) for _ in progress(range(runs))])
     return Reproduction(TITLE, ASSUMED, (*_three_speeds(), *_solver(found)), (*_slopes(), *_code(), _strobe(), _method(found)))
 
@@ -174,8 +166,7 @@ def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
     time, rate, motion = encoder_log(generator)
     gradient, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion, 0.1)
     reverse = linregress(motion.rate_at(time), rate).slope - 1.0
-    heading = np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1] - 2.0 * gradient.bias))])
-    heading /= 1.0 + gradient.scale_factor_error
+    heading = integrate(time, rate - gradient.bias) / (1.0 + gradient.scale_factor_error)
     return (gradient.scale_factor_error, gradient.bias, likely.scale_factor_error, likely.bias, float(reverse),
             float(np.abs(heading - motion.heading).max()))
 

@@ -49,16 +49,7 @@ ASSUMED = (
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
-    """
-    Work through the paper.
-
-    Parameters
-    ----------
-    generator : source of the noise
-    runs : of the simulated drive
-    progress : shows how many runs are done
-
-    """
+    """Work through the paper."""
     errors = np.array([drive_errors(generator) for _ in progress(range(runs))])
     return Reproduction(TITLE, ASSUMED, (*_self_calibration(), *_own_figures(), *_table(errors)),
                         (_rectangle_rule(), _short_move(), _exchanged_columns(), _efficiency(generator, runs, progress), _bias_unit(),

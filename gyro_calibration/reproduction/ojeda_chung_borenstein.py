@@ -66,16 +66,7 @@ def rd2100(sagnac: float = SAGNAC) -> GyroModel:
 
 
 def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
-    """
-    Work through the paper.
-
-    Parameters
-    ----------
-    generator : source of the noise
-    runs : twenty for each simulated calibration
-    progress : shows how many calibrations are done
-
-    """
+    """Work through the paper."""
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
     return Reproduction(TITLE, ASSUMED, (*_own_figures(), *_instrument(), *_results(found)),
                         (_index(), _data_sets(), _condition(), _regressor(generator), _sine(generator, len(found), progress),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.calibration import Bin, Calibration, binned
+from gyro_calibration.dwells import listed
 from gyro_calibration.effects import Parameter, polynomial_to_matrix
 from gyro_calibration.encoder import EncoderCalibration
 from gyro_calibration.log import DEGREE
@@ -144,9 +145,8 @@ def dwell_lines(fit: Calibration) -> Iterator[str]:
     yield f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, {slowest:.1f} to {fastest:.1f} deg/s{temperatures}.'
     outlying = np.flatnonzero(~fit.scatter.kept)
     if len(outlying):
-        named = ', '.join(f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)' for row in outlying[:5])
-        more = f' and {len(outlying) - 5} more' if len(outlying) > 5 else ''
-        yield _wrapped(f'{len(outlying)} outlying, not fitted: {named}{more}.')
+        named = listed([f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)' for row in outlying])
+        yield _wrapped(f'{len(outlying)} outlying, not fitted: {named}.')
     yield from sentences(table.remarks)
 
 

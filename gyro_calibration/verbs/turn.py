@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, dwells, take
+from gyro_calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.files import write_atomically
 from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.model import GyroModel
@@ -95,8 +95,7 @@ def _acquainted(model: GyroModel, log: str) -> str:
 def _outlying(found: Dwells, kept: Mask) -> Iterator[str]:
     places = [place for place, good in zip(found.place, kept) if not good]
     if places:
-        more = f' and {len(places) - 5} more' if len(places) > 5 else ''
-        yield f'{len(places)} outlying dwells are left out: {", ".join(places[:5])}{more}'
+        yield f'{len(places)} outlying dwells are left out: {listed(places)}'
 
 
 # bins
