@@ -1,0 +1,220 @@
+"""What a diagnosis finds, as records, and the same as data for files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from gyro_calibration.log import Array
+from gyro_calibration.model import GyroModel
+from gyro_calibration.noise import Noise
+
+SCHEMA = 'gyro_calibration/diagnosis/1'
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its interval of 95 %, in SI."""
+
+    estimate: float
+    interval: tuple[float, float]
+    unit: str
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    One cause.
+
+    Attributes
+    ----------
+    effect : its name in the catalogue
+    cause : one sentence for people
+    parameters : name -> estimate
+    p_value : the chance that a log without it shows as much
+    minimum_detectable : what of its first parameter would have been found, in its unit; None where that has no meaning
+    ambiguous_with : the names of those that the data at hand cannot rule out instead
+    separate_by : the experiment that would part them; '' where there is nothing to part
+    evidence : what in the data shows it, one sentence with numbers in units of people
+    along : the variable along which it shows, a key of `Diagnosis.curves`; '' where there is none
+
+    """
+
+    effect: str
+    cause: str
+    parameters: Mapping[str, Estimate]
+    p_value: float
+    minimum_detectable: float | None = None
+    ambiguous_with: tuple[str, ...] = ()
+    separate_by: str = ''
+    evidence: str = ''
+    along: str = ''
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'effect': self.effect, 'cause': self.cause,
+                'parameters': {name: value.figures() for name, value in self.parameters.items()},
+                'p_value': self.p_value, 'minimum_detectable': self.minimum_detectable,
+                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by, 'evidence': self.evidence}
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure without a name: the variable along which it lies, its share of the residual's variance, and its chance."""
+
+    along: str
+    share_of_variance: float
+    p_value: float
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'along': self.along, 'share_of_variance': self.share_of_variance, 'p_value': self.p_value}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A root mean square error before and after the extension, and the interval of 95 % of what is won (before less after)."""
+
+    before: float
+    after: float
+    interval: tuple[float, float]
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'before': self.before, 'after': self.after, 'ci95': list(self.interval)}
+
+
+@dataclass(frozen=True)
+class Gain:
+    """
+    What the extension wins on parts that took no part in the choice or the fit.
+
+    Attributes
+    ----------
+    held_out : which parts, in words
+    rate : of the simulated against the measured rate, rad/s
+    heading : of the simulated against the measured change of heading over windows, rad; None where no window is as long
+    window : s
+
+    """
+
+    held_out: str
+    rate: Change
+    heading: Change | None
+    window: float = 60.0
+
+    @property
+    def worse(self) -> bool:
+        """Tell whether the extension is worse than nothing, beyond chance."""
+        return any(change is not None and change.interval[1] < 0.0 for change in (self.rate, self.heading))
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        heading = None if self.heading is None else {'window_s': self.window, **self.heading.figures()}
+        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(), 'heading_rms': heading}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    The residual along one variable, in bins, for pictures: arrays of shape (bins,), in SI.
+
+    Attributes
+    ----------
+    along : rate, temperature, heading, time, frequency ...
+    unit : of `at`, SI
+    at : middle of each bin
+    before, after : mean of the residual there, against the model that was given and against the extended one, rad/s
+    deviation : standard deviation of these means by the noise alone, rad/s
+
+    """
+
+    along: str
+    unit: str
+    at: Array
+    before: Array
+    after: Array
+    deviation: Array
+
+
+@dataclass(frozen=True)
+class HeadingCurve:
+    """What the heading is wrong by over the log, if the simulation is believed: arrays of shape (n,), s and rad."""
+
+    time: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class NoiseCurve:
+    """Allan deviation of the residual and of the simulated noise: arrays of shape (n,), s and rad/s; simulated is None without figures."""
+
+    averaging_time: Array
+    measured: Array
+    fitted: Array
+    simulated: Array | None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """
+    All that was found.
+
+    Attributes
+    ----------
+    findings : named causes, the strongest first
+    unexplained : structure without a name
+    noise : of the residual
+    simulated : noise of the model that was given; all 0 where none was
+    gain : None where nothing is offered that could win
+    before, model : the simulation that was put to the test, and the extended one (the same where nothing is offered)
+    cannot_show : cause -> why these logs cannot show it
+    curves : the residual along each variable
+    heading, noise_curve : for pictures
+    remarks : what a person should know, one sentence each (what was filled, held back, chosen)
+    false_alarm_rate : of the whole diagnosis, a log
+    logs : names of the files
+
+    """
+
+    findings: tuple[Finding, ...]
+    unexplained: tuple[Unexplained, ...]
+    noise: Noise
+    simulated: Noise
+    gain: Gain | None
+    before: GyroModel
+    model: GyroModel
+    cannot_show: Mapping[str, str] = field(default_factory=dict)
+    curves: Sequence[Curve] = ()
+    heading: HeadingCurve | None = None
+    noise_curve: NoiseCurve | None = None
+    remarks: tuple[str, ...] = ()
+    false_alarm_rate: float = 0.01
+    logs: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """Return adequate, extended or unexplained."""
+        if self.unexplained:
+            return 'unexplained'
+        return 'extended' if self.findings else 'adequate'
+
+    def figures(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        return {'schema': SCHEMA, 'verdict': self.verdict, 'false_alarm_rate': self.false_alarm_rate,
+                'findings': [finding.figures() for finding in self.findings],
+                'unexplained': [each.figures() for each in self.unexplained],
+                'noise': _noise(self.noise), 'simulated_noise': _noise(self.simulated),
+                'gain': None if self.gain is None else self.gain.figures(),
+                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks), 'logs': list(self.logs)}
+
+
+def _noise(noise: Noise) -> dict[str, float]:
+    return {'angle_random_walk': noise.angle_random_walk, 'bias_instability': noise.bias_instability,
+            'rate_random_walk': noise.rate_random_walk}
