@@ -23,6 +23,7 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import Motion, from_headings
 from gyro_calibration.noise import ALLAN_FLOOR, Noise
 from gyro_calibration.self_calibration import Limits, fit_rate, refuse_dead, refuse_scale
+from gyro_calibration.stamps import lost_samples
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class EncoderCalibration:
     drift : what is left of the bias, and of its standard deviation what its wander is
     time : of the reference's samples, s, shape (n,)
     before, after : the residual heading without calibration and with it
-    lost_samples : so many are missing between the stamps
+    lost_samples : so many are missing between the stamps, as far as these are regular enough to tell
     remarks : what to know, one sentence each
 
     """
@@ -294,9 +295,9 @@ def _residual(time: Array, rate: Array, motion: Motion) -> Residual:
 
 
 def _lost(time: Array) -> int:
-    """Return how many samples are missing between the stamps."""
-    intervals = np.diff(time)
-    return int(np.sum(np.round(intervals / np.median(intervals)) - 1.0))
+    """Return how many samples are missing between the stamps; none where they are too irregular to tell."""
+    lost = lost_samples(time)
+    return 0 if lost is None else int(lost.sum())
 
 
 def _remarks(fit: Fit, method: str) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ A gyro at rest says nothing but its bias and its noise. The Allan variance at th
 difference between neighbouring means over tau. It is taken here at every sample (overlapping), and its uncertainty is computed and not
 assumed: second differences of the angle are Gaussian, so that variances and covariances of their mean squares follow from theirs.
 
-Reading order, each imports only from those before it: `angle` (of samples, some of them lost), `stamps` (by which samples are numbered),
+Reading order, each imports only from those before it: `angle` (of samples, some of them lost),
 `rest` (what is no gyro at rest), `record` (samples on an even grid); `parts` (of the noise), `covariance` (of Allan variances), `freedom`
 (degrees of it, and bounds), `chart` (the Allan deviation); `octaves` (those that are fitted), `description` (a combination of parts,
 fitted), `ranking` (of all combinations), `figures` (of the likeliest).

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.stamps import Integers
 
-Integers = NDArray[np.integer[Any]]
 Truths = NDArray[np.bool_]
 
 #: Fewer samples than this show no noise figure.

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyro_calibration.allan.angle import gaps, refuse_few
+from gyro_calibration.allan.angle import LOST_SHARE, gaps, refuse_few
 from gyro_calibration.allan.rest import leave_out_wild_samples, refuse_dead, refuse_motion
-from gyro_calibration.allan.stamps import number_stamps
 from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.stamps import Stamps, number_stamps
 
 #: Share of a record that may be lost.
 _MOST_LOST = 0.3
@@ -54,11 +54,16 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
     stamps = number_stamps(time)
     rate = np.full(int(stamps.number[-1]) + 1, np.nan)
     rate[stamps.number[known]] = output[known]
-    remarks = [*stamps.remarks, *_said_of_left_out(int(np.count_nonzero(~known))), *leave_out_wild_samples(rate, stamps)]
+    remarks = [*stamps.said_of_bursts, *_said_of_lost(stamps), *_said_of_left_out(int(np.count_nonzero(~known))),
+               *leave_out_wild_samples(rate, stamps)]
     refuse_motion(rate, stamps)
     rate = _shortened(rate, stamps.longest_gap)
     _refuse_tatters(rate)
     return Record(rate, stamps.interval, tuple(remarks))
+
+
+def _said_of_lost(stamps: Stamps) -> list[str]:
+    return [f'{said} Windows with more than {100 * LOST_SHARE:g} % lost are not used.' for said in stamps.said_of_lost]
 
 
 def _said_of_left_out(count: int) -> list[str]:

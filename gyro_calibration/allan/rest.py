@@ -8,9 +8,9 @@ import numpy as np
 from scipy.signal import medfilt
 
 from gyro_calibration.allan.angle import Integers, Truths, angle_of, filled, gaps, lost_before, refuse_few, whole
-from gyro_calibration.allan.stamps import LONG, Stamps
 from gyro_calibration.likelihood import CHANCE
 from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.stamps import LONG, Stamps
 
 
 def refuse_dead(time: Array, output: Array) -> None:

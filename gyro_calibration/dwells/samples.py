@@ -6,15 +6,14 @@ Samples: what of a log in time can be used, and the small questions that all par
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from gyro_calibration.log import Array, DataRefused, Log, Mask
-
-Numbers = NDArray[np.integer[Any]]
+from gyro_calibration.stamps import Integers as Numbers
+from gyro_calibration.stamps import lost_samples
 
 #: Samples that a dwell holds at least.
 FEWEST = 8
@@ -72,15 +71,14 @@ def missing(log: Log, samples: Samples, dwells: Sequence[Numbers]) -> Iterator[s
     """Say how many samples of the gyro are missing within the dwells, where the stamps are regular enough to tell."""
     assert log.time is not None and log.output is not None
     time = log.time[np.isfinite(log.output)]
-    steps = np.diff(time) / np.median(np.diff(time))
-    if np.mean(np.abs(steps - 1.0) > 0.25) > 0.1:
+    lost = lost_samples(time)
+    if lost is None:
         yield 'the stamps are too irregular to count lost samples'
         return
-    gaps = np.flatnonzero((steps > 1.5) & (np.interp(time[1:], samples.time, inside(samples, dwells)) > 0.5))
+    gaps = np.flatnonzero((lost > 0) & (np.interp(time[1:], samples.time, inside(samples, dwells)) > 0.5))
     if len(gaps):
-        lost = int(np.sum(np.round(steps[gaps]) - 1))
-        yield (f'samples missing within the dwells: {lost}, after {listed([f"{time[gap]:.2f} s" for gap in gaps])}; at a steady rate '
-               'that does no harm')
+        yield (f'samples missing within the dwells: {lost[gaps].sum()}, after {listed([f"{time[gap]:.2f} s" for gap in gaps])}; at a '
+               'steady rate that does no harm')
 
 
 def inside(samples: Samples, dwells: Sequence[Numbers]) -> Mask:

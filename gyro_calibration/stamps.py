@@ -9,11 +9,14 @@ gives the interval. Samples are lost where the stamps stay late after a long ste
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gyro_calibration.allan.angle import LOST_SHARE, Integers
 from gyro_calibration.log import Array, DataRefused
+
+Integers = NDArray[np.integer[Any]]
 
 #: Share of intervals below half of the usual one from which on the stamps are taken to come in bursts.
 _BURSTS = 0.02
@@ -39,21 +42,42 @@ class Stamps:
     Attributes
     ----------
     time : s, shape (n,)
+    lost : how many samples are lost after each but the last, shape (n - 1,)
     number : of each sample on the grid, shape (n,); long gaps are cut down to `longest_gap`
     interval : of the grid, s
-    remarks : what was found on the way, one sentence each
+    wander : how far the stamps are off it at most, s
+    bursts : the stamps come in bursts or with jitter, and the grid is believed instead
 
     """
 
     time: Array
+    lost: Integers
     number: Integers
     interval: float
-    remarks: tuple[str, ...]
+    wander: float
+    bursts: bool
 
     @property
     def longest_gap(self) -> int:
         """Return how many samples of a gap are kept: as no window reaches across them, more would only take memory."""
         return _longest_gap(self.time)
+
+    @property
+    def said_of_bursts(self) -> list[str]:
+        """Say how far stamps are off their grid, if they come in bursts."""
+        if not (self.bursts and self.wander):
+            return []
+        return [f'The stamps come in bursts or with jitter, up to {self.wander:.3g} s off an even interval of '
+                f'{1000 * self.interval:.5g} ms, which is used.']
+
+    @property
+    def said_of_lost(self) -> list[str]:
+        """Say how many samples are lost, if any are."""
+        if not self.lost.any():
+            return []
+        longest, gaps = int(np.argmax(self.lost)), int(np.count_nonzero(self.lost))
+        return [f'{self.lost.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; the longest, of {self.lost[longest]}, is at '
+                f'{self.time[longest]:.3f} s.']
 
     def at(self, number: int | np.integer) -> float:
         """Return the time of a place on the grid, s."""
@@ -78,8 +102,15 @@ def number_stamps(time: Array) -> Stamps:
     if uneven or wander > 0.05 * len(time) * interval:
         raise DataRefused(f'the stamps belong to no even interval (about {usual:g} s; up to {wander:g} s off); if the samples are even, '
                           'say with --rate how many there are a second')
-    remarks = [*(_said_of_bursts(interval, wander) if bursts else []), *_said_of_lost(time, lost)]
-    return Stamps(time, _numbers(np.minimum(lost, _longest_gap(time))), interval, tuple(remarks))
+    return Stamps(time, lost, _numbers(np.minimum(lost, _longest_gap(time))), interval, wander, bursts)
+
+
+def lost_samples(time: Array) -> Integers | None:
+    """Return how many samples are lost after each but the last, shape (n - 1,); None where the stamps belong to no even interval."""
+    try:
+        return number_stamps(time).lost
+    except DataRefused:
+        return None
 
 
 def _longest_gap(time: Array) -> int:
@@ -123,18 +154,3 @@ def _line(time: Array, number: Integers) -> tuple[float, float]:
     slope = float(np.polyfit(number, time - time[0], 1)[0])
     off = time - time[0] - slope * number
     return slope, float(np.abs(off - np.median(off)).max())
-
-
-def _said_of_bursts(interval: float, wander: float) -> list[str]:
-    if not wander:
-        return []
-    return [f'The stamps come in bursts or with jitter, up to {wander:.3g} s off an even interval of {1000 * interval:.5g} ms, '
-            'which is used.']
-
-
-def _said_of_lost(time: Array, lost: Integers) -> list[str]:
-    if not lost.any():
-        return []
-    longest, gaps = int(np.argmax(lost)), int(np.count_nonzero(lost))
-    return [f'{lost.sum()} samples are lost in {gaps} gap{"s" * (gaps > 1)}; the longest, of {lost[longest]}, is at '
-            f'{time[longest]:.3f} s. Windows with more than {100 * LOST_SHARE:g} % lost are not used.']
