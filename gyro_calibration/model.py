@@ -40,7 +40,7 @@ class Term:
         return [self._derivative(place, channels) if place < shapes else columns[place - shapes] for place in self.fitted]
 
     def _derivative(self, place: int, channels: Channels) -> Number:
-        step = 1e-5 * abs(self.values[place])
+        step = 1e-5 * abs(self.values[place]) or 1e-9
         below, above = (replace(self, values=(*self.values[:place], self.values[place] + change, *self.values[place + 1:]))
                         for change in (-step, step))
         return (above.error(channels) - below.error(channels)) / (2.0 * step)

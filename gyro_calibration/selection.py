@@ -20,10 +20,10 @@ from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    CATALOGUE,
     CUBIC_NONLINEARITY,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
+    STEADY,
     Channels,
     Effect,
 )
@@ -116,11 +116,11 @@ def select_effects(dwells: Dwells, technology: str | None = None, progress: Prog
     """
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
-    candidates = [effect for effect in CATALOGUE.values() if effect not in base.effects]
+    candidates = [effect for effect in STEADY.values() if effect not in base.effects]
     best = _grow(base, candidates, scatter, progress)
     best = _prune(best, base.effects, len(candidates), scatter)
     best, twins = _part(best, technology, scatter)
-    choices = tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in progress(list(CATALOGUE.values())))
+    choices = tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in progress(list(STEADY.values())))
     return Selection(best, choices, twins)
 
 
@@ -239,7 +239,7 @@ def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]
     """Return what a fit with the effect has over one without it, or with its twin, everything else being as it was chosen."""
     for pair in twins:
         if effect.name == pair.other:
-            swapped = fit_effects(fit.dwells, _swapped(fit.effects, CATALOGUE[pair.taken], effect), scatter)
+            swapped = fit_effects(fit.dwells, _swapped(fit.effects, STEADY[pair.taken], effect), scatter)
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
             return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan, reason)
     taken = effect in fit.effects

@@ -20,10 +20,10 @@ from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
-    CATALOGUE,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
+    STEADY,
     polynomial_to_matrix,
     rate_temperature_polynomial,
 )
@@ -269,4 +269,4 @@ def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
 
 def test_fewer_dwells_than_values_are_refused():
     with pytest.raises(DataRefused, match='2 dwells do not determine 9 values; add dwells, or fit fewer'):
-        fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(CATALOGUE.values()))
+        fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(STEADY.values()))

@@ -60,7 +60,7 @@ def test_a_module_imports_only_what_is_read_before_it(module):
     assert paths and all(own(imports(path)) <= known for path in paths), [(path.name, own(imports(path)) - known) for path in paths]
 
 
-@pytest.mark.parametrize('folder', ['allan', 'dwells', 'diagnosis'])
+@pytest.mark.parametrize('folder', ['effects', 'allan', 'dwells', 'diagnosis'])
 def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
     order = re.findall(r'`(\w+)`', importlib.import_module(f'gyro_calibration.{folder}').__doc__.partition('Reading order')[2])
     inside = f'gyro_calibration.{folder}.'

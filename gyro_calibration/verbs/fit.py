@@ -16,7 +16,7 @@ import numpy as np
 from gyro_calibration import __version__, picture
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.dwells import Dwells, dwells, join, take
-from gyro_calibration.effects import CATALOGUE, Effect, rate_temperature_polynomial
+from gyro_calibration.effects import STEADY, Effect, rate_temperature_polynomial
 from gyro_calibration.encoder import EncoderCalibration, calibrate_encoder
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
@@ -50,7 +50,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; likelihood: the reference heading itself; '
                         'rate: the rate of the reference heading, sample by sample. Default: what the log holds')
     what = parser.add_mutually_exclusive_group()
-    what.add_argument('--effects', type=_effects, metavar='NAME,...', help=f'fit these of {", ".join(CATALOGUE)}; default: those that '
+    what.add_argument('--effects', type=_effects, metavar='NAME,...', help=f'fit these of {", ".join(STEADY)}; default: those that '
                       'the data support')
     what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders instead; default: 3,2')
@@ -64,10 +64,10 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _effects(text: str) -> list[Effect]:
-    unknown = [name for name in text.split(',') if name not in CATALOGUE]
+    unknown = [name for name in text.split(',') if name not in STEADY]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect; choose from {", ".join(CATALOGUE)}')
-    return [CATALOGUE[name] for name in dict.fromkeys(text.split(','))]
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect; choose from {", ".join(STEADY)}')
+    return [STEADY[name] for name in dict.fromkeys(text.split(','))]
 
 
 def _orders(text: str) -> list[Effect]:
