@@ -1,0 +1,209 @@
+"""
+The physics of what is hidden, as the catalogue of effects says it: w rate, psi heading, t time since power-on, T temperature, y output.
+
+Each effect is a `Form`: how its shapes are drawn, and what it adds when its leading parameter has a size. Forms say where in the chain
+they act: on the signal before all else ('signal'), added to it ('sum'), on the finished output ('output'), on the reference
+('reference'), on single samples ('samples'), on the unit ('unit'), on the noise ('noise').
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from .filters import lag
+from .motion import Session
+
+REFERENCE_TEMPERATURE = 25.0
+REFERENCE_SUPPLY = 5.0
+Shapes = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Form:
+    """
+    How an effect is drawn and what it does.
+
+    Attributes
+    ----------
+    error : (session, resulting rate w, size, shapes) -> what it adds to the output less the reference, rad/s, of shape (n,)
+    unit : of the leading parameter, which is named like the effect
+    shapes : (sessions, generator) -> the other parameters
+    stage : where it acts
+    linear : the error is in proportion to the size
+    signed : the size may be negative
+    most : (sessions) -> the largest size that still makes sense
+    once : it happens in one of several recordings only; `shapes` has its number as 'run'
+
+    """
+
+    error: Callable[[Session, np.ndarray, float, Shapes], np.ndarray]
+    unit: str
+    shapes: Callable[[list[Session], np.random.Generator], Shapes] = lambda sessions, generator: {}
+    stage: str = 'sum'
+    linear: bool = True
+    signed: bool = True
+    most: Callable[[list[Session]], float] = lambda sessions: math.inf
+    once: bool = False
+
+
+def top_rate(sessions: list[Session]) -> float:
+    """Return the largest speed, rad/s."""
+    return max(float(np.abs(session.rate).max()) for session in sessions)
+
+
+def _log_uniform(generator: np.random.Generator, low: float, high: float) -> float:
+    return math.exp(generator.uniform(math.log(low), math.log(high)))
+
+
+def _column(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[Session, np.ndarray, float, Shapes], np.ndarray]:
+    return lambda session, w, size, shapes: size * formula(session, w, shapes)
+
+
+def _phase(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    return {'phase': generator.uniform(-math.pi, math.pi)}
+
+
+def _time_constant(low: float, high: float) -> Callable[[list[Session], np.random.Generator], Shapes]:
+    def draw(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+        duration = sessions[0].time[-1]
+        return {'time_constant': _log_uniform(generator, low * duration, high * duration)}
+    return draw
+
+
+def _frequency(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    return {'frequency': _log_uniform(generator, 0.2, 0.45 / sessions[0].interval), **_phase(sessions, generator)}
+
+
+def _step_time(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    run = int(generator.integers(len(sessions)))
+    return {'run': run, 'step_time': generator.uniform(0.15, 0.85) * sessions[run].time[-1]}
+
+
+def temperature_rate(session: Session) -> np.ndarray:
+    """Return dT/dt, K/s."""
+    return np.gradient(session.temperature, session.interval)
+
+
+def branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
+    """Return +1 while it heats and -1 while it cools; slower than the threshold, K/s, the last known; 0 before the first."""
+    speed = temperature_rate(session)
+    known = np.where(np.abs(speed) > threshold, np.arange(len(speed)), -1)
+    last = np.maximum.accumulate(known)
+    return np.where(last < 0, 0.0, np.sign(speed[np.maximum(last, 0)]))
+
+
+def vibration_power(session: Session) -> np.ndarray:
+    """Return the mean square of the vibration over a second, (m/s²)²."""
+    return uniform_filter1d(session.vibration ** 2, round(1.0 / session.interval))
+
+
+def _sine(session: Session, w: np.ndarray, k: float, shapes: Shapes) -> np.ndarray:
+    return np.sin(k * w) / k - w
+
+
+def _dead_zone(session: Session, w: np.ndarray, half_width: float, shapes: Shapes) -> np.ndarray:
+    return np.where(np.abs(w) < half_width, -w, 0.0)
+
+
+def _saturation(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -> np.ndarray:
+    return np.clip(w, -limit, limit) - w
+
+
+def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0, bandwidth: float = 0.0) -> np.ndarray:
+    """Return the rate as a delayed and slow gyro with a clock of its own sees it."""
+    if not bandwidth:
+        return session.motion.rate((1.0 + clock_rate) * session.time - time_offset)
+    finer = 8
+    time = np.arange(len(session.time) * finer) * (session.interval / finer)
+    rate = session.motion.rate((1.0 + clock_rate) * time - time_offset)
+    return lag(rate, session.interval / finer, bandwidth)[::finer]
+
+
+def _signal(name: str) -> Callable[[Session, np.ndarray, float, Shapes], np.ndarray]:
+    return lambda session, w, size, shapes: seen(session, **{name: size}) - session.rate
+
+
+def _slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    """Draw one to three moments of strong acceleration, at least a second apart."""
+    run = int(generator.integers(len(sessions)))
+    session = sessions[run]
+    acceleration = np.abs(np.gradient(session.rate, session.interval))
+    candidates = np.flatnonzero(acceleration > np.quantile(acceleration, 0.97))
+    times = np.sort(session.time[generator.choice(candidates, generator.integers(1, 4))])
+    kept = times[np.concatenate([[True], np.diff(times) > 1.0])]
+    return {'run': run, 'width': generator.uniform(0.05, 0.2), **{f'slip_time_{number}': float(at) for number, at in enumerate(kept)}}
+
+
+def _slip(session: Session, shapes: Shapes) -> np.ndarray:
+    """Return the rate of slips by 1 rad each, smooth in time, rad/s."""
+    times = [value for name, value in shapes.items() if name.startswith('slip_time')]
+    width = shapes['width']
+    pulses = [np.exp(-0.5 * ((session.time - at) / width) ** 2) / (width * math.sqrt(2.0 * math.pi)) for at in times]
+    return np.sum(pulses, axis=0)
+
+
+def _eccentric(session: Session, shapes: Shapes) -> np.ndarray:
+    return session.rate * np.sin(session.heading + shapes['phase'])
+
+
+def _samples(session: Session, w: np.ndarray, size: float, shapes: Shapes) -> np.ndarray:
+    raise NotImplementedError('faults of samples have no column')
+
+
+FORMS: Mapping[str, Form] = {
+    'bias': Form(_column(lambda session, w, shapes: np.ones_like(w)), 'rad/s'),
+    'scale_factor_error': Form(_column(lambda session, w, shapes: w), '1'),
+    'scale_factor_asymmetry': Form(_column(lambda session, w, shapes: np.abs(w)), '1'),
+    'quadratic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 2), 's/rad'),
+    'cubic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 3), 's²/rad²'),
+    'sine_response': Form(_sine, 's', linear=False, signed=False, most=lambda sessions: 1.5 / top_rate(sessions)),
+    'bias_temperature': Form(_column(lambda session, w, shapes: session.temperature - REFERENCE_TEMPERATURE), 'rad/s/K'),
+    'bias_temperature_quadratic': Form(
+        _column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) ** 2), 'rad/s/K²'),
+    'scale_factor_temperature': Form(_column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
+    'bias_temperature_rate': Form(_column(lambda session, w, shapes: temperature_rate(session)), 'rad/s/(K/s)'),
+    'thermal_lag': Form(
+        _column(lambda session, w, shapes: lag(session.temperature, session.interval, shapes['time_constant']) - session.temperature),
+        'rad/s/K', _time_constant(0.03, 0.3)),
+    'thermal_hysteresis': Form(_column(lambda session, w, shapes: branch(session)), 'rad/s'),
+    'warm_up': Form(
+        _column(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])), 'rad/s', _time_constant(0.03, 0.35)),
+    'rate_ramp': Form(_column(lambda session, w, shapes: session.time), 'rad/s²'),
+    'bias_step': Form(
+        _column(lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float)), 'rad/s', _step_time, once=True),
+    'heading_sensitivity': Form(_column(lambda session, w, shapes: np.sin(session.heading + shapes['phase'])), 'rad/s', _phase),
+    'acceleration_sensitivity': Form(_column(lambda session, w, shapes: session.specific_force), '(rad/s)/(m/s²)'),
+    'vibration_rectification': Form(_column(lambda session, w, shapes: vibration_power(session)), '(rad/s)/(m/s²)²'),
+    'supply_sensitivity': Form(_column(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
+    'interference_tone': Form(
+        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * shapes['frequency'] * session.time + shapes['phase'])),
+        'rad/s', _frequency, signed=False),
+    'bandwidth': Form(_signal('bandwidth'), 's', stage='signal', linear=False, signed=False, most=lambda sessions: 1.0),
+    'time_offset': Form(_signal('time_offset'), 's', stage='signal', linear=False, most=lambda sessions: 0.5),
+    'clock_rate': Form(_signal('clock_rate'), '1', stage='signal', linear=False, most=lambda sessions: 0.01),
+    'dead_zone': Form(_dead_zone, 'rad/s', linear=False, signed=False, most=lambda sessions: 0.3 * top_rate(sessions)),
+    'saturation': Form(_saturation, 'rad/s', stage='output', linear=False, signed=False, most=top_rate),
+    'quantization': Form(_samples, 'rad/s', stage='output', signed=False),
+    'outliers': Form(_samples, '1', stage='samples', signed=False),
+    'stuck_samples': Form(_samples, '1', stage='samples', signed=False),
+    'dropped_samples': Form(_samples, '1', stage='samples', signed=False),
+    'reference_once_per_rev': Form(
+        lambda session, w, size, shapes: -size * _eccentric(session, shapes), '1', _phase, stage='reference', signed=False),
+    'reference_scale': Form(lambda session, w, size, shapes: -size * session.rate, '1', stage='reference'),
+    'reference_slip': Form(lambda session, w, size, shapes: -size * _slip(session, shapes), 'rad', _slips, stage='reference', once=True),
+    'reference_quantization': Form(_samples, 'rad', stage='reference', signed=False),
+    'unit_error': Form(_samples, '1', stage='unit', signed=False),
+    'angle_random_walk': Form(_samples, 'rad/√s', stage='noise'),
+    'bias_instability': Form(_samples, 'rad/s', stage='noise', signed=False),
+    'rate_random_walk': Form(_samples, 'rad/s/√s', stage='noise', signed=False),
+}
+
+#: What a wrong unit multiplies the output by; and delays, in samples.
+UNIT_FACTORS = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-1': -1.0, '2': 2.0, '1024/1000': 1.024, '4096/1000': 4.096}
+UNIT_DELAYS = {'one sample': 1.0, 'half a sample': 0.5}

@@ -1,0 +1,23 @@
+"""
+First-order filters on evenly spaced samples.
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+
+def lag(signal: np.ndarray, interval: float, time_constant: float) -> np.ndarray:
+    """Return the answer of a first-order lag, exact for a signal that is straight between samples, starting in its first value."""
+    decay = np.exp(-interval / time_constant)
+    ramp = time_constant / interval * -np.expm1(-interval / time_constant)
+    # x' = (u - x) / tau over one interval: x1 = decay x0 + (ramp - decay) u0 + (1 - ramp) u1
+    start = [ramp * signal[0]]
+    return lfilter([1.0 - ramp, ramp - decay], [1.0, -decay], signal, zi=start)[0]
+
+
+def autoregression(innovations: np.ndarray, factor: float) -> np.ndarray:
+    """Return x with x[k] = factor x[k-1] + innovations[k]."""
+    return lfilter([1.0], [1.0, -factor], innovations)

@@ -1,0 +1,405 @@
+"""
+Logs with something hidden in them, and the truth about it.
+
+The chain: the rate as the gyro sees it (time offset, clock, bandwidth); what adds to it; noise; saturation; quantization; faults of
+samples; a wrong unit. Effects on the reference change the reference alone.
+
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from .effects import FORMS, UNIT_DELAYS, UNIT_FACTORS, Form, Shapes, seen, top_rate
+from .motion import Session, session
+from .noise import NoiseFigures, draw_figures, make
+from .outside import OUTSIDE
+from .size import DETECTABLE, Metric, solve_noise, solve_size
+
+ALL: Mapping[str, Form] = {**FORMS, **OUTSIDE}
+#: What is a finding only beside a model that says otherwise.
+AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk', 'bias_instability', 'rate_random_walk')
+
+
+@dataclass(frozen=True)
+class Cause:
+    """
+    One hidden effect.
+
+    Attributes
+    ----------
+    name : in the catalogue, or outside it
+    size : the leading parameter, in SI: what was added; for a figure of the noise its value
+    shapes : the other parameters
+    unit : of the size
+    minimum_detectable : size that is just found, alone; for saturation a limit, for a figure of the noise a change; nan without meaning
+    multiple : of it, that is hidden
+    apart : the multiple that is left when the other hidden effects take from it what they can explain
+
+    """
+
+    name: str
+    size: float
+    shapes: Shapes
+    unit: str
+    minimum_detectable: float
+    multiple: float
+    apart: float = math.nan
+
+    @property
+    def standard_deviation(self) -> float:
+        """What an estimate of the size scatters by at best, where it is in proportion to the size."""
+        return self.minimum_detectable / DETECTABLE
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The size under the effect's name, and the shapes."""
+        return {self.name: self.size, **self.shapes}
+
+
+@dataclass(frozen=True)
+class Gyro:
+    """
+    A hidden gyro: what can be recorded again under other conditions.
+
+    Attributes
+    ----------
+    causes : what is hidden
+    figures : its noise
+    scale_factor_error : 1
+    bias_spread : standard deviation of the bias from one power-on to the next, rad/s
+    bias : rad/s, common to all
+
+    """
+
+    causes: tuple[Cause, ...]
+    figures: NoiseFigures
+    scale_factor_error: float
+    bias: float
+    bias_spread: float
+
+    def value(self, name: str) -> float:
+        """Return the size of a hidden effect, 0 where it is not hidden."""
+        return next((cause.size for cause in self.causes if cause.name == name), 0.0)
+
+    def has(self, name: str) -> bool:
+        """Tell whether an effect is hidden."""
+        return any(cause.name == name for cause in self.causes)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """
+    What is so, of one recording.
+
+    Attributes
+    ----------
+    gyro : the hidden gyro
+    names : of what is hidden
+    bias, scale_factor_error : of this recording, rad/s and 1
+    expected : what a model says that knows all but what is hidden: bias, scale_factor_error, angle_random_walk, bias_instability,
+        rate_random_walk, in SI; for effects that are findings only against a model
+    rate, heading : true, rad/s and rad, at the rows of the log
+    added : what all effects, bias and scale included, add to the true rate; without noise, rad/s
+    reference : rate that the reference means, rad/s
+    noise : the noise that was added, rad/s
+    prediction : the output that who knows all but the noise predicts, rad/s
+    good : False at rows whose sample is wild or stuck
+
+    """
+
+    gyro: Gyro
+    names: tuple[str, ...]
+    bias: float
+    scale_factor_error: float
+    expected: Mapping[str, float]
+    rate: np.ndarray
+    heading: np.ndarray
+    added: np.ndarray
+    reference: np.ndarray
+    noise: np.ndarray
+    prediction: np.ndarray
+    good: np.ndarray
+
+    def __getitem__(self, name: str) -> Cause:
+        return next(cause for cause in self.gyro.causes if cause.name == name)
+
+
+@dataclass(frozen=True)
+class HiddenLog:
+    """Columns in the log format, by name, and the truth."""
+
+    columns: Mapping[str, np.ndarray]
+    truth: Truth
+    notes: tuple[str, ...] = field(default=())
+
+    def write(self, path: str | Path) -> Path:
+        """Write a CSV file, compressed where the name ends in .gz, and return its path."""
+        text = io.StringIO()
+        text.writelines(f'# {note}\n' for note in self.notes)
+        text.write(','.join(self.columns) + '\n')
+        rows = zip(*(column.tolist() for column in self.columns.values()))
+        text.writelines(','.join(map(repr, row)) + '\n' for row in rows)
+        data = text.getvalue().encode()
+        Path(path).write_bytes(gzip.compress(data, 1) if str(path).endswith('.gz') else data)
+        return Path(path)
+
+
+def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, *, noise: str = 'mixed',
+         reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0, runs: int = 1, encoder_step: float = 0.0,
+         figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None) -> list[HiddenLog]:
+    """
+    Hide effects in recordings of a random gyro under random conditions.
+
+    Parameters
+    ----------
+    names : of effects in `FORMS` or `OUTSIDE`; none is a gyro with bias, scale factor error and noise alone
+    multiple : of the minimum detectable effect, one for all or by name
+    generator : source of all that is random
+    noise : white, walk, flicker, gauss_markov or mixed (random walk, Gauss-Markov process, and flicker in every other)
+    reference : rate or heading
+    duration, sample_rate : of each recording, s and Hz
+    runs : recordings of the one gyro, each after a power-on of its own
+    encoder_step : of a reference heading, rad; 0 is a heading without steps
+    figures : the noise instead of a random one
+    conditions : words for `session`: motion, temperature, supply, force, top_rate
+
+    Returns
+    -------
+    one log a recording
+
+    """
+    sessions = [session(generator, duration, sample_rate, **(conditions or {})) for _ in range(runs)]
+    expected = figures or draw_figures(noise, generator)
+    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step)
+    return [record(gyro, each, generator, expected=expected, reference=reference, encoder_step=encoder_step, run=run)
+            for run, each in enumerate(sessions)]
+
+
+def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, sessions: list[Session],
+              expected: NoiseFigures, encoder_step: float = 0.0) -> Gyro:
+    """Draw a gyro whose hidden effects have these multiples of what is just detectable in these recordings."""
+    multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
+    figures, causes = expected, []
+    for name in names:
+        if FORMS.get(name) and FORMS[name].stage == 'noise':
+            cause, figures = _draw_noise(name, multiples[name], generator, sessions, figures)
+            causes.append(cause)
+    plain = 'unit_error' in names
+    gyro = Gyro((), figures, 0.0 if plain else generator.uniform(-0.02, 0.02), 0.0 if plain else generator.normal(0.0, 3e-3),
+                0.0 if plain else 3e-4)
+    metric = Metric(sessions, figures, encoder_step)
+    causes += [_draw_cause(name, multiples[name], generator, sessions, gyro, metric) for name in names if ALL[name].stage != 'noise']
+    return replace(gyro, causes=_apart(causes, sessions, metric))
+
+
+def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session], gyro: Gyro, metric: Metric) -> Cause:
+    form = ALL[name]
+    shapes = form.shapes(sessions, generator)
+    sign = float(generator.choice([-1.0, 1.0])) if form.signed else 1.0
+    if name in COUNTED or name in STEPPED or name == 'unit_error':
+        return _draw_uncommon(name, multiple, generator, sessions, gyro, metric)
+    without = {'bias': 'bias', 'scale_factor_error': 'scale', 'reference_scale': 'scale'}.get(name, '')
+    if form.linear:
+        least = DETECTABLE / metric.norm(errors(form, 1.0, shapes, sessions), without)
+        return Cause(name, sign * multiple * least, shapes, form.unit, least, multiple)
+    if name == 'saturation':
+        return _draw_saturation(multiple, sessions, metric)
+    most = form.most(sessions)
+
+    def norm(size: float) -> float:
+        return metric.norm(errors(form, sign * size, shapes, sessions))
+    guess = 1e-3 * most
+    least = solve_size(norm, DETECTABLE, guess, most)
+    size = solve_size(norm, DETECTABLE * multiple, min(least * multiple, most), most) if multiple != 1.0 else least
+    return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTABLE if size == most else multiple)
+
+
+def _draw_saturation(multiple: float, sessions: list[Session], metric: Metric) -> Cause:
+    """Solve for how far below the top rate the limit is; the higher, the less there is to see."""
+    top, form = top_rate(sessions), FORMS['saturation']
+
+    def norm(below: float) -> float:
+        return metric.norm(errors(form, top - below, {}, sessions))
+    below = solve_size(norm, DETECTABLE, 1e-3 * top, 0.9 * top)
+    further = solve_size(norm, DETECTABLE * multiple, below, 0.9 * top)
+    return Cause('saturation', top - further, {}, form.unit, top - below, multiple)
+
+
+def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
+    """Return what an effect of a size adds in each recording, less the reference, at the true rate."""
+    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run else np.zeros(len(each.time))
+            for run, each in enumerate(sessions)]
+
+
+def _apart(causes: list[Cause], sessions: list[Session], metric: Metric) -> tuple[Cause, ...]:
+    """Tell of each cause that has a column what the others leave of its multiple."""
+    shown = [cause for cause in causes if cause.name not in (*AGAINST_A_MODEL, *COUNTED, *STEPPED, 'unit_error')]
+    if not shown:
+        return tuple(causes)
+    gram = metric.gram([errors(ALL[cause.name], cause.size, cause.shapes, sessions) for cause in shown])
+    scale = np.sqrt(np.diag(gram))
+    left = 1.0 / np.sqrt(np.diag(np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12, hermitian=True)))
+    apart = {cause.name: float(length * share) / DETECTABLE for cause, length, share in zip(shown, scale, left)}
+    return tuple(replace(cause, apart=apart.get(cause.name, math.nan)) for cause in causes)
+
+
+#: What is counted, and how many of them are just detectable: enough that chance does not make them.
+COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
+#: Steps that are sized by the variance that they add, which a test of the variance would just see.
+STEPPED = ('quantization', 'reference_quantization')
+
+
+def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session], gyro: Gyro,
+                   metric: Metric) -> Cause:
+    """Draw what has no column: counted faults, steps, and wrong units."""
+    form, interval = FORMS[name], sessions[0].interval
+    if name in COUNTED:
+        return Cause(name, float(max(1, round(COUNTED[name] * multiple))), {}, form.unit, COUNTED[name], multiple)
+    if name == 'unit_error':
+        kind = str(generator.choice([*UNIT_FACTORS, *UNIT_DELAYS]))
+        return Cause(f'{name}', UNIT_FACTORS.get(kind, 1.0), {'delay': UNIT_DELAYS.get(kind, 0.0) * interval}, form.unit, math.nan, math.nan)
+    count = sum(len(each.time) for each in sessions)
+    extra = DETECTABLE * math.sqrt(2.0 / count) * gyro.figures.sample_deviation(interval) ** 2
+    # a step q adds q² / 12 to the variance; a heading's, differenced, twice that over the interval squared
+    least = math.sqrt(12.0 * extra) if name == 'quantization' else math.sqrt(6.0 * extra) * interval
+    return Cause(name, multiple * least, {}, form.unit, least, multiple)
+
+
+def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session],
+                expected: NoiseFigures) -> tuple[Cause, NoiseFigures]:
+    """Change a figure of the noise so far that the spectrum tells it; white noise up or down, the others up."""
+    start, sign = getattr(expected, name), 1.0
+    if name == 'angle_random_walk' and multiple * DETECTABLE / math.sqrt(2.0 * len(sessions[0].time)) < 0.5:
+        sign = float(generator.choice([-1.0, 1.0]))
+
+    def changed(change: float) -> NoiseFigures:
+        return replace(expected, **{name: start + sign * change})
+    guess = 1e-2 * (start or expected.angle_random_walk)
+    least = solve_noise(changed, expected, DETECTABLE, sessions, guess)
+    change = solve_noise(changed, expected, DETECTABLE * multiple, sessions, least)
+    return Cause(name, start + sign * change, {}, FORMS[name].unit, least, multiple), changed(change)
+
+
+def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expected: NoiseFigures | None = None, reference: str = 'rate',
+           encoder_step: float = 0.0, run: int = 0) -> HiddenLog:
+    """Record a gyro under the conditions of a session, which need not be those that its effects were sized for."""
+    bias = gyro.bias + generator.normal(0.0, 1.0) * gyro.bias_spread
+    delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'), 0.0)
+    w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'), gyro.value('bandwidth'))
+    prediction = w + _sum(gyro, each, w, bias, run)
+    white, slow = make(gyro.figures, len(w), each.interval, generator)
+    output, wanted = _finish(gyro, prediction + white + slow), _finish(gyro, prediction)
+    reference_rate, reference_heading = _reference(gyro, each, run)
+    columns = {'time_s': each.time, 'gyro_rad_s': output, **_conditions(each, generator)}
+    columns |= _reference_columns(gyro, reference_rate, reference_heading, reference, encoder_step)
+    columns, good, kept = _faults(gyro, columns, generator, each)
+    rows = np.flatnonzero(kept)
+    truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error, _expected(gyro, bias, expected),
+                  each.rate[rows], each.heading[rows], (prediction - each.rate)[rows], reference_rate[rows], (white + slow)[rows],
+                  wanted[rows], good[rows])
+    return HiddenLog(columns, truth)
+
+
+def _sum(gyro: Gyro, each: Session, w: np.ndarray, bias: float, run: int) -> np.ndarray:
+    """Return what adds to the resulting rate, without noise, rad/s."""
+    total = bias + gyro.scale_factor_error * w
+    for cause in gyro.causes:
+        form = ALL[cause.name]
+        if form.stage == 'sum' and not (form.once and cause.shapes['run'] != run):
+            total = total + form.error(each, w, cause.size, cause.shapes)
+    return total
+
+
+def _finish(gyro: Gyro, signal: np.ndarray) -> np.ndarray:
+    """Clip, round, and take the wrong unit."""
+    if gyro.has('saturation'):
+        signal = np.clip(signal, -gyro.value('saturation'), gyro.value('saturation'))
+    if gyro.has('quantization'):
+        signal = np.round(signal / gyro.value('quantization')) * gyro.value('quantization')
+    return signal * gyro.value('unit_error') if gyro.has('unit_error') else signal
+
+
+def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return rate and heading as the reference, true or wrong, means them, without the steps of an encoder."""
+    rate, heading = each.rate, each.heading
+    for cause in gyro.causes:
+        if cause.name == 'reference_once_per_rev':
+            phase = cause.shapes['phase']
+            heading = heading - cause.size * (np.cos(each.heading + phase) - math.cos(phase))
+        if cause.name == 'reference_scale':
+            heading = heading + cause.size * each.heading
+        form = ALL[cause.name]
+        if form.stage == 'reference' and cause.name not in STEPPED and not (form.once and cause.shapes['run'] != run):
+            wrong = -form.error(each, each.rate, cause.size, cause.shapes)
+            rate = rate + wrong
+            if cause.name == 'reference_slip':
+                heading = heading + np.cumsum(wrong) * each.interval
+    return rate, heading
+
+
+def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: str, encoder_step: float) -> dict[str, np.ndarray]:
+    step = gyro.value('reference_quantization') or encoder_step
+    if step:
+        return {'reference_heading_rad': np.round(heading / step) * step}
+    return {'reference_rate_rad_s': rate} if kind == 'rate' else {'reference_heading_rad': heading}
+
+
+def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return what is measured beside the gyro; the thermometer has fine steps, or some noise, or neither."""
+    temperature = each.temperature
+    kind = generator.integers(4)
+    if kind == 0:
+        temperature = np.round(temperature * 340.0) / 340.0
+    elif kind == 1:
+        temperature = np.round(temperature * 16.0) / 16.0
+    elif kind == 2:
+        temperature = temperature + 0.01 * generator.standard_normal(len(temperature))
+    count = len(temperature)
+    return {'temperature_degc': temperature,
+            'acceleration_mps2': each.specific_force + 0.005 * generator.standard_normal(count),
+            'supply_v': each.supply + 0.0005 * generator.standard_normal(count),
+            'moving': each.moving.astype(float)}
+
+
+def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Generator,
+            each: Session) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Make samples wild or stuck, and drop some; return the columns, which of the true rows are good, and which are kept."""
+    output = columns['gyro_rad_s'].copy()
+    count = len(output)
+    good, kept = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
+    if gyro.has('outliers'):
+        rows = generator.choice(count, int(gyro.value('outliers')), replace=False)
+        size = gyro.figures.sample_deviation(each.interval) * generator.uniform(10.0, 40.0, len(rows))
+        output[rows] += size * generator.choice([-1.0, 1.0], len(rows))
+        good[rows] = False
+    if gyro.has('stuck_samples'):
+        for start in _turning_rows(each, int(gyro.value('stuck_samples')), generator):
+            stuck = slice(start + 1, start + int(generator.integers(4, 20)))
+            output[stuck], good[stuck] = output[start], False
+    if gyro.has('dropped_samples'):
+        for start in _turning_rows(each, int(gyro.value('dropped_samples')), generator):
+            kept[start:start + int(generator.integers(1, 6))] = False
+    columns = {**columns, 'gyro_rad_s': output}
+    return {name: column[kept] for name, column in columns.items()}, good, kept
+
+
+def _turning_rows(each: Session, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Choose rows while it turns, not in the first or last seconds."""
+    margin = round(2.0 / each.interval)
+    rows = margin + np.flatnonzero(np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max())
+    return generator.choice(rows, count, replace=False)
+
+
+def _expected(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
+    """Return what a model says that knows all but what is hidden."""
+    figures = expected or gyro.figures
+    return {'bias': bias, 'scale_factor_error': gyro.scale_factor_error, 'angle_random_walk': figures.angle_random_walk,
+            'bias_instability': figures.floor, 'rate_random_walk': figures.rate_random_walk}

@@ -1,0 +1,324 @@
+"""
+What happens to a gyro during a recording: motion, temperature, supply, tilt and vibration, drawn at random.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.ndimage import gaussian_filter1d
+
+from .filters import lag
+
+#: Knots of the rate, s. A cubic B-spline through them is exactly zero at rest, and its integral is exact.
+KNOT = 0.05
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The true rate, rad/s, and its integral from 0 on, rad, as functions of the time since power-on."""
+
+    rate: Callable[[np.ndarray], np.ndarray]
+    heading: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Session:
+    """
+    One recording without a gyro: arrays of shape (n,), true and without noise.
+
+    Attributes
+    ----------
+    motion : for times between the samples
+    time : since power-on, s
+    rate, heading : rad/s and rad
+    temperature : of the gyro, degC
+    supply : V
+    tilt_force : what of the specific force does not vibrate, m/s²
+    vibration : the rest of it
+    moving : True where it turns, or has turned or will turn within a second
+
+    """
+
+    motion: Motion
+    time: np.ndarray
+    rate: np.ndarray
+    heading: np.ndarray
+    temperature: np.ndarray
+    supply: np.ndarray
+    tilt_force: np.ndarray
+    vibration: np.ndarray
+    moving: np.ndarray
+
+    @property
+    def interval(self) -> float:
+        """Time between samples, s."""
+        return float(self.time[1] - self.time[0])
+
+    @property
+    def specific_force(self) -> np.ndarray:
+        """Along the input axis, m/s²."""
+        return self.tilt_force + self.vibration
+
+
+def session(generator: np.random.Generator, duration: float = 900.0, sample_rate: float = 50.0, motion: str = 'rich',
+            temperature: str = 'rich', supply: str = 'rich', force: str = 'rich', top_rate: float | None = None) -> Session:
+    """
+    Draw a recording.
+
+    Parameters
+    ----------
+    generator : source of all that is random
+    duration, sample_rate : s and Hz
+    motion : rich, one_speed (never at rest), two_way (one speed both ways, and rest), slow (below 0.3 rad/s), smooth (slow swings only)
+    temperature : rich, ramp, cold_start, triangle (one turn), triangles (one speed both ways), smooth, constant
+    supply : rich, heating (follows the temperature), constant
+    force : rich, one_pose, turning (vibrates exactly while it turns), rest_too (vibrates at rest as well), off_axis (centripetal)
+    top_rate : rad/s; random between 1 and 5 where it is None
+
+    """
+    time = np.arange(round(duration * sample_rate)) / sample_rate
+    top = np.exp(generator.uniform(np.log(1.0), np.log(5.0))) if top_rate is None else top_rate
+    turning = spline(MOTIONS[motion](generator, duration, top))
+    degc = TEMPERATURES[temperature](generator, time)
+    return assemble(generator, time, turning, degc, supply, force)
+
+
+def described(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray, temperature: np.ndarray | None = None,
+              supply: str = 'rich', force: str = 'rich') -> Session:
+    """Make a recording of a motion and a temperature that somebody else planned, given at evenly spaced times."""
+    knots = np.interp(np.arange(time[0], time[-1] + KNOT, KNOT), time, rate)
+    degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0], 5.0)
+    return assemble(generator, time - time[0], spline(knots), degc, supply, force)
+
+
+def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion, temperature: np.ndarray, supply: str, force: str) -> Session:
+    """Add supply, tilt and vibration to a motion and a temperature."""
+    rate = motion.rate(time)
+    moving = gaussian_filter1d((np.abs(rate) > 1e-9).astype(float), 0.25 / time[1]) > 1e-3
+    tilt_force, vibration = FORCES[force](generator, time, rate)
+    return Session(motion, time, rate, motion.heading(time), temperature, SUPPLIES[supply](generator, time, temperature),
+                   tilt_force, vibration, moving)
+
+
+def spline(knots: np.ndarray) -> Motion:
+    """Return the motion whose rate has these coefficients every `KNOT` s; outside of them it rests."""
+    margin = 4
+    coefficients = np.concatenate([np.zeros(margin), knots, np.zeros(margin)])
+    places = KNOT * (np.arange(len(coefficients) + 4) - margin - 2)
+    rate = BSpline(places, coefficients, 3)
+    heading = rate.antiderivative()
+    first, last = places[3], places[-4]
+    start = heading(0.0)
+    return Motion(lambda time: rate(np.clip(time, first, last)), lambda time: heading(np.clip(time, first, last)) - start)
+
+
+def _rich(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    """Draw pieces of all kinds between two rests until the time is full, and round the corners."""
+    count = round(duration / KNOT)
+    pieces = [_rest(generator, top, 10.0, 30.0)]
+    length = len(pieces[0])
+    kinds = list(PIECES)
+    while length < count:
+        # each kind comes once before any comes again, so that a log of some minutes has them all
+        order = generator.permutation(len(kinds))
+        for number in order:
+            pieces.append(PIECES[kinds[number]](generator, top))
+            if generator.random() < 0.4:
+                pieces.append(_rest(generator, top))
+        length = sum(len(piece) for piece in pieces)
+    knots = gaussian_filter1d(np.concatenate(pieces)[:count], generator.uniform(0.1, 0.3) / KNOT)
+    knots[-round(5.0 / KNOT):] = 0.0
+    return gaussian_filter1d(knots, 0.1 / KNOT)
+
+
+def _length(generator: np.random.Generator, low: float, high: float) -> int:
+    return round(generator.uniform(low, high) / KNOT)
+
+
+def _speed(generator: np.random.Generator, top: float) -> float:
+    """Draw a speed with a sign, as often slow as fast."""
+    fast = generator.uniform(0.3, 1.0) if generator.random() < 0.5 else np.exp(generator.uniform(np.log(0.01), np.log(0.5)))
+    return float(generator.choice([-1.0, 1.0]) * top * fast)
+
+
+def _rest(generator: np.random.Generator, top: float, low: float = 3.0, high: float = 12.0) -> np.ndarray:
+    return np.zeros(_length(generator, low, high))
+
+
+def _turn(generator: np.random.Generator, top: float) -> np.ndarray:
+    return np.full(_length(generator, 3.0, 15.0), _speed(generator, top))
+
+
+def _staircase(generator: np.random.Generator, top: float) -> np.ndarray:
+    """Several speeds one after another, both ways."""
+    return np.concatenate([np.full(_length(generator, 1.5, 4.0), _speed(generator, top)) for _ in range(6)])
+
+
+def _ramp(generator: np.random.Generator, top: float) -> np.ndarray:
+    """From one speed through zero to another."""
+    high = abs(_speed(generator, top))
+    return np.linspace(-high, high, _length(generator, 8.0, 20.0)) * generator.choice([-1.0, 1.0])
+
+
+def _slow_sweep(generator: np.random.Generator, top: float) -> np.ndarray:
+    high = 0.05 * top * generator.uniform(0.5, 2.0)
+    return np.linspace(-high, high, _length(generator, 10.0, 20.0)) * generator.choice([-1.0, 1.0])
+
+
+def _reversals(generator: np.random.Generator, top: float) -> np.ndarray:
+    high, half = generator.uniform(0.3, 1.0) * top, _length(generator, 0.5, 1.5)
+    return np.tile(np.repeat([high, -high], half), 3)
+
+
+def _swing(generator: np.random.Generator, top: float) -> np.ndarray:
+    time = KNOT * np.arange(_length(generator, 8.0, 20.0))
+    return generator.uniform(0.2, 1.0) * top * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
+
+
+def _wander(generator: np.random.Generator, top: float) -> np.ndarray:
+    """Random motion, as by hand."""
+    shape = gaussian_filter1d(generator.standard_normal(_length(generator, 10.0, 20.0)), generator.uniform(0.3, 1.0) / KNOT)
+    return generator.uniform(0.5, 1.0) * top * shape / np.abs(shape).max()
+
+
+def _eighths(generator: np.random.Generator, top: float) -> np.ndarray:
+    """Eighths of a turn with a stop after each."""
+    steps = 1 + int(0.25 * np.pi / (0.3 * top) / KNOT)
+    move = np.full(steps, 0.25 * np.pi / (steps * KNOT)) * generator.choice([-1.0, 1.0])
+    return np.tile(np.concatenate([move, np.zeros(_length(generator, 1.0, 2.5))]), 8)
+
+
+PIECES = {'rest': _rest, 'turn': _turn, 'staircase': _staircase, 'ramp': _ramp, 'slow_sweep': _slow_sweep, 'reversals': _reversals,
+          'swing': _swing, 'wander': _wander, 'eighths': _eighths}
+
+
+def _one_speed(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    return np.full(round(duration / KNOT), top)
+
+
+def _two_way(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    """Draw rests and turns of one speed both ways, with short ramps."""
+    pieces, length = [], 0
+    while length < duration / KNOT:
+        for sign in (1.0, -1.0):
+            pieces += [_rest(generator, top), np.full(_length(generator, 8.0, 15.0), sign * top)]
+        length = sum(len(piece) for piece in pieces)
+    return gaussian_filter1d(np.concatenate([*pieces[:-1], _rest(generator, top)])[:round(duration / KNOT)], 2.0)
+
+
+def _slow(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    return _rich(generator, duration, 0.3)
+
+
+def _smooth(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
+    """Swing so slowly that no lag and no delay can be told apart."""
+    shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT)), 1.5 / KNOT)
+    edge = np.minimum(1.0, np.arange(len(shape)) * KNOT / 5.0)
+    return top * shape / np.abs(shape).max() * edge * edge[::-1]
+
+
+MOTIONS = {'rich': _rich, 'one_speed': _one_speed, 'two_way': _two_way, 'slow': _slow, 'smooth': _smooth}
+
+
+def _chamber(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray, degc: np.ndarray) -> np.ndarray:
+    """Follow a plan of straight lines with the lag of a heat capacity."""
+    return lag(np.interp(time, corners, degc), time[1] - time[0], generator.uniform(15.0, 40.0))
+
+
+def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    """Draw a cold start and, on top, a chamber that goes up and down two to four times, some of the corners with a pause."""
+    half_cycles = generator.integers(3, 7)
+    inner = np.sort(generator.uniform(0.1, 0.95, half_cycles)) * time[-1]
+    corners = np.concatenate([[0.0], inner, [1.3 * time[-1]]])
+    swing = generator.uniform(3.0, 12.0, len(corners)) * (-1.0) ** np.arange(len(corners)) * generator.choice([-1.0, 1.0])
+    warm_up = generator.uniform(0.0, 8.0) * -np.exp(-time / generator.uniform(60.0, 250.0))
+    return generator.uniform(18.0, 35.0) + warm_up + _chamber(generator, time, corners, swing)
+
+
+def _one_ramp(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    return generator.uniform(15.0, 25.0) + generator.uniform(8.0, 20.0) * time / time[-1]
+
+
+def _cold_start(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    return generator.uniform(30.0, 40.0) - generator.uniform(8.0, 15.0) * np.exp(-time / (0.2 * time[-1]))
+
+
+def _triangle(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    turn = generator.uniform(0.4, 0.6) * time[-1]
+    speed = generator.uniform(0.02, 0.04)
+    return 20.0 + speed * (turn - np.abs(time - turn))
+
+
+def _triangles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    phase = (time / time[-1] * generator.integers(3, 6) + generator.random()) % 1.0
+    return 20.0 + 24.0 * np.abs(phase - 0.5)
+
+
+def _smooth_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    """One sine, slow beside any lag of a gyro."""
+    return 25.0 + 8.0 * np.sin(2.0 * np.pi * (time / time[-1] + generator.random()))
+
+
+def _constant_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
+    return np.full(len(time), generator.uniform(20.0, 30.0))
+
+
+TEMPERATURES = {'rich': _warm_up_and_cycles, 'ramp': _one_ramp, 'cold_start': _cold_start, 'triangle': _triangle,
+                'triangles': _triangles, 'smooth': _smooth_temperature, 'constant': _constant_temperature}
+
+
+def _steps_and_wander(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    """Draw a supply that is switched between levels some times, and wanders by some millivolts."""
+    interval = time[1] - time[0]
+    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(4, 9)))
+    levels = generator.uniform(-0.25, 0.25, len(edges) + 1)
+    wander = gaussian_filter1d(generator.standard_normal(len(time)), 20.0 / interval)
+    return generator.choice([3.3, 5.0]) + lag(levels[np.searchsorted(edges, time)], interval, 0.2) + 0.01 * wander / np.std(wander)
+
+
+def _heating_supply(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    return 5.0 + 0.02 * (temperature - 25.0)
+
+
+def _constant_supply(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+    return np.full(len(time), 5.0)
+
+
+SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _constant_supply}
+
+
+def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tilt between poses, slowly, and vibrate while a motor runs, which it does at rest and in motion."""
+    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(4, 8)))
+    poses = generator.uniform(-np.pi / 3.0, np.pi / 3.0, len(edges) + 1)
+    angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 4.0), time[1] - time[0], 4.0)
+    starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
+    levels = generator.choice([0.0, 1.0], len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
+    return GRAVITY * np.cos(angle), _vibration(generator, time, levels[np.searchsorted(starts, time)])
+
+
+def _vibration(generator: np.random.Generator, time: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Vibrate at random with this root mean square, m/s², that comes and goes within half a second."""
+    return generator.standard_normal(len(time)) * lag(level, time[1] - time[0], 0.2)
+
+
+def _one_pose(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.full(len(time), GRAVITY), np.zeros(len(time))
+
+
+def _turning_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vibrate in proportion to the speed's square root, so that the power goes as the speed."""
+    return np.full(len(time), GRAVITY), generator.standard_normal(len(time)) * np.sqrt(np.abs(rate))
+
+
+def _off_axis(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return GRAVITY + 0.15 * rate ** 2, np.zeros(len(time))
+
+
+FORCES = {'rich': _rich_force, 'one_pose': _one_pose, 'turning': _turning_force, 'off_axis': _off_axis}

@@ -1,0 +1,198 @@
+"""
+The noise of a hidden gyro, how it is made, and how well an effect shows through it.
+
+Everything that is not white is a sum of first-order Markov processes: the rate random walk is one that never decays, and flicker is a
+ladder of stationary ones, whose time constants go up by factors of four. What they look like to an effect is then exact and cheap: the
+precision matrix of all their states over all samples is banded, and so ``x' S^-1 y`` takes one banded Cholesky factor (`Whitening`).
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from .filters import autoregression
+
+#: Between the time constants of the ladder that makes flicker.
+STEP_OF_LADDER = 4.0
+#: Bias instability B whose Allan floor is the peak of a Gauss-Markov process of standard deviation 1: 0.437 sqrt(2) / 0.664.
+FLOOR_OF_GAUSS_MARKOV = 0.437 * math.sqrt(2.0) / math.sqrt(2.0 * math.log(2.0) / math.pi)
+KINDS = ('white', 'walk', 'flicker', 'gauss_markov', 'mixed')
+
+
+@dataclass(frozen=True)
+class NoiseFigures:
+    """
+    The noise of one gyro, in SI.
+
+    Attributes
+    ----------
+    angle_random_walk : N, rad/√s
+    bias_instability : B, rad/s, with the spectrum B² / (2 pi f)
+    rate_random_walk : K, rad/s/√s
+    correlated : standard deviation of a Gauss-Markov process, rad/s
+    correlation_time : its time constant, s
+
+    """
+
+    angle_random_walk: float
+    bias_instability: float = 0.0
+    rate_random_walk: float = 0.0
+    correlated: float = 0.0
+    correlation_time: float = 60.0
+
+    @property
+    def floor(self) -> float:
+        """The bias instability that a model without a Gauss-Markov process needs for the same worst Allan deviation, rad/s."""
+        return math.hypot(self.bias_instability, FLOOR_OF_GAUSS_MARKOV * self.correlated)
+
+    def sample_deviation(self, interval: float) -> float:
+        """Return the standard deviation of the white noise of one sample, rad/s."""
+        return self.angle_random_walk / math.sqrt(interval)
+
+
+def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
+    """
+    Draw the figures of a gyro between a good fibre gyro and a cheap micromachined one.
+
+    Flicker, random walk and Gauss-Markov process rise out of the white noise at averaging times that are random, too.
+
+    """
+    if kind not in KINDS:
+        raise ValueError(f'no noise {kind!r}; wanted one of {", ".join(KINDS)}')
+    white = math.exp(generator.uniform(math.log(5e-6), math.log(5e-4)))
+    crossing = np.exp(generator.uniform(math.log(20.0), math.log(300.0), 3))
+    figures = NoiseFigures(
+        white, white / math.sqrt(crossing[0]) / 0.664, math.sqrt(3.0) * white / crossing[1],
+        white / math.sqrt(crossing[2]) * generator.uniform(1.0, 2.5), math.exp(generator.uniform(math.log(5.0), math.log(150.0))))
+    absent = {'white': ('bias_instability', 'rate_random_walk', 'correlated'), 'walk': ('bias_instability', 'correlated'),
+              'flicker': ('rate_random_walk', 'correlated'), 'gauss_markov': ('bias_instability', 'rate_random_walk'),
+              'mixed': ('bias_instability',) if generator.random() < 0.5 else ()}[kind]
+    return replace(figures, **dict.fromkeys(absent, 0.0))
+
+
+@dataclass(frozen=True)
+class Markov:
+    """x[k] = factor x[k-1] + innovations of a standard deviation, from a first x of one of its own."""
+
+    factor: float
+    innovation: float
+    first: float
+
+
+def processes(figures: NoiseFigures, count: int, interval: float) -> list[Markov]:
+    """Return the first-order processes that the noise has beside the white one."""
+    found = []
+    if figures.rate_random_walk:
+        step = figures.rate_random_walk * math.sqrt(interval)
+        found.append(Markov(1.0, step, step))
+    if figures.correlated:
+        found.append(_stationary(figures.correlated, figures.correlation_time, interval))
+    if figures.bias_instability:
+        # integrated over ln(time constant), processes of variance v a factor e have the spectrum v / (2 f)
+        each = figures.bias_instability * math.sqrt(math.log(STEP_OF_LADDER) / math.pi)
+        rungs = math.ceil(math.log(8.0 * count) / math.log(STEP_OF_LADDER))
+        found += [_stationary(each, 2.0 * interval * STEP_OF_LADDER ** rung, interval) for rung in range(rungs)]
+    return found
+
+
+def _stationary(deviation: float, time_constant: float, interval: float) -> Markov:
+    factor = math.exp(-interval / time_constant)
+    return Markov(factor, deviation * math.sqrt(-math.expm1(-2.0 * interval / time_constant)), deviation)
+
+
+def make(figures: NoiseFigures, count: int, interval: float, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the white part and the slow part of noise, rad/s."""
+    white = figures.sample_deviation(interval) * generator.standard_normal(count)
+    slow = np.zeros(count)
+    for process in processes(figures, count, interval):
+        innovations = process.innovation * generator.standard_normal(count)
+        innovations[0] *= process.first / process.innovation
+        slow += autoregression(innovations, process.factor)
+    return white, slow
+
+
+class Whitening:
+    """
+    Inner products x' S^-1 y for the covariance S of the noise of one recording.
+
+    With r = white + H s, where s are the states of the slow processes and P their banded precision matrix, S^-1 = (1 - H C H' / v) / v
+    with C = (P + H' H / v)^-1 and v the variance of the white noise. The steps of an encoder add a state of their own a sample, the error
+    of the reference's heading, whose differences are in the residual.
+
+    """
+
+    def __init__(self, figures: NoiseFigures, count: int, interval: float, encoder_step: float = 0.0):
+        self._variance = figures.sample_deviation(interval) ** 2
+        slow = processes(figures, count, interval)
+        self._slow, self._encoder = len(slow), encoder_step > 0.0
+        self._states, self._count, self._interval = len(slow) + self._encoder, count, interval
+        if self._states:
+            self._factor = cholesky_banded(self._precision(slow, encoder_step), overwrite_ab=True, check_finite=False)
+
+    def _precision(self, slow: list[Markov], encoder_step: float) -> np.ndarray:
+        """Return P + H' H / v, upper banded, the states of one sample side by side."""
+        width, count, information = self._states, self._count, 1.0 / self._variance
+        band = np.zeros((width + 1, count, width))  # band[width - d, k, j]: with the state d places before state j of sample k
+        for place, process in enumerate(slow):
+            inner = 1.0 / process.innovation ** 2
+            band[width, :, place] = inner * (1.0 + process.factor ** 2)
+            band[width, 0, place] = 1.0 / process.first ** 2 + inner * process.factor ** 2
+            band[width, -1, place] = inner
+            band[0, 1:, place] = -inner * process.factor
+        for later in range(self._slow):
+            for earlier in range(later + 1):
+                band[width - later + earlier, :, later] += information
+        if self._encoder:
+            self._add_encoder(band, encoder_step, information)
+        return band.reshape(width + 1, count * width)
+
+    def _add_encoder(self, band: np.ndarray, step: float, information: float) -> None:
+        """Add the error e of the reference's heading: uniform over a step, and in the residual by -(e[k] - e[k-1]) / interval."""
+        width, last, rate = self._states, self._states - 1, 1.0 / self._interval
+        band[width, :, last] += 12.0 / step ** 2
+        band[width, 1:, last] += information * rate ** 2
+        band[width, :-1, last] += information * rate ** 2
+        band[0, 1:, last] -= information * rate ** 2
+        for place in range(self._slow):
+            band[width - last + place, 1:, last] -= information * rate  # with e of the same sample
+            band[width - 1 - place, 1:, place] += information * rate    # with e of the sample before
+
+    def solve(self, signal: np.ndarray) -> np.ndarray:
+        """Return S^-1 times a signal of shape (n,)."""
+        if not self._states:
+            return signal / self._variance
+        seen = np.zeros((self._count, self._states))
+        seen[:, :self._slow] = signal[:, None]
+        if self._encoder:
+            seen[1:, -1] -= signal[1:] / self._interval
+            seen[:-1, -1] += signal[1:] / self._interval
+        states = cho_solve_banded((self._factor, False), seen.ravel(), check_finite=False).reshape(self._count, self._states)
+        explained = states[:, :self._slow].sum(axis=1)
+        if self._encoder:
+            explained[1:] -= np.diff(states[:, -1]) / self._interval
+        return (signal - explained / self._variance) / self._variance
+
+
+def spectrum(figures: NoiseFigures, count: int, interval: float) -> np.ndarray:
+    """Return the variance of the noise's components at the frequencies k / (2 T), k = 1 to n - 1, as those of white noise would have it."""
+    angle = math.pi * np.arange(1, count) / count
+    total = np.full(count - 1, figures.sample_deviation(interval) ** 2)
+    for process in processes(figures, count, interval):
+        total += process.innovation ** 2 / (1.0 - 2.0 * process.factor * np.cos(angle) + process.factor ** 2)
+    return total
+
+
+def divergence(figures: NoiseFigures, expected: NoiseFigures, count: int, interval: float) -> float:
+    """
+    Return how far a noise is from another, in standard deviations: the root of twice the information that tells them apart.
+
+    For a small change of one figure it is the change over its standard deviation.
+
+    """
+    ratio = spectrum(figures, count, interval) / spectrum(expected, count, interval)
+    return math.sqrt(float(np.sum(ratio - 1.0 - np.log(ratio))))

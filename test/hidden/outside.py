@@ -1,0 +1,87 @@
+"""
+Effects that the catalogue does not have: a diagnosis must say that something is left, and give it no name.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from .effects import Form, Shapes, _column, _log_uniform, _phase, top_rate
+from .motion import Session
+
+
+def _middle(values: list[np.ndarray]) -> float:
+    return float(np.median(np.concatenate(values)))
+
+
+def _temperature_wave(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    spread = max(float(np.ptp(session.temperature)) for session in sessions)
+    return {'period': spread / generator.uniform(3.0, 6.0), **_phase(sessions, generator)}
+
+
+def _pulse(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    run = int(generator.integers(len(sessions)))
+    duration = sessions[run].time[-1]
+    return {'run': run, 'pulse_time': generator.uniform(0.15, 0.85) * duration, 'width': duration * generator.uniform(0.01, 0.03)}
+
+
+def _square_wave(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    return {'period': _log_uniform(generator, 15.0, 60.0), **_phase(sessions, generator)}
+
+
+def _harmonic(number: int) -> Form:
+    return Form(_column(lambda session, w, shapes: np.sin(number * session.heading + shapes['phase'])), 'rad/s', _phase)
+
+
+def _warm_heading(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    return (session.temperature - shapes['middle']) * np.sin(session.heading + shapes['phase'])
+
+
+def _root(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    return np.sqrt(np.abs(w))
+
+
+def _exponential(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    return np.exp((w - shapes['top']) / shapes['rate_constant'])
+
+
+def _supply_parabola(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    return (session.supply - shapes['middle']) ** 2
+
+
+OUTSIDE: Mapping[str, Form] = {
+    'second_harmonic_of_heading': _harmonic(2),
+    'third_harmonic_of_heading': _harmonic(3),
+    'gear_of_heading': _harmonic(7),
+    'root_of_speed': Form(_column(_root), '(rad/s)^0.5'),
+    'wave_over_rate': Form(
+        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes['period'] + shapes['phase'])), 'rad/s',
+        lambda sessions, generator: {'period': top_rate(sessions) / generator.uniform(2.0, 4.0), **_phase(sessions, generator)}),
+    'exponential_of_rate': Form(
+        _column(_exponential), 'rad/s',
+        lambda sessions, generator: {'top': top_rate(sessions), 'rate_constant': top_rate(sessions) / generator.uniform(8.0, 15.0)}),
+    'wave_over_temperature': Form(
+        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase'])),
+        'rad/s', _temperature_wave),
+    'temperature_times_heading': Form(
+        _column(_warm_heading), 'rad/s/K',
+        lambda sessions, generator: {'middle': _middle([session.temperature for session in sessions]), **_phase(sessions, generator)}),
+    'bias_pulse': Form(
+        _column(lambda session, w, shapes: np.exp(-0.5 * ((session.time - shapes['pulse_time']) / shapes['width']) ** 2)),
+        'rad/s', _pulse, once=True),
+    'square_wave': Form(
+        _column(lambda session, w, shapes: np.sign(np.sin(2.0 * math.pi * session.time / shapes['period'] + shapes['phase']))),
+        'rad/s', _square_wave),
+    'supply_parabola': Form(
+        _column(_supply_parabola), 'rad/s/V²',
+        lambda sessions, generator: {'middle': _middle([session.supply for session in sessions])}),
+    'supply_times_rate': Form(
+        _column(lambda session, w, shapes: (session.supply - shapes['middle']) * w), '1/V',
+        lambda sessions, generator: {'middle': _middle([session.supply for session in sessions])}),
+    'force_times_rate': Form(_column(lambda session, w, shapes: (session.tilt_force - shapes['middle']) * w), '1/(m/s²)',
+                             lambda sessions, generator: {'middle': _middle([session.tilt_force for session in sessions])}),
+}

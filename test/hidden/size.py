@@ -1,0 +1,109 @@
+"""
+How large an effect must be so that it is found: the minimum detectable effect, and the size at a multiple of it.
+
+``I = x' S^-1 x - x' S^-1 Z (Z' S^-1 Z)^-1 Z' S^-1 x`` for an effect's column x, with the nuisances Z, a bias of each recording and one
+scale; its standard deviation is 1 / sqrt(I), and `DETECTABLE` of them are found. An effect that is no column times a size has the size at
+which all that it adds, as it is, has the norm `DETECTABLE`: sqrt(x' S^-1 x - ...) for x the whole finite error.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import brentq
+
+from .motion import Session
+from .noise import NoiseFigures, Whitening, divergence
+
+#: Standard deviations: the level corrected for some 31 columns, and the power.
+DETECTABLE = 4.8
+
+Columns = list[np.ndarray]  # of each recording, shape (n,)
+
+
+class Metric:
+    """
+    The information of several recordings of one gyro about what it adds, beside a bias of each and one scale.
+
+    Parameters
+    ----------
+    sessions : the recordings
+    figures : the noise
+    encoder_step : of the reference's heading, rad
+    without : nuisance to leave out, 'bias' or 'scale_factor_error', because a model says its value
+
+    """
+
+    def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0):
+        self._whitenings = [Whitening(figures, len(session.time), session.interval, encoder_step) for session in sessions]
+        self._sessions = sessions
+        self._nuisances = {f'bias {run}': [np.full(len(each.time), float(run == number)) for number, each in enumerate(sessions)]
+                           for run in range(len(sessions))}
+        self._nuisances['scale_factor_error'] = [session.rate for session in sessions]
+        self._solved = {name: self.solve(columns) for name, columns in self._nuisances.items()}
+
+    def solve(self, columns: Columns) -> Columns:
+        """Return S^-1 times the columns."""
+        return [whitening.solve(column) for whitening, column in zip(self._whitenings, columns)]
+
+    def _kept(self, without: str) -> list[str]:
+        return [name for name in self._nuisances if not (without and name.startswith(without))]
+
+    def gram(self, several: list[Columns], without: str = '') -> np.ndarray:
+        """Return the inner products of several columns, less what the nuisances explain, shape (m, m)."""
+        names = self._kept(without)
+        solved = [self.solve(columns) for columns in several]
+        full = np.array([[_inner(a, b) for b in solved] for a in several])
+        beside = np.array([[_inner(self._nuisances[name], b) for b in solved] for name in names])
+        among = np.array([[_inner(self._nuisances[a], self._solved[b]) for b in names] for a in names])
+        scale = np.sqrt(np.diag(among))
+        beside, among = beside / scale[:, None], among / np.outer(scale, scale)
+        return full - beside.T @ np.linalg.pinv(among, rcond=1e-12, hermitian=True) @ beside
+
+    def norm(self, columns: Columns, without: str = '') -> float:
+        """Return the length of what the nuisances do not explain, in standard deviations."""
+        return math.sqrt(max(float(self.gram([columns], without)[0, 0]), 0.0))
+
+
+def _inner(a: Columns, b: Columns) -> float:
+    return float(sum(x @ y for x, y in zip(a, b)))
+
+
+def solve_size(norm: Callable[[float], float], wanted: float, first: float, most: float) -> float:
+    """
+    Return the size at which a norm that grows with the size has a wanted value; the largest size where it does not get there.
+
+    Parameters
+    ----------
+    norm : size -> norm
+    wanted : its value
+    first : a guess of the size
+    most : the largest size
+
+    """
+    low = high = min(first, most)
+    value = norm(high)
+    while value < wanted:
+        if high >= most:
+            return most
+        low, high = high, min(most, high * min(10.0, max(2.0, 1.2 * wanted / max(value, 1e-9))))
+        value = norm(high)
+    while norm(low) > wanted:
+        low, high = low * max(0.1, min(0.5, 0.8 * wanted / value)), low
+        value = norm(low)
+    if low == high:
+        return low
+    return math.exp(brentq(lambda logarithm: math.log((norm(math.exp(logarithm)) + 1e-9) / wanted), math.log(low), math.log(high),
+                           xtol=3e-3, rtol=1e-6))
+
+
+def solve_noise(changed: Callable[[float], NoiseFigures], expected: NoiseFigures, wanted: float, sessions: list[Session],
+                first: float) -> float:
+    """Return by how much a figure of the noise must change so that all recordings together tell it by so many standard deviations."""
+    def norm(change: float) -> float:
+        each = [divergence(changed(change), expected, len(session.time), session.interval) for session in sessions]
+        return math.sqrt(sum(value ** 2 for value in each))
+    return solve_size(norm, wanted, first, math.inf)
