@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gyro_calibration.effects import Channels
+from gyro_calibration.history import clip
 from gyro_calibration.log import CACHED, Array, Number
 from gyro_calibration.model import GyroModel
 
@@ -33,7 +34,7 @@ class Compensated:
     beyond_range: Number
 
 
-def compensate(model: GyroModel, output: Number, temperature: Number | None = None) -> Compensated:
+def compensate(model: GyroModel, output: Number, temperature: Number | None = None, surroundings: Channels | None = None) -> Compensated:
     """
     Compensate by the model (eq. 13 of Ojeda et al.) and then by its self-calibration (eq. 3 of Hong and Park).
 
@@ -41,16 +42,20 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
     ----------
     output : rad/s, a number or shape (n,)
     temperature : degC, alike; the model's reference temperature where it is None
+    surroundings : what else effects look at, from the `GyroModel.history` that followed the same temperatures; needed where the model
+        `looks_around`
 
     """
     given = model.reference_temperature if temperature is None else temperature
-    return _by_blocks(model, output, given) if isinstance(output, np.ndarray) else _compensated(model, output, given)
+    if isinstance(output, np.ndarray) and surroundings is None:
+        return _by_blocks(model, output, given)
+    return _compensated(model, output, given, surroundings)
 
 
-def _compensated(model: GyroModel, output: Number, given: Number) -> Compensated:
+def _compensated(model: GyroModel, output: Number, given: Number, surroundings: Channels | None = None) -> Compensated:
     low, high = model.temperature_range
-    used = _clip(given, low, high)
-    modelled = model.rate(output, used)
+    used = clip(given, low, high)
+    modelled = model.rate_in(Channels(output, output, used) if surroundings is None else surroundings.moving(output, output))
     slowest, fastest = model.rate_range
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     return Compensated(modelled, rate, used, used != given, (output < slowest) | (output > fastest))
@@ -66,30 +71,26 @@ def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
         modelled[block], clipped[block], beyond[block] = part.modelled, part.temperature_clipped, part.beyond_range
         if rate is not modelled:
             rate[block] = part.rate
-    used = _clip(given, *model.temperature_range) if clipped.any() else given
+    used = clip(given, *model.temperature_range) if clipped.any() else given
     return Compensated(modelled, rate, used, clipped, beyond)
 
 
-def _clip(value: Number, low: float, high: float) -> Number:
-    # numpy would make a numpy scalar of a number, and all that is computed from it three times slower.
-    return np.clip(value, low, high) if isinstance(value, np.ndarray) else min(max(value, low), high)
-
-
-def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number) -> np.ndarray:
+def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number,
+                     surroundings: Channels | None = None) -> np.ndarray:
     """
     Return what the rate changes by for each uncertain value of the model, shape (m, ...).
 
     First the fitted values of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
     `covariance`. The model's rate solves ``rate = output - error(rate)``, so that what a value adds to the error is divided by the
-    steepness there: 0.5 for a sine response at 60 degrees of its phase.
+    steepness there: 0.5 for a sine response at 60 degrees of its phase. What cannot be undone is not compensated, and changes nothing.
 
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None:
         modelled = rate if calibration is None else (rate - calibration.offset) / calibration.scale
-        channels = Channels(modelled, output, temperature)
+        channels = Channels(modelled, output, temperature) if surroundings is None else surroundings.moving(modelled, output)
         steepness = model.steepness(channels)
-        rows = [row / steepness for term in model.terms for row in term.sensitivity(channels)]
+        rows = [0.0 if term.effect.undone else row / steepness for term in model.terms for row in term.sensitivity(channels)]
     if calibration is not None:
         rows += [rate, 1.0]
     sensitivity = np.empty((len(rows), *np.shape(rate)))

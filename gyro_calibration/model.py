@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from gyro_calibration.effects import Channels, Effect, Number
+from gyro_calibration.history import History
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.noise import Noise
 
@@ -35,7 +37,7 @@ class Term:
         return tuple(place for place, parameter in enumerate(self.effect.parameters) if parameter.default is None)
 
     def sensitivity(self, channels: Channels) -> list[Number]:
-        """Return what the error changes by for each fitted value: its column, or for a shape the derivative."""
+        """Return what the error changes by for each fitted value: its column, or for a shape the derivative (0 where nothing is added)."""
         columns, shapes = self.columns(channels), len(self.effect.shapes)
         return [self._derivative(place, channels) if place < shapes else columns[place - shapes] for place in self.fitted]
 
@@ -140,33 +142,76 @@ class GyroModel:
 
     def steepness(self, channels: Channels) -> Number:
         """Return what rate and error together grow by with the rate, 1; not below 0.1, as `rate` solves for no effect beyond that."""
-        sought = [term for term in self.terms if 'rate' in term.effect.looks_at]
+        sought = self._parted_by_rate[1]
         if not sought:
             return 1.0
         step = 1e-5  # rad/s; small beside what bends an effect, and large beside the rounding of its error
-        below, above = (_sum(sought, replace(channels, rate=channels.rate + change)) for change in (-step, step))
+        below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output)) for change in (-step, step))
         return np.maximum(1.0 + (above - below) / (2.0 * step), 0.1)
 
     def looks_at(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""
         return any(channel in term.effect.looks_at for term in self.terms)
 
+    @cached_property
+    def looks_around(self) -> bool:
+        """Tell whether an effect looks at more than rate, output and temperature of the moment, so that a history is needed."""
+        return any(term.effect.looks_at - {'rate', 'output', 'temperature'} for term in self.terms)
+
+    def history(self) -> History:
+        """Return a history that begins now, of the temperatures that the model uses."""
+        return History(self.reference_temperature, *self.temperature_range)
+
     def output(self, rate: Number, temperature: Number) -> Number:
         """Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``; without noise."""
-        known, sought = self._split('output')
-        given = rate + _sum(known, Channels(rate, rate, temperature))
-        return _solve(lambda output: given + _sum(sought, Channels(rate, output, temperature)), rate, bool(sought))
+        return self.output_in(Channels(rate, rate, temperature))
+
+    def output_in(self, channels: Channels) -> Number:
+        """Return the output, rad/s, at the rate of the channels and in their surroundings; without noise."""
+        rate, (known, sought) = channels.rate, self._parted_by_output
+        given = rate + _sum(known, channels)
+        return _solve(lambda output: given + _sum(sought, channels.moving(rate, output)), rate, bool(sought))
 
     def rate(self, output: Number, temperature: Number) -> Number:
-        """Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``."""
-        known, sought = self._split('rate')
-        given = output - _sum(known, Channels(output, output, temperature))
-        return _solve(lambda rate: given - _sum(sought, Channels(rate, output, temperature)), output, bool(sought))
+        """Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``; what cannot be undone stays."""
+        return self.rate_in(Channels(output, output, temperature))
 
-    def _split(self, channel: str) -> tuple[list[Term], list[Term]]:
-        """Return the effects that do not look at a channel, which need no repetition to solve for it, and those that do."""
-        known = [term for term in self.terms if channel not in term.effect.looks_at]
-        return known, [term for term in self.terms if channel in term.effect.looks_at]
+    def rate_in(self, channels: Channels) -> Number:
+        """Return the rate, rad/s, at the output of the channels and in their surroundings, of which the rate does not matter."""
+        output, (known, sought) = channels.output, self._parted_by_rate
+        given = output - _sum(known, channels)
+        return _solve(lambda rate: given - _sum(sought, channels.moving(rate, output)), output, bool(sought))
+
+    def distorted(self, stage: str, signal: Array, time: Array) -> Array:
+        """Return the signal of a whole log after the effects that change it at a stage, 'rate' or 'output'."""
+        for term in self.terms:
+            if term.effect.distortion is not None and term.effect.stage == stage:
+                signal = term.effect.distortion(signal, time, *term.values)
+        return signal
+
+    def true_time(self, time: Number) -> Number:
+        """Return when a sample was taken, s since power-on, that has a stamp of `time`, s since power-on."""
+        for term in self.terms:
+            if term.effect.moved is not None:
+                time = term.effect.moved(time, *term.values)
+        return time
+
+    @cached_property
+    def _parted_by_output(self) -> Parted:
+        return _parted(self.terms, 'output')
+
+    @cached_property
+    def _parted_by_rate(self) -> Parted:
+        return _parted([term for term in self.terms if not term.effect.undone], 'rate')
+
+
+#: Effects that do not look at what is sought, which need no repetition to solve for it, and those that do.
+Parted = tuple[list[Term], list[Term]]
+
+
+def _parted(terms: Sequence[Term], channel: str) -> Parted:
+    known = [term for term in terms if channel not in term.effect.looks_at]
+    return known, [term for term in terms if channel in term.effect.looks_at]
 
 
 def _sum(terms: Sequence[Term], channels: Channels) -> Number:
