@@ -32,6 +32,7 @@ setup(
     maintainer=manifest.findtext('maintainer'),
     maintainer_email=manifest.find('maintainer').get('email'),
     packages=find_packages(include=[name, f'{name}.*']),
+    package_data={f'{name}.diagnosis': ['report.html']},
     python_requires='>=3.10,<3.14',
     install_requires=['numpy', 'scipy', 'pyserial', 'PyYAML', 'tqdm'],
     extras_require={'ros': ros, 'plot': plot, 'test': test},

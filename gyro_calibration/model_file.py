@@ -211,7 +211,12 @@ def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple
 
 def write_model(path: str | Path, model: GyroModel) -> None:
     """Write a model file; it is complete or not there."""
-    write_atomically(path, yaml.safe_dump(_to_content(model), sort_keys=False, allow_unicode=True).encode())
+    write_atomically(path, model_text(model).encode())
+
+
+def model_text(model: GyroModel) -> str:
+    """Return what a model file holds."""
+    return yaml.safe_dump(_to_content(model), sort_keys=False, allow_unicode=True)
 
 
 def _to_content(model: GyroModel) -> dict[str, Any]:

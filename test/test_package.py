@@ -90,10 +90,10 @@ def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
     wheel, = tmp_path.glob('*.whl')
     with zipfile.ZipFile(wheel) as archive:
         data = {name.split('.data/data/')[1]: archive.getinfo(name) for name in archive.namelist() if '.data/data/' in name}
-        modules = {name for name in archive.namelist() if name.startswith('gyro_calibration/')}
+        parts = {name for name in archive.namelist() if name.startswith('gyro_calibration/')}
     assert set(data) == expected_data()
     assert all(data[f'lib/gyro_calibration/{name}'].external_attr >> 16 & 0o111 for name in EXECUTABLES)
-    assert modules == {str(file.relative_to(ROOT)) for file in (ROOT / 'gyro_calibration').rglob('*.py')}
+    assert parts == {str(file.relative_to(ROOT)) for file in (ROOT / 'gyro_calibration').rglob('*.*') if file.suffix != '.pyc'}
     check_metadata(wheel)
 
 

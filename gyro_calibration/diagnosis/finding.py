@@ -131,6 +131,7 @@ class Curve:
     at : middle of each bin
     before, after : mean of the residual there, against the model that was given and against the extended one, rad/s
     deviation : standard deviation of these means by the noise alone, rad/s
+    simulated : mean error, output less true rate, that the simulation with the given model has there, rad/s; measured is that and `before`
 
     """
 
@@ -140,6 +141,26 @@ class Curve:
     before: Array
     after: Array
     deviation: Array
+    simulated: Array | None = None
+
+
+@dataclass(frozen=True)
+class Trace:
+    """
+    A stretch of the log where simulation and measurement differ most, sample by sample: arrays of shape (n,), s and rad/s.
+
+    Attributes
+    ----------
+    time : s, as in the log
+    measured : output of the gyro
+    simulated, extended : output that the given model and the extended one have for the same motion, without noise
+
+    """
+
+    time: Array
+    measured: Array
+    simulated: Array
+    extended: Array
 
 
 @dataclass(frozen=True)
@@ -176,7 +197,7 @@ class Diagnosis:
     before, model : the simulation that was put to the test, and the extended one (the same where nothing is offered)
     cannot_show : cause -> why these logs cannot show it
     curves : the residual along each variable
-    heading, noise_curve : for pictures
+    heading, noise_curve, trace : for pictures
     remarks : what a person should know, one sentence each (what was filled, held back, chosen)
     false_alarm_rate : of the whole diagnosis, a log
     logs : names of the files
@@ -197,6 +218,7 @@ class Diagnosis:
     remarks: tuple[str, ...] = ()
     false_alarm_rate: float = 0.01
     logs: tuple[str, ...] = ()
+    trace: Trace | None = None
 
     @property
     def verdict(self) -> str:

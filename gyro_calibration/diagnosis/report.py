@@ -1,0 +1,317 @@
+"""A diagnosis as one page that needs nothing else: no network, no other files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+import gyro_calibration
+from gyro_calibration.diagnosis.charts import Chart, Line, draw
+from gyro_calibration.diagnosis.finding import Change, Curve, Diagnosis, Estimate, Finding, Gain, HeadingCurve, NoiseCurve, Trace
+from gyro_calibration.diagnosis.markup import Markup, element, joined
+from gyro_calibration.diagnosis.units import amount, chance, for_people, number, quantity, span
+from gyro_calibration.diagnosis.words import (
+    change,
+    clean,
+    doubt,
+    headline,
+    hidden,
+    listed,
+    noise_figures,
+    offered,
+    sentence,
+    shown_by,
+    sizes,
+    smallest,
+    spoken,
+    unknown,
+)
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.model_file import model_text
+
+#: Of a curve, so many points are drawn at most, four to a part: its ends and its extremes stay.
+_PARTS = 90
+#: Residuals below this, rad/s, are read in deg/h.
+_SLOW = 2e-3 * DEGREE
+_VERDICTS = {'adequate': 'Adequate: nothing was found', 'extended': 'Extended: all that was found has a name',
+             'unexplained': 'Unexplained: something is left without a name'}
+
+_METHOD = (
+    '{logs} replayed through the simulation: the motion and the temperature as recorded, the output as the model has it.',
+    'What the output then differs by, the residual, was compared with every cause of the catalogue, under a noise of angle random walk,',
+    'flicker and rate random walk that was found together with the causes. A cause is named where it shows more than the strongest of',
+    'all causes does in noise drawn for this very log, so that of logs without any cause {share} give an alarm. Causes were added one at a',
+    'time, refined, exchanged, and taken back where another one explains more. Those that explain the same are given as a set, of which the',
+    'simplest is in the model. Bias and scale factor are fitted in any case. What is won was measured on parts that took no part in this;',
+    'intervals are of 95 %.')
+
+
+def report(diagnosis: Diagnosis) -> str:
+    """Return the page, HTML in UTF-8."""
+    template = Template(Path(__file__).with_name('report.html').read_text(encoding='utf-8'))
+    title = ', '.join(map(clean, diagnosis.logs)) or 'gyro'
+    body = joined(_header(diagnosis), element('main', *_sections(diagnosis)))
+    return template.substitute(title=element('title', f'Diagnosis of {title}'), body=body)
+
+
+def _header(diagnosis: Diagnosis) -> Markup:
+    what, won = headline(diagnosis)
+    gyro = ' '.join(clean(str(diagnosis.model.gyro.get(name, ''))) for name in ('name', 'serial_number')).strip()
+    about = ' · '.join(filter(None, ['Diagnosis', gyro, ', '.join(map(clean, diagnosis.logs))]))
+    return element('header', element('p', about, class_='about'), element('h1', what), element('p', won, class_='won'),
+                   element('p', _VERDICTS[diagnosis.verdict], class_=f'verdict {diagnosis.verdict}'), _tiles(diagnosis.gain))
+
+
+def _tiles(gain: Gain | None) -> Markup | None:
+    if gain is None:
+        return None
+    return element('div', *(_tile(sentence(what).rstrip('.'), errors, unit) for what, errors, unit in _errors(gain)), class_='tiles')
+
+
+def _tile(what: str, errors: Change, unit: str) -> Markup:
+    name, factor = for_people(unit)
+    numbers = element('p', number(errors.before * factor), element('span', ' → ', class_='quiet'), number(errors.after * factor),
+                      element('span', f' {name}', class_='quiet'), class_='big')
+    return element('div', element('p', what), numbers, element('p', f'won {_gained(errors, unit)}', class_='quiet'), class_='tile')
+
+
+def _gained(errors: Change, unit: str) -> str:
+    return str(quantity(Estimate(errors.before - errors.after, errors.interval, unit)))
+
+
+def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
+    guilty, others = _curves(diagnosis)
+    yield _section('Simulation and measurement', _misfit(diagnosis, guilty or others))
+    yield _section('Causes', [_cause(place, found, diagnosis) for place, found in enumerate(diagnosis.findings, 1)])
+    yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])] if diagnosis.unexplained else [])
+    yield _section('What is won', _gain(diagnosis))
+    yield _section('Noise', _noise(diagnosis))
+    rest = others if guilty else []
+    yield _section('Along the other variables', [_pairs(draw(_residual(curve, place)) for place, curve in rest)] if rest else [])
+    yield _section('What these data cannot show', [_reasons(diagnosis)] if diagnosis.cannot_show else [])
+    yield _section('The model', _model(diagnosis))
+    yield _section('How this was computed', _method(diagnosis))
+
+
+def _section(title: str, content: Iterable[Markup | None]) -> Markup | None:
+    parts = [part for part in content if part]
+    return element('section', element('h2', title), *parts) if parts else None
+
+
+def _pairs(figures: Iterable[Markup]) -> Markup:
+    return element('div', *figures, class_='pairs')
+
+
+def _items(texts: Iterable[str]) -> Markup:
+    return element('ul', *(element('li', text) for text in texts))
+
+
+# simulation and measurement
+
+Numbered = tuple[int, Curve]
+
+
+def _curves(diagnosis: Diagnosis) -> tuple[list[Numbered], list[Numbered]]:
+    """Return the curves along guilty variables, in the order of the causes, and the others."""
+    along = [*(found.along for found in diagnosis.findings), *(each.along for each in diagnosis.unexplained)]
+    curves = list(enumerate(diagnosis.curves))
+    guilty = [each for each in curves if each[1].along in along]
+    guilty.sort(key=lambda each: along.index(each[1].along))
+    return guilty, [each for each in curves if each[1].along not in along]
+
+
+def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup | None]:
+    if guilty or diagnosis.trace is not None:
+        yield element('p', 'Point at a chart, or use the arrow keys, to read its values.', class_='quiet hint')
+    if diagnosis.trace is not None:
+        yield element('p', 'The stretch where they differ most:')
+        yield _pairs(draw(chart) for chart in _trace(diagnosis.trace))
+    for place, curve in guilty:
+        yield element('p', _misfit_sentence(curve))
+        yield _pairs(draw(chart) for chart in (_predicted(curve, place), _residual(curve, place)) if chart is not None)
+
+
+def _misfit_sentence(curve: Curve) -> str:
+    sizes = [np.abs(each[np.isfinite(each)]).max(initial=0.0) for each in (curve.before, curve.after)]
+    before, after = (amount(float(size), 'rad/s') for size in sizes)
+    if _same(curve):
+        return f'Along {spoken(curve.along)}, the simulation is off by up to {before}.'
+    return f'Along {spoken(curve.along)}, the simulation is off by up to {before} as it was, and by up to {after} as extended.'
+
+
+def _same(curve: Curve) -> bool:
+    return bool(np.array_equal(curve.before, curve.after, equal_nan=True))
+
+
+def _trace(trace: Trace) -> Iterator[Chart]:
+    time, measured, simulated, extended = _thinned(trace.time, trace.measured, trace.simulated, trace.extended)
+    unit, factor = _rate_unit(measured)
+    lines = [Line('measured', 'measured', factor * measured), Line('simulated', 'simulated', factor * simulated)]
+    yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time', 's', time, 'output', unit, lines)
+    unit, factor = _rate_unit(measured - simulated)
+    lines = [Line('before', 'before', factor * (measured - simulated)), Line('after', 'after', factor * (measured - extended))]
+    yield Chart('difference', 'Measured less simulated', 'What the simulation leaves over time, before and after the extension.',
+                'time', 's', time, 'residual', unit, lines)
+
+
+def _across(curve: Curve) -> tuple[str, float]:
+    if curve.along == 'time':
+        return span(float(np.ptp(curve.at)) if len(curve.at) else 0.0)
+    return for_people(curve.unit)
+
+
+def _rate_unit(values: Array) -> tuple[str, float]:
+    """Return the unit in which people read rates up to these, and the factor to it."""
+    largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+    return ('deg/h', 3600.0 / DEGREE) if 0.0 < largest < _SLOW else ('deg/s', 1.0 / DEGREE)
+
+
+def _predicted(curve: Curve, place: int) -> Chart | None:
+    """Return what the simulation said that the gyro errs by, and what it did."""
+    if curve.simulated is None:
+        return None
+    measured = curve.simulated + curve.before
+    unit, factor = _rate_unit(measured)
+    across, scale = _across(curve)
+    lines = [Line('measured', 'measured', factor * measured, factor * curve.deviation, dots=True),
+             Line('simulated', 'simulated', factor * curve.simulated)]
+    if not _same(curve):
+        lines.append(Line('simulated, extended', 'after', factor * (measured - curve.after)))
+    along = spoken(curve.along)
+    return Chart(f'predicted-{place}', f'Error of the gyro along {along}', f'Mean of output less true rate along {along}, as measured '
+                 'and as the simulation has it.', along, across, scale * curve.at, 'error', unit, lines)
+
+
+def _residual(curve: Curve, place: int) -> Chart:
+    unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
+    across, scale = _across(curve)
+    lines = [Line('before', 'before', factor * curve.before, factor * curve.deviation)]
+    if not _same(curve):
+        lines.append(Line('after', 'after', factor * curve.after, factor * curve.deviation))
+    along = spoken(curve.along)
+    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}, before and after the '
+                 'extension, with bands of 95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+
+
+def _thinned(at: Array, *values: Array) -> list[Array]:
+    """Return curves with fewer points: of each part the lowest and the highest ones, which stay where they are."""
+    if len(at) <= 4 * _PARTS:
+        return [at, *values]
+    chosen = {0, len(at) - 1}
+    for part in np.array_split(np.arange(len(at)), _PARTS):
+        for each in values:
+            known = np.isfinite(each[part])
+            if known.any():
+                chosen |= {int(part[np.nanargmin(each[part])]), int(part[np.nanargmax(each[part])])}
+    kept = np.array(sorted(chosen))
+    return [each[kept] for each in (at, *values)]
+
+
+# causes
+
+def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
+    inside = any(term.effect.name == found.effect for term in diagnosis.model.terms) and offered(diagnosis)
+    facts = [f'By noise alone: {chance(found.p_value)}.', smallest(found), 'It is in the extended model.' if inside else '']
+    uncertain = element('p', doubt(found), class_='doubt') if found.ambiguous_with else None
+    title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect), ' ', _code(found.effect))
+    return element('article', title,
+                   *(element('p', text) for text in shown_by(found)), _parameters(found), uncertain,
+                   element('p', ' '.join(filter(None, facts)), class_='quiet'))
+
+
+def _code(effect: str) -> Markup | None:
+    """Return the name that files have, where it is another one."""
+    return element('code', effect, class_='quiet') if spoken(effect) != clean(effect) else None
+
+
+def _parameters(found: Finding) -> Markup | None:
+    if not found.parameters:
+        return None
+    return _folding(['', 'estimate', '95 % interval'], [
+        [spoken(name), f'{size.value} {size.unit}'.strip(), size.interval or '–'] for name, size in sizes(found).items()])
+
+
+def _folding(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
+    """Return a table whose rows become lists on a narrow screen."""
+    return element('table', element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
+                   element('tbody', *(_row(heads, row) for row in rows)), class_='fold')
+
+
+def _row(heads: Sequence[str], row: Sequence[str]) -> Markup:
+    cells = [element('td', cell, data_head=head) for head, cell in zip(heads[1:], row[1:])]
+    return element('tr', element('th', row[0], scope='row'), *cells)
+
+
+# what is won, noise
+
+def _gain(diagnosis: Diagnosis) -> Iterator[Markup | None]:
+    if diagnosis.gain is not None:
+        yield element('p', _gain_sentences(diagnosis.gain))
+    parts = [] if diagnosis.heading is None else [draw(_heading(diagnosis.heading))]
+    parts += [] if diagnosis.gain is None else [_gain_table(diagnosis.gain)]
+    yield _pairs(parts) if parts else None
+
+
+def _errors(gain: Gain) -> list[tuple[str, Change, str]]:
+    """Return what was measured before and after, with its unit of SI."""
+    heading = [] if gain.heading is None else [(f'heading error over {gain.window:g} s', gain.heading, 'rad')]
+    return [*heading, ('rate error', gain.rate, 'rad/s')]
+
+
+def _gain_sentences(gain: Gain) -> str:
+    changes = [f'The extension {change(errors, unit, f"the {what}")}.' for what, errors, unit in _errors(gain)]
+    return ' '.join([f'Measured on {clean(gain.held_out)}, which took no part in the choice or the fit.', *changes])
+
+
+def _gain_table(gain: Gain) -> Markup:
+    return _folding(['rms', 'before', 'after', 'won, 95 % interval'], [
+        [what, amount(errors.before, unit), amount(errors.after, unit), _gained(errors, unit)] for what, errors, unit in _errors(gain)])
+
+
+def _heading(curve: HeadingCurve) -> Chart:
+    time, before, after = _thinned(curve.time, curve.before, curve.after)
+    unit, factor = span(float(np.ptp(time)) if len(time) else 0.0)
+    lines = [Line('before', 'before', before / DEGREE), Line('after', 'after', after / DEGREE)]
+    return Chart('heading', 'Heading error over the log', 'Error of the heading if the simulation is believed, before and after the '
+                 'extension.', 'time', unit, factor * time, 'heading error', 'deg', lines)
+
+
+def _noise(diagnosis: Diagnosis) -> Iterator[Markup | None]:
+    table = _folding(['', 'residual', 'simulation'], noise_figures(diagnosis))
+    if diagnosis.noise_curve is None:
+        yield table
+    else:
+        yield element('div', draw(_allan(diagnosis.noise_curve)), table, class_='pairs')
+
+
+def _allan(curve: NoiseCurve) -> Chart:
+    factor = 3600.0 / DEGREE
+    lines = [Line('residual', 'measured', factor * curve.measured, dots=True), Line('noise as found', 'after', factor * curve.fitted)]
+    if curve.simulated is not None:
+        lines.append(Line('noise of the simulation', 'simulated', factor * curve.simulated))
+    return Chart('noise', 'Allan deviation of the residual', 'Allan deviation over averaging time, of the residual and of the noise '
+                 'that is simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation', 'deg/h', lines, logarithmic=True)
+
+
+# the rest
+
+def _reasons(diagnosis: Diagnosis) -> Markup:
+    return element('dl', *(joined(element('dt', listed(names)), element('dd', reason))
+                           for reason, names in hidden(diagnosis.cannot_show).items()))
+
+
+def _model(diagnosis: Diagnosis) -> Iterator[Markup]:
+    what = ('This is the extended model, as model.yaml has it; compensate, simulate and the compensation node take it as it is.'
+            if offered(diagnosis) else 'The model is as it was.')
+    yield element('p', what)
+    yield element('pre', element('code', model_text(diagnosis.model)), tabindex='0', class_='scroll')
+
+
+def _method(diagnosis: Diagnosis) -> Iterator[Markup | None]:
+    logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
+    yield element('p', ' '.join(_METHOD).format(logs=logs, share=f'{100.0 * diagnosis.false_alarm_rate:.2g} %'))
+    yield _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None
+    yield element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')

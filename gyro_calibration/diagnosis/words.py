@@ -1,0 +1,187 @@
+"""A diagnosis in plain words: the same for the terminal and for the report."""
+
+from __future__ import annotations
+
+import textwrap
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+
+from gyro_calibration.diagnosis.finding import Change, Diagnosis, Finding, Unexplained
+from gyro_calibration.diagnosis.units import Quantity, amount, chance, number, quantity
+from gyro_calibration.model import same_effects
+
+#: Lines for a terminal are not longer.
+_WIDTH = 120
+#: So many causes are named in one sentence.
+_NAMED = 3
+_FIGURES = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s', 'rate_random_walk': 'rad/s/√s'}
+
+
+def clean(text: str) -> str:
+    """Return a text, such as the name of a file, without what could steer a terminal or break a page."""
+    plain = text.encode(errors='replace').decode()
+    return ''.join('\ufffd' if unicodedata.category(each) in ('Cc', 'Cf') else each for each in plain)
+
+
+def spoken(name: str) -> str:
+    """Return the name of an effect or a parameter as words."""
+    return clean(name).replace('_', ' ')
+
+
+def listed(words: Sequence[str], last: str = 'and') -> str:
+    """Return words as a list in a sentence."""
+    return f' {last} '.join(filter(None, [', '.join(words[:-1]), *words[-1:]]))
+
+
+def sentence(text: str) -> str:
+    """Return a text with a capital and a full stop."""
+    text = clean(text).strip()
+    return text if not text else text[0].upper() + text[1:] + ('' if text[-1] in '.!?' else '.')
+
+
+# the finding in two sentences
+
+def headline(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Return the finding in two sentences: what is wrong, and what is won by mending it."""
+    if diagnosis.verdict == 'adequate':
+        return ('Simulation and measurement differ by no more than noise.',
+                f'The model is left as it is; of logs without any cause, {100.0 * diagnosis.false_alarm_rate:.2g} % would give an alarm '
+                'by chance.')
+    named = [f'because of {_named(diagnosis.findings)}'] if diagnosis.findings else []
+    left = [_left(diagnosis.unexplained, bool(named))] if diagnosis.unexplained else []
+    return f'Simulation and measurement differ {", and ".join(named + left)}.', _won(diagnosis)
+
+
+def _named(findings: Sequence[Finding]) -> str:
+    if len(findings) > 1:
+        more = [f'{len(findings) - _NAMED} more'] if len(findings) > _NAMED else []
+        return f'{len(findings)} causes: ' + listed([alternatives(each) for each in findings[:_NAMED]] + more)
+    (found,) = findings
+    size = next(iter(sizes(found).values()), None)
+    if not found.ambiguous_with:
+        return spoken(found.effect) + ('' if size is None else f': {size}')
+    taken = '' if size is None else f'; taken as {spoken(found.effect)} it is {size}'
+    return f'{alternatives(found)}, which these data cannot tell apart{taken}'
+
+
+def alternatives(found: Finding) -> str:
+    """Return the names of a cause and of those that the data cannot rule out instead."""
+    return listed([spoken(name) for name in (found.effect, *found.ambiguous_with)], 'or')
+
+
+def sizes(found: Finding) -> dict[str, Quantity]:
+    """Return the parameters of a cause as people read them."""
+    return {name: quantity(value, name) for name, value in found.parameters.items()}
+
+
+def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
+    where = listed([spoken(each.along) for each in unexplained[:_NAMED]])
+    share = number(100.0 * max(each.share_of_variance for each in unexplained), 2)
+    what = 'by something' if beside else 'by structure'
+    most = 'up to ' if len(unexplained) > 1 else ''
+    return f'along {where} {what} that no cause in the catalogue explains ({most}{share} % of the variance of the residual)'
+
+
+def offered(diagnosis: Diagnosis) -> bool:
+    """Tell whether the model was extended."""
+    return not same_effects(diagnosis.before, diagnosis.model)
+
+
+def _won(diagnosis: Diagnosis) -> str:
+    gain = diagnosis.gain
+    if not offered(diagnosis):
+        return 'No extended model is offered, so that the model is left as it is.'
+    if gain is None:
+        return 'An extended model is offered, but these data do not allow to measure what it wins.'
+    if gain.heading is None:
+        return f'The extended model {change(gain.rate, "rad/s", "the rate error")}, measured on {clean(gain.held_out)}.'
+    what = f'the heading error over {gain.window:g} s'
+    return f'The extended model {change(gain.heading, "rad", what)}, measured on {clean(gain.held_out)}.'
+
+
+def change(errors: Change, unit: str, what: str) -> str:
+    """Return what becomes of an error, as the end of a sentence."""
+    before, after = (amount(value, unit) for value in (errors.before, errors.after))
+    if errors.interval[0] > 0.0:
+        return f'brings {what} down from {before} to {after} rms'
+    if errors.interval[1] < 0.0:
+        return f'makes {what} worse, from {before} to {after} rms'
+    return f'leaves {what} as it is within chance, {before} before and {after} after'
+
+
+# one by one
+
+def shown_by(found: Finding) -> list[str]:
+    """Return what there is to say of a cause, beside its size: a sentence each."""
+    return [sentence(text) for text in (found.cause, found.evidence) if text.strip()]
+
+
+def doubt(found: Finding) -> str:
+    """Return what else it could be, and what would part them; empty where it is sure."""
+    if not found.ambiguous_with:
+        return ''
+    others = listed([spoken(name) for name in found.ambiguous_with], 'or')
+    remedy = f' To part them: {sentence(found.separate_by)}' if found.separate_by else ' No experiment is known that would part them.'
+    return f'These data cannot rule out that it is {others} instead.{remedy}'
+
+
+def smallest(found: Finding) -> str:
+    """Return what would have been found, as a sentence; empty where that has no meaning."""
+    if found.minimum_detectable is None or not found.parameters:
+        return ''
+    name, first = next(iter(found.parameters.items()))
+    return f'From {amount(found.minimum_detectable, first.unit, name, 2)} on it would have been found.'
+
+
+def unknown(each: Unexplained) -> str:
+    """Return what is known of structure without a name."""
+    share = number(100.0 * each.share_of_variance, 2)
+    return f'Along {spoken(each.along)}: {share} % of the variance of the residual; by noise alone {chance(each.p_value)}.'
+
+
+def noise_figures(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
+    """Return the name of each noise figure, that of the residual, and that of the simulation."""
+    def shown(value: float, name: str) -> str:
+        return amount(value, _FIGURES[name], name) if value else 'none'
+    return [(spoken(name), shown(getattr(diagnosis.noise, name), name), shown(getattr(diagnosis.simulated, name), name))
+            for name in _FIGURES]
+
+
+def hidden(cannot_show: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the causes that the logs cannot show, by the reason."""
+    reasons: dict[str, list[str]] = {}
+    for name, reason in cannot_show.items():
+        reasons.setdefault(sentence(reason), []).append(spoken(name))
+    return reasons
+
+
+# for a terminal
+
+def lines(diagnosis: Diagnosis) -> Iterator[str]:
+    """Give the diagnosis for a terminal: the finding in two sentences, then a short list."""
+    yield from map(_wrapped, headline(diagnosis))
+    for place, found in enumerate(diagnosis.findings, 1):
+        yield ''
+        yield from _finding_lines(f'{place}. ', found)
+    for title, items in _lists(diagnosis):
+        if items:
+            yield from ('', title, *(_wrapped(f'- {item}', 2) for item in items))
+
+
+def _finding_lines(mark: str, found: Finding) -> Iterator[str]:
+    indent = len(mark)
+    parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}' for name, size in sizes(found).items()]
+    yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}{", ".join(parameters)}', indent)
+    for text in (' '.join([*shown_by(found), f'By noise alone: {chance(found.p_value)}.', smallest(found)]), doubt(found)):
+        if text:
+            yield _wrapped(' ' * indent + text, indent)
+
+
+def _lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
+    yield 'Without a name:', [unknown(each) for each in diagnosis.unexplained]
+    yield 'These data cannot show:', [f'{listed(names)}: {reason}' for reason, names in hidden(diagnosis.cannot_show).items()]
+    yield 'To know:', [sentence(remark) for remark in diagnosis.remarks]
+
+
+def _wrapped(text: str, indent: int = 0) -> str:
+    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False, break_on_hyphens=False)

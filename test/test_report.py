@@ -1,0 +1,469 @@
+"""
+The report of a diagnosis: one page that needs nothing else, looked at in a browser as people do, on a phone and on a desk.
+
+"""
+
+import base64
+import json
+import os
+import select
+import subprocess
+import time
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyro_calibration.diagnosis.finding import (
+    Change,
+    Curve,
+    Diagnosis,
+    Estimate,
+    Finding,
+    Gain,
+    HeadingCurve,
+    NoiseCurve,
+    Trace,
+    Unexplained,
+)
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.words import headline, lines
+from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.noise import Noise
+
+CHROMIUM = Path('/usr/bin/chromium')
+HOSTILE = ('</title></script><script>document.title = "taken"</script><img src="http://example.org/x.png" onerror="alert(1)">'
+           '&"\'\x1b[2J\udcff.csv')
+
+
+# diagnoses made by hand
+
+def curve(along, unit, at, error, mended, deviation=0.01 * DEGREE):
+    """Return a curve whose error is wholly before, and partly mended after."""
+    generator = np.random.default_rng(len(along))
+    before = error + deviation * generator.standard_normal(len(at))
+    return Curve(along, unit, at, before, before - mended * error, np.full(len(at), deviation), 0.1 * DEGREE + 0.0 * at)
+
+
+TEMPERATURE = np.linspace(18.0, 41.0, 24)
+HEADING = np.linspace(-np.pi, np.pi, 37)
+RATE = np.linspace(-100.0, 100.0, 31) * DEGREE
+TIME = np.linspace(0.0, 1500.0, 40)
+
+
+def temperature_finding(ambiguous=('rate_ramp',)):
+    size = Estimate(0.021 * DEGREE, (0.0203 * DEGREE, 0.0217 * DEGREE), 'rad/s/K')
+    return Finding('bias_temperature', CATALOGUE['bias_temperature'].cause, {'bias_temperature': size}, 1e-9, 0.0009 * DEGREE, ambiguous,
+                   'heat and cool the gyro within one log' if ambiguous else '',
+                   'From 18 to 41 °C the residual rises by 0.48 deg/s.', 'temperature')
+
+
+def adequate():
+    return Diagnosis((), (), Noise(1e-4, 2e-5, 1e-6), Noise(1e-4, 2e-5, 1e-6), None, GyroModel(), GyroModel(),
+                     logs=('still.csv',), curves=[curve('temperature', 'degC', TEMPERATURE, 0.0 * TEMPERATURE, 0.0)])
+
+
+def extended():
+    """Return a diagnosis with one cause that the data leave in a set, and everything there is to draw."""
+    model = GyroModel((Term(CATALOGUE['bias'], (0.1 * DEGREE,)), Term(CATALOGUE['bias_temperature'], (25.0, 0.021 * DEGREE))),
+                      np.diag([1e-9, 1e-12]), (-1.745, 1.745), (18.0, 41.0), noise=Noise(1e-4, 2e-5, 1e-6), gyro={'name': 'yaw gyro'})
+    thermal = (TEMPERATURE - 25.0) * 0.021 * DEGREE
+    curves = [curve('temperature', 'degC', TEMPERATURE, thermal, 0.98), curve('rate', 'rad/s', RATE, 0.0 * RATE, 0.0),
+              curve('time', 's', TIME, 1e-4 * TIME * DEGREE, 0.97), curve('heading', 'rad', HEADING, 0.0 * HEADING, 0.0)]
+    gain = Gain('every second block of 150 s', Change(0.31 * DEGREE, 0.12 * DEGREE, (0.17 * DEGREE, 0.21 * DEGREE)),
+                Change(8.2 * DEGREE, 1.1 * DEGREE, (6.6 * DEGREE, 7.7 * DEGREE)))
+    no_force = 'the log holds no specific force'
+    cannot_show = {'supply_sensitivity': 'the log holds no supply voltage', 'acceleration_sensitivity': no_force,
+                   'vibration_rectification': no_force}
+    return Diagnosis((temperature_finding(),), (), Noise(1.3e-4, 2e-5, 0.0), Noise(1e-4, 2e-5, 1e-6), gain,
+                     replace(model, terms=model.terms[:1]), model, cannot_show, curves, heading_curve(45000), noise_curve(),
+                     ('12 lost samples were left out.', 'the reference is an encoder'), logs=('turntable.csv.gz',), trace=trace())
+
+
+def heading_curve(count):
+    time = np.linspace(0.0, 900.0, count)
+    walk = np.cumsum(np.random.default_rng(3).standard_normal(count)) * 0.4 / np.sqrt(count) * DEGREE
+    return HeadingCurve(time, walk + 9.0 * DEGREE * (time / 900.0) ** 2, walk)
+
+
+def noise_curve():
+    times = np.geomspace(0.02, 300.0, 50)
+    fitted = np.sqrt(1.3e-4 ** 2 / times + (0.664 * 2e-5) ** 2)
+    return NoiseCurve(times, fitted * (1.0 + 0.05 * np.sin(np.arange(50.0))), fitted, np.sqrt(1e-8 / times + 1e-12 * times / 3.0))
+
+
+def trace():
+    time = np.linspace(412.0, 424.0, 600)
+    rate = 60.0 * DEGREE * np.sin(1.2 * time) + 0.1 * DEGREE * np.random.default_rng(4).standard_normal(600)
+    return Trace(time, rate, 60.0 * DEGREE * np.sin(1.2 * time) - 0.4 * DEGREE, 60.0 * DEGREE * np.sin(1.2 * time))
+
+
+def unexplained():
+    """Return a diagnosis where something along the heading has no name."""
+    return replace(adequate(), unexplained=(Unexplained('heading', 0.12, 1e-7), Unexplained('rate', 0.03, 2e-4)),
+                   curves=[curve('heading', 'rad', HEADING, 0.08 * DEGREE * np.sin(3.0 * HEADING), 0.0)])
+
+
+def no_gain():
+    return replace(extended(), gain=None, heading=None, noise_curve=None, trace=None)
+
+
+def several():
+    """Return a diagnosis with many causes, of the log, the reference and the gyro."""
+    offset = Estimate(0.0201, (0.0198, 0.0204), 's')
+    cubic = Estimate(-2.1e-3, (-2.4e-3, -1.8e-3), 's²/rad²')
+    warm = {'warm_up': Estimate(0.3 * DEGREE, (0.2 * DEGREE, 0.4 * DEGREE), 'rad/s'),
+            'time_constant': Estimate(240.0, (180.0, 330.0), 's')}
+    found = (temperature_finding(()),
+             Finding('time_offset', 'The stamps of the output come late.', {'time_offset': offset}, 0.0, 1e-4, ('bandwidth',),
+                     'reverse the motion faster than once in two seconds', 'The output lags the encoder.'),
+             Finding('cubic_nonlinearity', CATALOGUE['cubic_nonlinearity'].cause, {'cubic_nonlinearity': cubic}, 3e-4, 5e-4, along='rate'),
+             Finding('warm_up', 'The bias settles after power-on.', warm, 2e-5),
+             Finding('dropped_samples', 'Samples are missing.', {}, 1e-12, evidence='123 samples are missing in 40 gaps.'))
+    return replace(extended(), findings=found, unexplained=(Unexplained('frequency', 0.004, 0.002),), logs=('a.csv', 'b.csv'))
+
+
+def hostile():
+    found = replace(temperature_finding((HOSTILE,)), effect=HOSTILE, cause=HOSTILE, separate_by=HOSTILE, evidence=HOSTILE, along=HOSTILE,
+                    parameters={HOSTILE: Estimate(1.0, (0.5, 1.5), HOSTILE)})
+    whole = extended()
+    model = replace(whole.model, gyro={'name': HOSTILE}, origin={'file': HOSTILE.replace('\udcff', '')})
+    gain = replace(whole.gain, held_out=HOSTILE)
+    return replace(whole, findings=(found,), unexplained=(Unexplained(HOSTILE, 0.1, 0.01),), logs=(HOSTILE,), gain=gain,
+                   remarks=(HOSTILE, '$title $body'), cannot_show={HOSTILE: HOSTILE}, model=model,
+                   curves=[replace(whole.curves[0], along=HOSTILE, unit=HOSTILE)])
+
+
+def holes():
+    """Return a diagnosis whose numbers are lacking in places."""
+    whole, missing = extended(), np.full(24, np.nan)
+    found = replace(temperature_finding(), p_value=np.nan, minimum_detectable=None,
+                    parameters={'bias_temperature': Estimate(1e-4, (-np.inf, np.inf), 'rad/s/K'), 'k': Estimate(0.0, (0.0, 0.0), 's')})
+    some = np.where(np.arange(24) % 5 == 0, np.nan, whole.curves[0].before)
+    curves = [replace(whole.curves[0], before=some, deviation=missing), replace(whole.curves[0], before=missing, after=missing),
+              Curve('time', 's', np.array([]), np.array([]), np.array([]), np.array([]))]
+    return replace(whole, findings=(found,), curves=curves, heading=HeadingCurve(np.array([0.0]), np.array([0.0]), np.array([0.0])))
+
+
+MADE = {each.__name__: each for each in (adequate, extended, unexplained, no_gain, several, hostile, holes)}
+
+
+@pytest.fixture(params=MADE, scope='module')
+def made(request):
+    """Return one diagnosis after the other."""
+    return MADE[request.param]()
+
+
+# the page as text
+
+class Page(HTMLParser):
+    """Reads a page strictly: every element that is opened is closed, in order, and says which elements and attributes there are."""
+
+    EMPTY = {'meta', 'br'}
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.texts = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, f'left open: {self.open}'
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        self.open += [] if tag in self.EMPTY else [tag]
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open.pop() == tag, (tag, self.getpos())
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    @property
+    def text(self):
+        """What a person can read."""
+        return ' '.join(' '.join(self.texts).split())
+
+
+def test_the_page_is_well_formed_and_has_each_name_once(made):
+    page = Page(report(made))
+    names = [attributes['id'] for _, attributes in page.elements if 'id' in attributes]
+    assert len(names) == len(set(names))
+    assert {tag for tag, _ in page.elements} >= {'h1', 'main', 'section', 'style', 'script'}
+
+
+def test_the_page_refers_to_nothing_outside(made):
+    for tag, attributes in Page(report(made)).elements:
+        assert tag not in ('img', 'link', 'iframe', 'object', 'embed', 'base', 'form', 'a')
+        assert not {'src', 'href', 'srcset', 'action', 'style'} & set(attributes)
+        assert not any(name.startswith('on') for name in attributes)
+
+
+def test_the_page_allows_itself_no_network(made):
+    policy, = [attributes['content'] for tag, attributes in Page(report(made)).elements if attributes.get('http-equiv')]
+    assert policy.startswith("default-src 'none';")
+
+
+def test_texts_of_others_stay_texts():
+    text = report(hostile())
+    page = Page(text)
+    assert [tag for tag, _ in page.elements].count('script') == 1
+    assert '<script>document.title' in page.text and '$title $body' in page.text
+    assert not any(ord(each) < 32 and each != '\n' for each in text)
+    text.encode()  # what cannot be said in UTF-8 could not be written
+
+
+def test_no_number_is_written_as_a_computer_says_it(made):
+    text = Page(report(made)).text.split('The model', 1)[0]
+    assert not [word for word in ('nan', 'inf ', 'None', 'e-0', 'np.float') if word in text]
+
+
+def test_every_chart_has_words_and_a_table_of_its_values(made):
+    page = Page(report(made))
+    tags = [tag for tag, _ in page.elements]
+    charts = [attributes for tag, attributes in page.elements if tag == 'svg' and attributes.get('role') == 'img']
+    assert tags.count('desc') == tags.count('figure') == len(charts) and all(each['aria-labelledby'] for each in charts)
+    assert [tag for tag in tags if tag == 'caption'] == ['caption'] * len(charts)
+
+
+def test_the_finding_stands_on_top_and_is_the_same_for_the_terminal(made):
+    text = Page(report(made)).text
+    if made.logs != (HOSTILE,):
+        assert all(sentence in text for sentence in headline(made))
+    assert len(headline(made)) == 2
+    assert ' '.join(lines(made)).replace('\n', ' ').startswith(headline(made)[0])
+
+
+def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
+    whole = replace(extended(), heading=heading_curve(1_000_000))
+    whole.heading.before[777_777] = 50.0 * DEGREE
+    text = report(whole)
+    assert len(text.encode()) < 300_000
+    assert '<td>50</td>' in text
+
+
+# the words
+
+def test_a_set_is_named_with_the_experiment_that_parts_it():
+    text = ' '.join(' '.join(lines(extended())).split())
+    assert 'bias temperature or rate ramp, which these data cannot tell apart' in text
+    assert 'To part them: Heat and cool the gyro within one log.' in text
+
+
+def test_sizes_are_in_the_units_of_people():
+    text = ' '.join(lines(several()))
+    assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
+
+
+@pytest.mark.parametrize('interval, words', [((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'within chance'), ((-0.02, -0.01), 'worse')])
+def test_a_gain_is_called_what_it_is(interval, words):
+    whole = extended()
+    gain = replace(whole.gain, heading=replace(whole.gain.heading, interval=interval))
+    assert words in headline(replace(whole, gain=gain))[1]
+
+
+def test_lines_for_a_terminal_are_not_too_long(made):
+    if made.logs != (HOSTILE,):
+        assert max(len(line) for text in lines(made) for line in text.split('\n')) <= 120
+
+
+# the page in a browser
+
+class Browser:
+    """
+    Chromium without a window, spoken to through a pipe in its own protocol; what it asks the network for and complains of is kept.
+
+    """
+
+    def __init__(self, folder):
+        there, self._out = os.pipe()
+        self._in, back = os.pipe()
+        command = ['bash', '-c', f'exec "$@" 3<&{there} 4>&{back}', 'bash', str(CHROMIUM), '--headless', '--remote-debugging-pipe',
+                   '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--no-first-run', f'--user-data-dir={folder}', 'about:blank']
+        self._process = subprocess.Popen(command, pass_fds=(there, back), stderr=subprocess.DEVNULL)
+        os.close(there)
+        os.close(back)
+        self._rest, self._number, self.events, self._session = b'', 0, [], None
+        page = next(each for each in self('Target.getTargets')['targetInfos'] if each['type'] == 'page')
+        self._session = self('Target.attachToTarget', targetId=page['targetId'], flatten=True)['sessionId']
+        for domain in ('Page', 'Network', 'Runtime', 'Log'):
+            self(f'{domain}.enable')
+
+    def __call__(self, method, **parameters):
+        """Ask for something and return the answer."""
+        self._number += 1
+        session = {'sessionId': self._session} if self._session else {}
+        os.write(self._out, json.dumps({'id': self._number, 'method': method, 'params': parameters, **session}).encode() + b'\0')
+        while (message := self._next()).get('id') != self._number:
+            self.events.append(message)
+        assert 'error' not in message, message
+        return message['result']
+
+    def _next(self, timeout=30.0):
+        deadline = time.monotonic() + timeout
+        while b'\0' not in self._rest:
+            assert select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))[0], 'the browser does not answer'
+            self._rest += os.read(self._in, 1 << 20)
+        message, self._rest = self._rest.split(b'\0', 1)
+        return json.loads(message)
+
+    def show(self, path, width, height, dark=False):
+        """Load a page on a screen of this size."""
+        self('Emulation.setDeviceMetricsOverride', width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        self('Emulation.setEmulatedMedia', features=[{'name': 'prefers-color-scheme', 'value': 'dark' if dark else 'light'}])
+        self.events.clear()
+        self('Page.navigate', url=path.as_uri())
+        while not any(event.get('method') == 'Page.loadEventFired' for event in self.events):
+            self.events.append(self._next())
+
+    def tell(self, expression):
+        """Return what an expression is in the page."""
+        answer = self('Runtime.evaluate', expression=expression, returnByValue=True)
+        assert 'exceptionDetails' not in answer, answer
+        return answer['result'].get('value')
+
+    def point(self, selector, part):
+        """Move the pointer over an element, to a part of its width."""
+        x, y = self.tell(f'(() => {{ const picture = document.querySelector("{selector}"); picture.scrollIntoView({{block: "center"}}); '
+                         f'const box = picture.getBoundingClientRect(); return [box.x + {part} * box.width, box.y + box.height / 2]; }})()')
+        self('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y)
+
+    def picture(self, path):
+        """Keep a picture of the whole page."""
+        height = self.tell('document.documentElement.scrollHeight')
+        width = self.tell('innerWidth')
+        clip = {'x': 0, 'y': 0, 'width': width, 'height': height, 'scale': 1}
+        path.write_bytes(base64.b64decode(self('Page.captureScreenshot', captureBeyondViewport=True, clip=clip)['data']))
+
+    def close(self):
+        """End it."""
+        self('Browser.close')
+        self._process.wait(20.0)
+        os.close(self._in)
+        os.close(self._out)
+
+
+@pytest.fixture(scope='module')
+def browser(tmp_path_factory):
+    """Return a browser; skip where there is none."""
+    if not CHROMIUM.exists():
+        pytest.skip(f'{CHROMIUM} is missing: install the package chromium')
+    browser = Browser(tmp_path_factory.mktemp('profile'))
+    yield browser
+    browser.close()
+
+
+SCREENS = {'phone': (360, 800), 'desk': (1280, 900)}
+
+
+@pytest.fixture(params=SCREENS)
+def screen(request):
+    """Return the size of a screen."""
+    return SCREENS[request.param]
+
+
+@pytest.fixture(scope='module')
+def path(made, tmp_path_factory):
+    """Return a file with the page."""
+    path = tmp_path_factory.mktemp('page') / 'report.html'
+    path.write_text(report(made), encoding='utf-8')
+    return path
+
+
+#: Elements that reach beyond the right edge of the screen, other than within a box that scrolls by itself.
+BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest(".scroll, svg") && '
+          'each.getBoundingClientRect().right > innerWidth + 0.5).map(each => each.outerHTML.slice(0, 80))')
+
+
+def test_the_page_fits_the_screen(browser, path, screen):
+    browser.show(path, *screen)
+    assert browser.tell('innerWidth') == screen[0]
+    assert browser.tell('document.documentElement.scrollWidth') <= screen[0]
+    assert browser.tell(BEYOND) == []
+
+
+def test_the_page_opens_without_complaint_and_without_network(browser, path, screen):
+    browser.show(path, *screen)
+    kinds = ('Runtime.exceptionThrown', 'Log.entryAdded', 'Runtime.consoleAPICalled')
+    complaints = [event for event in browser.events if event.get('method') in kinds]
+    asked = [event['params']['request']['url'] for event in browser.events if event.get('method') == 'Network.requestWillBeSent']
+    assert not complaints
+    assert asked == [path.as_uri()]
+    assert browser.tell('document.title').startswith('Diagnosis of ')
+
+
+@pytest.fixture(scope='module')
+def whole_path(tmp_path_factory):
+    """Return a file with the page that has every chart."""
+    path = tmp_path_factory.mktemp('whole') / 'report.html'
+    path.write_text(report(extended()), encoding='utf-8')
+    return path
+
+
+def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path, screen):
+    browser.show(whole_path, *screen)
+    count = browser.tell('document.querySelectorAll("figure.chart").length')
+    browser.tell('document.querySelectorAll("figure.chart").forEach((each, place) => each.id = "chart" + place)')
+    assert count == 9
+    for place in range(count):
+        browser.point(f'#chart{place} > svg', 0.6)
+        shown = browser.tell(f'document.querySelector("#chart{place} .readout").textContent')
+        rows = browser.tell(f'[...document.querySelectorAll("#chart{place} tbody tr")].map(row => '
+                            '[...row.cells].map(cell => cell.textContent))')
+        assert any(all(cell in shown for cell in row) for row in rows), shown
+        assert browser.tell(f'getComputedStyle(document.querySelector("#chart{place} .cursor")).visibility') == 'visible'
+
+
+def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
+    browser.show(whole_path, *screen)
+    temperatures = []
+    browser.tell('[...document.querySelectorAll("figure")].find(each => '
+                 'each.textContent.startsWith("Residual along temperature")).id = "thermal"')
+    for part in (46.0 / 360.0, 198.0 / 360.0, 350.0 / 360.0):  # left end, middle and right end of the axis
+        browser.point('#thermal > svg', part)
+        temperatures.append(float(browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
+    assert temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51 and temperatures[2] == 41.0
+
+
+def test_arrow_keys_read_values_too(browser, whole_path):
+    browser.show(whole_path, *SCREENS['desk'])
+    browser.tell('document.querySelector("figure.chart > svg").focus()')
+    for _ in range(2):
+        browser('Input.dispatchKeyEvent', type='keyDown', key='ArrowRight', code='ArrowRight', windowsVirtualKeyCode=39)
+    first = browser.tell('[...document.querySelectorAll("figure.chart tbody tr")][1].cells[0].textContent')
+    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith(f'time {first} s')
+
+
+#: The least contrast of any text, and of any stroke, with what lies behind it (WCAG 2, 1.4.3 and 1.4.11).
+CONTRAST = """(() => {
+  const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number).map(each => each / 255)
+    .map(each => each > 0.04045 ? ((each + 0.055) / 1.055) ** 2.4 : each / 12.92); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const behind = each => { const colour = getComputedStyle(each).backgroundColor;
+    return colour.startsWith('rgba') && each.parentElement ? behind(each.parentElement) : colour; };
+  const contrast = (a, b) => { const [low, high] = [light(a), light(b)].sort((x, y) => x - y); return (high + 0.05) / (low + 0.05); };
+  const least = (selector, name) => Math.min(...[...document.querySelectorAll(selector)].map(each =>
+    contrast(getComputedStyle(each)[name], behind(each))));
+  const texts = 'p, h1, h2, h3, li, td, th, dt, dd, summary, figcaption, pre';
+  return [least(texts, 'color'), least('svg text', 'fill'), least('.stroke', 'stroke')];
+})()"""
+
+
+@pytest.mark.parametrize('dark', [False, True], ids=['light', 'dark'])
+def test_everything_can_be_read_in_light_and_in_dark(browser, whole_path, dark):
+    browser.show(whole_path, *SCREENS['phone'], dark=dark)
+    text, letters, strokes = browser.tell(CONTRAST)
+    paper = browser.tell('getComputedStyle(document.body).backgroundColor')
+    assert (paper == 'rgb(20, 24, 27)') == dark
+    assert text >= 4.5 and letters >= 4.5 and strokes >= 3.0
+
+
+def test_it_can_be_printed(browser, whole_path):
+    browser.show(whole_path, *SCREENS['desk'])
+    sheets = base64.b64decode(browser('Page.printToPDF', preferCSSPageSize=True)['data'])
+    assert sheets.startswith(b'%PDF') and 2 <= sheets.count(b'/Type /Page\n') <= 12
