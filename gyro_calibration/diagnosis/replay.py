@@ -1,0 +1,156 @@
+"""
+A log and its simulation side by side: the residual, and what the causes look at, sample by sample and on an even grid.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from gyro_calibration.diagnosis.spectrum import transform
+from gyro_calibration.effects import Channels
+from gyro_calibration.history import channels_of
+from gyro_calibration.log import Array, Log, Mask
+
+#: More points of the grid than this are averaged in neighbours, for a million samples are more than are needed to part causes.
+MOST_POINTS = 100_000
+#: A heading is smoothed over so long, s, to find the rate that nonlinear effects look at.
+SMOOTHING = 0.15
+
+
+@dataclass(frozen=True)
+class Replay:
+    """
+    One log, ready to be searched: n samples, of which some are trusted.
+
+    Attributes
+    ----------
+    channels : what the effects look at; the rate is that of the reference, the time counts from the first sample
+    reference : the rate that the output is compared with, rad/s: as measured, where `channels.rate` is smooth
+    kept : samples that are trusted
+    place : number of each kept sample on the even grid
+    interval : of the grid, s
+    every : so many points of the grid are averaged into one
+    rounded : the reference is the difference of a heading, whose error is white times (2 - 2 cos)
+    has : names of the channels that the log has
+
+    """
+
+    channels: Channels
+    reference: Array
+    kept: Mask
+    place: Array
+    interval: float
+    every: int
+    rounded: bool
+    has: frozenset[str]
+
+    @property
+    def step(self) -> float:
+        """Return the interval of the points that are searched, s."""
+        return self.interval * self.every
+
+    @property
+    def points(self) -> int:
+        """Return how many points are searched."""
+        return (int(self.place[-1]) + 1) // self.every
+
+    @property
+    def duration(self) -> float:
+        """Return the length of the log, s."""
+        return self.points * self.step
+
+    def on_grid(self, values: Array) -> Array:
+        """Return samples, shape (n,), on the even grid: lost ones are bridged, and neighbours averaged where there are many."""
+        known = values[self.kept]
+        whole = known if len(known) == self.place[-1] + 1 else np.interp(np.arange(self.place[-1] + 1), self.place, known)
+        return whole[:self.points * self.every].reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
+
+    def coefficients(self, values: Array) -> Array:
+        """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
+        return transform(self.on_grid(values))
+
+    def with_rate(self, rate: Array) -> Replay:
+        """Return it with another rate that the effects look at."""
+        return replace(self, channels=replace(self.channels, rate=rate))
+
+
+def replay(log: Log, trusted: Mask, update: float | None = None) -> Replay:
+    """
+    Lay a log out.
+
+    Parameters
+    ----------
+    log : with output, time and a reference; one at rest needs no reference
+    trusted : samples to use, shape (n,)
+    update : interval at which the reference is renewed, s, where it is held in between
+
+    """
+    assert log.time is not None and log.output is not None
+    time = log.time - log.time[0]
+    seen = channels_of(log)
+    if log.reference_rate is not None:
+        rate = _between_updates(time, log.reference_rate, update)
+        reference, smooth, rounded = rate, rate, False
+    elif log.reference_heading is not None:
+        heading = _between_updates(time, log.reference_heading, update)
+        reference, smooth, rounded = *_rates(time, heading), True
+    else:
+        reference = smooth = np.zeros(len(log))
+        rounded = False
+    kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
+    place, interval = numbered(time, kept)
+    every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
+    output = _at_intervals(log.output) if rounded else log.output
+    heading = _heading(time, log, smooth)
+    return Replay(replace(seen, rate=smooth, output=output, time=time, heading=heading), reference, kept, place, interval, every,
+                  rounded, _known(log))
+
+
+def numbered(time: Array, kept: Mask) -> tuple[Array, float]:
+    """Number the kept samples on an even grid, and return its interval, s."""
+    interval = float(np.median(np.diff(time)))
+    steps = np.maximum(np.rint(np.diff(time) / interval), 1.0)
+    place = np.concatenate([[0.0], np.cumsum(steps)]).astype(int)[kept]
+    return place - place[0], float((time[kept][-1] - time[kept][0]) / (place[-1] - place[0]))
+
+
+def _known(log: Log) -> frozenset[str]:
+    return frozenset(name for name in ('temperature', 'specific_force', 'supply') if getattr(log, name) is not None)
+
+
+def _between_updates(time: Array, values: Array, update: float | None) -> Array:
+    """Interpolate a held reference between its updates, for a held value is half an interval late."""
+    if update is None:
+        return values
+    renewed = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    return np.interp(time, time[renewed], values[renewed])
+
+
+def _rates(time: Array, heading: Array) -> tuple[Array, Array]:
+    """Return mean rates from each sample to the next (the last is repeated), as differences and smooth."""
+    interval = np.diff(time)
+    raw = np.diff(heading) / interval
+    length = max(5, 2 * round(0.5 * SMOOTHING / np.median(interval)) + 1)
+    known = np.isfinite(heading)
+    filled = np.interp(time, time[known], heading[known])
+    smooth = savgol_filter(filled, length, 2)
+    even = np.diff(smooth) / interval
+    return np.append(raw, np.nan), np.append(even, even[-1])
+
+
+def _at_intervals(values: Array) -> Array:
+    """Return the mean of each sample and the next."""
+    return np.append(0.5 * (values[1:] + values[:-1]), values[-1])
+
+
+def _heading(time: Array, log: Log, rate: Array) -> Array:
+    """Return the heading that effects look at: the reference's, or the integral of its rate."""
+    if log.reference_heading is not None and np.isfinite(log.reference_heading).all():
+        return log.reference_heading
+    known = np.nan_to_num(rate)
+    return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * np.diff(time))])

@@ -1,0 +1,350 @@
+"""
+Which causes the data support.
+
+Causes are added one by one, the strongest first. The shapes of those that come into question are refined before one is taken, so that a
+large effect that was only nearly right leaves nothing that other causes could take up. In the end each is taken out again, to see
+whether another explains it better, or none is needed.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
+from scipy.special import logsumexp
+
+from gyro_calibration.diagnosis.candidates import Candidate, by_cause, candidates, columns_of, effect, fitted_shapes, pulse, with_shape
+from gyro_calibration.diagnosis.evidence import Judged, beside, drawn, evidence, judge, measured, sums
+from gyro_calibration.diagnosis.field import Field, Named, Work, field, seen, work
+from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.diagnosis.spectrum import inverse, transform
+from gyro_calibration.log import Array
+
+#: Residuals drawn to learn what chance shows.
+DRAWS = 400
+#: A cause that explains the data less well than the best by more than this, in logarithms of the likelihood, is ruled out.
+RULED_OUT = 3.2
+#: What a shape costs, for a free one fits a little noise.
+PRICE_OF_SHAPE = 1.5
+#: A tone has at least so many periods in a log; slower ones are wander.
+LEAST_PERIODS = 20
+#: Within which times a reference may slip, s.
+WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
+#: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
+UNLIKELY = 12.0
+#: So many causes at most are named.
+MOST_CAUSES = 6
+
+
+@dataclass(frozen=True)
+class Chance:
+    """
+    What evidence of each cause chance shows: beyond `start`, with probability `share`, it falls off by e every `scale`.
+
+    """
+
+    start: Mapping[str, float]
+    scale: Mapping[str, float]
+    share: float
+
+    def threshold(self, cause: str, rate: float) -> float:
+        """Return the evidence that chance reaches at a given rate."""
+        if cause not in self.start:  # it is scanned for, and its evidence counts the places already
+            return -float(np.log(rate))
+        return self.start[cause] + self.scale[cause] * float(np.log(self.share / rate))
+
+    def p_value(self, cause: str, found: float) -> float:
+        """Return how often chance reaches an evidence."""
+        return min(1.0, self.share * float(np.exp(-(found - self.start[cause]) / self.scale[cause])))
+
+
+@dataclass(frozen=True)
+class Bank:
+    """
+    All candidates on the logs, as the gyro sees their rate.
+
+    Attributes
+    ----------
+    candidates : causes with their first shapes
+    groups : of each, the places of its columns
+    columns : whitened, shape (p, m)
+
+    """
+
+    candidates: tuple[Candidate, ...]
+    groups: tuple[tuple[int, ...], ...]
+    columns: Array
+
+
+@dataclass(frozen=True)
+class Screen:
+    """The evidence of each candidate beside what is named, and what it was made from."""
+
+    found: Array
+    judged: Judged
+
+    def of_causes(self, places: Mapping[str, list[int]]) -> dict[str, float]:
+        """Return the evidence of each cause, averaged over its first shapes."""
+        return {cause: averaged(self.found[own]) for cause, own in places.items()}
+
+
+def averaged(found: Array) -> float:
+    """Return the logarithm of the mean of likelihoods, of those that can be told."""
+    known = found[np.isfinite(found)]
+    return float(logsumexp(known) - np.log(len(known))) if len(known) else -np.inf
+
+
+def bank(whole: Field, found: Sequence[Candidate], named: Sequence[Named] = ()) -> Bank:
+    """Make the columns of candidates."""
+    replays = [seen(each, named) for each in whole.replays]
+    parts = [columns_of(each, replays) / whole.deviation for each in found]
+    ends = np.cumsum([len(part) for part in parts])
+    groups = tuple(tuple(range(end - len(part), end)) for end, part in zip(ends, parts))
+    return Bank(tuple(found), groups, np.concatenate(parts))
+
+
+@dataclass(frozen=True)
+class Search:
+    """
+    A search under way.
+
+    Attributes
+    ----------
+    field : the logs
+    candidates : all causes with their first shapes
+    chance : what they show where there is nothing
+    rate : false alarms allowed a cause
+
+    """
+
+    field: Field
+    candidates: tuple[Candidate, ...]
+    chance: Chance
+    rate: float
+
+    def excess(self, cause: str, found: float) -> float:
+        """Return what an evidence is above what chance may show."""
+        return found - self.chance.threshold(cause, self.rate)
+
+
+def screen(done: Work, stock: Bank) -> Screen:
+    """Return the evidence of all candidates beside what is named."""
+    count = len(done.columns)
+    columns = np.concatenate([done.columns, stock.columns])
+    known = sums(columns, done.field.starts)
+    by = beside(known, done.field.noises, done.by.nuisances)
+    judged = judge(measured(done.residual, columns, done.field.starts), done.field.noises, by)
+    return Screen(evidence(judged, by, [[place + count for place in group] for group in stock.groups])[0], judged)
+
+
+def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
+    """Draw residuals of noise alone, as this log may have it, and see what evidence of each cause they show."""
+    probable = done.judged.probability[0]
+    kept = np.flatnonzero(probable > 1e-4)
+    noises = done.field.noises.take(kept)
+    columns = np.concatenate([done.columns, stock.columns])
+    known = sums(columns, done.field.starts)
+    by = beside(known, noises, done.by.nuisances)
+    sample = drawn(known, noises, probable[kept] / probable[kept].sum(), DRAWS, generator)
+    found = evidence(judge(sample, noises, by), by, [[place + len(done.columns) for place in group] for group in stock.groups])
+    start, scale, share = {}, {}, 0.15
+    for cause, places in by_cause(stock.candidates).items():
+        drawn_evidence = np.sort([averaged(each) for each in found[:, places]])
+        most = drawn_evidence[int((1.0 - share) * DRAWS):]
+        start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
+    return Chance(start, scale, share)
+
+
+def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006) -> Search:
+    """Lay out logs and learn what chance shows in them."""
+    found = candidates(replays)
+    whole = _of_likely_noises(field(replays), found)
+    done = work(whole, [])
+    return Search(whole, tuple(found), chances(done, bank(whole, found), generator), rate / len(by_cause(found)))
+
+
+def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
+    """Leave out noises that are out of the question, both where nothing is in the logs and where much may be."""
+    middle = [places[len(places) // 2] for places in by_cause(found).values()]
+    tried = [work(whole, []), work(whole, [], [found[place] for place in middle])]
+    kept = np.flatnonzero(np.any([each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried], axis=0))
+    return replace(whole, shapes=tuple(whole.shapes[place] for place in kept), noises=whole.noises.take(kept))
+
+
+# what happens at any frequency, or at any moment
+
+def tones(done: Work) -> list[tuple[Candidate, float]]:
+    """Return the strongest tone of each log with its evidence, less what the number of frequencies makes likely."""
+    found = []
+    for each, white in zip(done.field.replays, done.white()):
+        power = np.abs(np.fft.rfft(white)) ** 2 / len(white)
+        lowest = LEAST_PERIODS
+        if len(power) > 2 * lowest:
+            best = lowest + int(power[lowest:-1].argmax())
+            found.append((effect('interference_tone', best / each.duration), float(power[best] - np.log(len(power)))))
+    return [max(found, key=lambda one: one[1])] if found else []
+
+
+def slips(done: Work) -> list[tuple[Candidate, float]]:
+    """Return the clearest jump of the reference's heading, of those moments where it accelerates."""
+    found = []
+    best_noise = int(done.judged.likelihood[0].argmax())
+    divided = np.split(done.field.divided(best_noise) / done.field.deviation, np.cumsum([e.points - 1 for e in done.field.replays])[:-1])
+    for run, (each, white, factor) in enumerate(zip(done.field.replays, done.white(), divided)):
+        time = np.arange(each.points) * each.step
+        rate = each.on_grid(each.channels.rate)
+        acceleration = np.abs(np.gradient(rate, each.step))
+        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max()) if acceleration.max() > 0.0 else []
+        if not len(moments):
+            continue
+        for width in WIDTHS:
+            kernel = inverse(transform(pulse(time, time[len(time) // 2], max(width, 0.5 * each.step))) * factor)
+            match = np.roll(correlate(white, kernel, 'same'), 0) / np.sqrt(kernel @ kernel)
+            best = moments[int(np.abs(match[moments]).argmax())]
+            value = 0.5 * match[best] ** 2 - np.log(len(moments) * len(WIDTHS))
+            begin = float(each.channels.time[each.kept][0])
+            found.append((effect('reference_slip', begin + float(time[best]), max(width, 0.5 * each.step), run=run), float(value)))
+    return [max(found, key=lambda one: one[1])] if found else []
+
+
+# one cause more
+
+@dataclass(frozen=True)
+class Step:
+    """A list of causes and its score."""
+
+    named: tuple[Named, ...]
+    score: float
+
+
+def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Step:
+    """Add a cause with the best of its shapes near those given."""
+    if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
+        return Step((*named, Named(candidate)), work(search.field, [*named, Named(candidate)]).score)
+    begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
+    place = fitted_shapes(candidate)[0]
+    low, high = _around(search, begin, place)
+
+    def cost(at: float) -> float:
+        return -work(search.field, [*named, Named(with_shape(begin, place, _shape(at, begin, place)))]).score
+
+    best = minimize_scalar(cost, bounds=(low, high), method='bounded', options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
+    return Step((*named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - PRICE_OF_SHAPE)
+
+
+def _shape(at: float, begin: Candidate, place: int) -> float:
+    return at if begin.cause == 'bias_step' else float(np.copysign(np.exp(at), begin.shapes[place]))
+
+
+def _around(search: Search, begin: Candidate, place: int) -> tuple[float, float]:
+    """Return where to look for a shape: between its neighbours, on a scale of logarithms but for moments."""
+    mine = begin.shapes[place]
+    if begin.cause == 'bias_step':
+        width = 1.5 * max(each.duration for each in search.field.replays) / 64
+        return mine - width, mine + width
+    if begin.amplitude is not None:
+        return float(np.log(abs(mine))) - 0.7, float(np.log(abs(mine))) + 0.7
+    if begin.cause == 'interference_tone':
+        width = 1.0 / (mine * max(each.duration for each in search.field.replays))
+        return float(np.log(mine)) - width, float(np.log(mine)) + width
+    width = 0.8
+    return float(np.log(abs(mine))) - width, float(np.log(abs(mine))) + width
+
+
+#: How the effect of a small shape grows with it.
+_POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
+
+
+def _unbent(search: Search, named: Sequence[Named], candidate: Candidate) -> Candidate:
+    """Return a cause of fixed amplitude with the shape that the free amplitude of its column speaks for."""
+    power = _POWERS.get(candidate.cause)
+    if power is None:
+        return candidate
+    free = work(search.field, named, [replace(candidate, amplitude=None)])
+    values, _ = free.estimates
+    ratio = float(values[-1])
+    place = fitted_shapes(candidate)[0]
+    return with_shape(candidate, place, candidate.shapes[place] * float(np.copysign(abs(ratio) ** (1.0 / power), ratio)))
+
+
+def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] | None = None) -> tuple[Step | None, list[Step]]:
+    """
+    Look for one cause more.
+
+    Returns
+    -------
+    the best, None where nothing is beyond chance, and all that were refined, the best first
+
+    """
+    done = work(search.field, named)
+    stock = bank(search.field, search.candidates, named)
+    found = screen(done, stock).found
+    scanned = [*tones(done), *slips(done)]
+    first = [(search.candidates[max(own, key=lambda place: found[place])], averaged(found[own]), float(found[own].max()))
+             for own in by_cause(search.candidates).values()]
+    first += [(candidate, value, value) for candidate, value in scanned]
+    if not any(search.excess(candidate.cause, value) > 0.0 for candidate, value, _ in first):
+        return None, []
+    top = max(most for _, _, most in first)
+    steps = [refined(search, named, candidate) for candidate, _, most in first if most > 0.8 * top - 8.0]
+    steps.sort(key=lambda step: -step.score)
+    return steps[0], steps
+
+
+def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
+    """Refine all shapes together, and find the values, by the method of Gauss and Newton."""
+    current = tuple(named)
+    for _ in range(3):
+        done = work(search.field, current)
+        values, _ = done.estimates
+        current = tuple(_updated(done, place, values) for place in range(len(current)))
+    return current
+
+
+def _updated(done: Work, place: int, values: Array) -> Named:
+    known = done.named[place]
+    own = {done.owner[column]: values[rank] for rank, column in enumerate(done.by.nuisances)}
+    free = tuple(float(own[place, number]) for number in range(8) if (place, number) in own)
+    found = free if known.candidate.amplitude is None else (known.candidate.amplitude,)
+    candidate = known.candidate
+    for shape in fitted_shapes(candidate):
+        change = own.get((place, -1 - shape), 0.0)
+        before = candidate.shapes[shape]
+        candidate = with_shape(candidate, shape, before + float(np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
+    return Named(candidate, found or known.values)
+
+
+def searched(search: Search) -> tuple[Named, ...]:
+    """Return the causes that the data support, with values."""
+    named: tuple[Named, ...] = ()
+    while len(named) < MOST_CAUSES:
+        step, _ = strongest(search, named)
+        if step is None:
+            break
+        named = polished(search, step.named)
+        named = _exchanged(search, named) if len(named) > 1 else named
+    return named
+
+
+def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
+    """Take each cause out again: another may be better, or none may be needed."""
+    for known in named[:-1]:
+        others = tuple(each for each in named if each is not known)
+        step, _ = strongest(search, others)
+        if step is None:
+            return polished(search, others) if others else others
+        if step.named[-1].candidate.cause != known.candidate.cause and step.score > work(search.field, named).score + 1.0:
+            return polished(search, step.named)
+    return named
+
+
+def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list[tuple[str, float]]:
+    """Return the causes that may stand in the place of a named one, with what they lack in likelihood."""
+    others = tuple(each for each in named if each is not known)
+    _, steps = strongest(search, others)
+    mine = max(step.score for step in steps if step.named[-1].candidate.cause == known.candidate.cause)
+    return [(step.named[-1].candidate.cause, mine - step.score) for step in steps if mine - step.score < RULED_OUT]

@@ -1,0 +1,100 @@
+"""
+The noise of a residual in its cosine transform, where whitening is a division.
+
+White noise and a random walk of the rate with any start have cosines as their exact eigenvectors; those of a Gauss-Markov process are
+nearly so. The coefficient of order 0 is the bias and is left out. The rounding of an encoder, differenced to a rate, is white noise times
+``2 - 2 cos``.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import dct, idct
+
+from gyro_calibration.log import Array
+
+#: Ratios of random walk to white noise, of Gauss-Markov to white noise, and correlation times that are tried: see `noise_grid`.
+_WALKS, _STRENGTHS, _TIMES = 14, 7, 7
+
+
+@dataclass(frozen=True)
+class Shape:
+    """
+    A noise relative to its white part: what the variance of a coefficient is in units of that of white noise.
+
+    Attributes
+    ----------
+    walk : rate random walk, K² / N², 1/s²
+    strength : variance of the Gauss-Markov part over the spectral density of the white one, 1/s
+    correlation_time : of the Gauss-Markov part, s
+    reference : variance of the reference's rounding over the interval squared, relative to that of a white sample
+
+    """
+
+    walk: float = 0.0
+    strength: float = 0.0
+    correlation_time: float = 1.0
+    reference: float = 0.0
+
+    def variance(self, angle: Array, interval: Array | float) -> Array:
+        """
+        Return the variance of coefficients relative to the white part.
+
+        Parameters
+        ----------
+        angle : pi k / n of each coefficient
+        interval : of the samples, s
+
+        """
+        wave = 2.0 - 2.0 * np.cos(angle)
+        total = 1.0 + self.reference * wave
+        if self.walk:
+            total = total + self.walk * interval ** 2 / wave
+        if self.strength:
+            kept = np.exp(-interval / self.correlation_time)
+            total = total + self.strength * interval * (1.0 - kept ** 2) / ((1.0 - kept) ** 2 + kept * wave)
+        return total
+
+
+def transform(values: Array) -> Array:
+    """Return the cosine transform of a signal, or of each row, without the mean: shape (..., n - 1)."""
+    return dct(values, norm='ortho', axis=-1)[..., 1:]
+
+
+def inverse(coefficients: Array) -> Array:
+    """Return the signal of coefficients, with no mean: shape (n,)."""
+    return idct(np.concatenate([[0.0], coefficients]), norm='ortho')
+
+
+def angles(count: int) -> Array:
+    """Return pi k / n of the coefficients of a signal of so many samples: shape (n - 1,)."""
+    return np.arange(1, count) * math.pi / count
+
+
+def bands(angle: Array, interval: float, single: int = 24, ratio: float = 1.12) -> Array:
+    """Return the first index of each band of coefficients: the lowest alone, then so that frequencies in one differ little."""
+    edges, count = list(range(min(single, len(angle)))), len(angle)
+    while edges and edges[-1] * ratio + 1.0 < count:
+        edges.append(int(math.ceil(edges[-1] * ratio + 0.5)))
+    return np.unique([edge for edge in edges if edge < count])
+
+
+def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list[Shape]:
+    """
+    Return noises that a residual may have, coarse enough to try all.
+
+    A random walk shows where it is stronger than white noise over the log; a Gauss-Markov part where its correlation time lies between
+    some samples and the log.
+
+    """
+    lowest = 0.02 / duration ** 2
+    highest = max(1e5 * lowest, 1e-3 / interval ** 2 * 1e-3)
+    walks = [0.0, *np.geomspace(lowest, highest, _WALKS)]
+    times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, _TIMES)
+    # By their density at frequency 0 over the white one, from hardly seen to a hundred times.
+    strong = [(ratio / (2.0 * time), time) for time in times for ratio in np.geomspace(0.3, 1000.0, _STRENGTHS)]
+    return [Shape(walk, strength, time, reference) for walk in walks for strength, time in [(0.0, 1.0), *strong]]
