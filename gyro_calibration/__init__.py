@@ -9,9 +9,10 @@ Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise p
 Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist only at the rim (files, wires, the
 command line), where the name says so: ``gyro_dps``.
 
-Reading order: `log`, `stamps`, `effects`, `noise`, `model`, `model_file`, `motion`, `simulation`, `compensation`, `heading`, `likelihood`,
-`self_calibration`; then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`, `selection`, `encoder`, `turn`, `diagnosis`,
-`reproduction`; then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then `verbs`, `command_line`.
+Reading order: `log`, `stamps`, `effects`, `history`, `noise`, `model`, `model_file`, `motion`, `simulation`, `compensation`, `heading`,
+`log_compensation`, `likelihood`, `self_calibration`; then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`, `selection`,
+`encoder`, `turn`, `diagnosis`, `reproduction`; then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then
+`verbs`, `command_line`.
 
 """
 

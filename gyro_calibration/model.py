@@ -158,6 +158,11 @@ class GyroModel:
         """Tell whether an effect looks at more than rate, output and temperature of the moment, so that a history is needed."""
         return any(term.effect.looks_at - {'rate', 'output', 'temperature'} for term in self.terms)
 
+    @cached_property
+    def moves_stamps(self) -> bool:
+        """Tell whether samples were taken at another time than their stamps say."""
+        return any(term.effect.moved is not None for term in self.terms)
+
     def history(self) -> History:
         """Return a history that begins now, of the temperatures that the model uses."""
         return History(self.reference_temperature, *self.temperature_range)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
+from gyro_calibration.compensation import covariance, quadratic_form
 from gyro_calibration.heading import BlockIntegrator, Threshold
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask, write_log_blocks
+from gyro_calibration.log_compensation import LogCompensation, rows_of
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.verbs.verb import Answer, add_log, not_negative, output_of, read_blocks, verb
@@ -33,7 +34,15 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _compensate(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Found()
     write_log_blocks(given.out, _compensated(given, model, found))
-    return _answer(given, found)
+    return _answer(given, model, found)
+
+
+#: What else effects may look at: quantity of a log -> channel, and what is said where the log lacks it.
+_WORDS = {
+    'specific_force': ('specific_force', 'The log holds no specific force: it was taken for zero.'),
+    'supply': ('supply', 'The log holds no supply voltage: its effect was left out.'),
+    'reference_heading': ('heading', 'The log holds no reference heading: the one found here was taken, from zero on.'),
+}
 
 
 @dataclass
@@ -45,6 +54,7 @@ class _Found:
     temperature_clipped: int = 0
     beyond_range: int = 0
     temperature_known: bool = False
+    unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
 
@@ -54,6 +64,7 @@ class _Found:
         self.temperature_clipped += int(columns['temperature_clipped'].sum())
         self.beyond_range += int(columns['beyond_range'].sum())
         self.temperature_known = log.temperature is not None
+        self.unknown = tuple(quantity for quantity in _WORDS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
             self.heading, self.deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
 
@@ -62,27 +73,28 @@ def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> 
     """Give the log block by block with its new columns, and count what is found in it."""
     threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
     integrator, variance = BlockIntegrator(threshold, model.noise, covariance(model)), 0.0
+    compensation = LogCompensation(model)
     for log in read_blocks(given):
         output = output_of(given, log)
         if log.time is not None and not found.rows:
             # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
             variance = model.noise.rate_variance(float(np.median(np.diff(log.time))))
         known = np.isfinite(output)
-        time, temperature = (None if each is None else each[known] for each in (log.time, log.temperature))
-        columns = _columns(model, integrator, variance, time, output[known], temperature)
+        columns = _columns(model, compensation, integrator, variance, rows_of(replace(log, output=output), known))
         found.add(log, columns)
         yield log, {name: _at(known, values) for name, values in columns.items()}
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
 
 
-def _columns(model: GyroModel, integrator: BlockIntegrator, variance: float, time: Array | None, output: Array,
-             temperature: Array | None) -> dict[str, Array]:
-    result = compensate(model, output, temperature)
-    sensitivity = rate_sensitivity(model, output, result.rate, result.temperature)
+def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator, variance: float, log: Log) -> dict[str, Array]:
+    result, sensitivity = compensation.add(log)
     columns = {'rate_rad_s': result.rate}
-    if time is not None:
+    if log.time is not None:
+        time = compensation.true_time(log.time) if model.moves_stamps else log.time
         columns['rate_rad_s'], columns['heading_rad'], columns['heading_std_rad'] = integrator.add(time, result.rate, sensitivity)
+        if model.moves_stamps:
+            columns['rate_time_s'] = time
     columns['rate_std_rad_s'] = np.sqrt(variance + quadratic_form(covariance(model), sensitivity))
     columns['temperature_clipped'], columns['beyond_range'] = result.temperature_clipped, result.beyond_range
     return columns
@@ -95,9 +107,9 @@ def _at(known: Mask, values: Array) -> Array:
     return whole
 
 
-def _answer(given: argparse.Namespace, found: _Found) -> Answer:
+def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answer:
     data: dict[str, Any] = {'out': given.out, **asdict(found)}
-    heading, deviation = data.pop('heading'), data.pop('deviation')
+    heading, deviation, _ = (data.pop(name) for name in ('heading', 'deviation', 'unknown'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
         data.update(heading_rad=heading, heading_std_rad=None if math.isnan(deviation) else deviation)
@@ -105,6 +117,8 @@ def _answer(given: argparse.Namespace, found: _Found) -> Answer:
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if not found.temperature_known:
         lines.append('The log holds no temperature: the model was used at its reference temperature.')
+    lines += [words for quantity, (channel, words) in _WORDS.items() if quantity in found.unknown and model.looks_at(channel)]
+    lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms if term.effect.undone]
     for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
                         ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),
                         ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated.')):

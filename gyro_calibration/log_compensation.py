@@ -1,0 +1,119 @@
+"""A log through the compensation of a model that looks around: its surroundings are followed from block to block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyro_calibration.compensation import Compensated, compensate, rate_sensitivity
+from gyro_calibration.effects import Channels
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import QUANTITIES, Array, Log, Mask
+from gyro_calibration.model import GyroModel
+
+#: An effect of the heading that is found meanwhile is found over so long at once, s: over longer, more passes would be needed.
+_AT_ONCE = 60.0
+#: Passes end where the heading changes by less, rad, or after so many.
+_SETTLED, _PASSES = 1e-10, 50
+
+
+class LogCompensation:
+    """
+    Compensate a log that comes block by block, with the same result as in one piece.
+
+    The heading that effects look at is that of the reference. Without one it is what the compensated rates come to, from 0 on.
+
+    """
+
+    def __init__(self, model: GyroModel):
+        """Begin with nothing known of the past."""
+        self._model, self._history = model, model.history()
+        self._begin: float | None = None
+        self._turned: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
+
+    def add(self, log: Log) -> tuple[Compensated, Array]:
+        """
+        Take the next rows, in each of which the output is known, and return them with their `rate_sensitivity`.
+
+        """
+        if not self._model.looks_around or not len(log):
+            return self._compensated(log, None)
+        compensated, sensitivities = zip(*(self._around(part) for part in self._parts(log)))
+        joined = {each.name: np.concatenate([np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
+                  for each in fields(Compensated)}
+        return Compensated(**joined), np.concatenate(sensitivities, axis=1)
+
+    def true_time(self, time: Array) -> Array:
+        """Return when the samples with the next stamps, s, were taken."""
+        if self._begin is None and len(time):
+            self._begin = float(time[0])
+        begin = self._begin or 0.0
+        return np.asarray(begin + self._model.true_time(time - begin))
+
+    def _compensated(self, log: Log, around: Channels | None) -> tuple[Compensated, Array]:
+        assert log.output is not None
+        result = compensate(self._model, log.output, log.temperature, around)
+        return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature, around)
+
+    def _parts(self, log: Log) -> Iterator[Log]:
+        """Give the rows in parts for which a heading is soon found, or all at once where none is sought."""
+        if log.time is None or not self._seeks_heading(log):
+            yield log
+            return
+        part = ((log.time - log.time[0]) // _AT_ONCE).astype(int)
+        for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
+            yield rows_of(log, rows)
+
+    def _seeks_heading(self, log: Log) -> bool:
+        return self._model.looks_at('heading') and (log.reference_heading is None or not np.isfinite(log.reference_heading).any())
+
+    def _around(self, log: Log) -> tuple[Compensated, Array]:
+        time = np.zeros(len(log)) if log.time is None else log.time
+        around = self._history.follow(time, log.temperature, log.specific_force, log.supply, _bridged(time, log.reference_heading))
+        if self._model.looks_at('heading') and log.time is not None:
+            around = self._found_heading(log, around) if self._seeks_heading(log) else around
+        return self._compensated(log, around)
+
+    def _found_heading(self, log: Log, around: Channels) -> Channels:
+        """Repeat: compensate with a heading, and integrate to the next one; it gains about the effect times the time with each pass."""
+        assert log.time is not None
+        last_time, last_rate, begin = self._turned
+        carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
+        heading = np.full(len(log), begin)
+        for _ in range(_PASSES):
+            around = replace(around, heading=heading)
+            rate = np.concatenate([last_rate, compensate(self._model, np.asarray(log.output), log.temperature, around).rate])
+            before, heading = heading, integrate(time, rate, begin)[carried:]
+            if np.abs(heading - before).max() < _SETTLED:
+                break
+        self._turned = time[-1:], rate[-1:], float(heading[-1])
+        return replace(around, heading=heading)
+
+
+def compensate_log(model: GyroModel, log: Log) -> Array:
+    """
+    Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is.
+
+    """
+    assert log.output is not None
+    known = np.isfinite(log.output)
+    rate = np.full(len(log), np.nan)
+    rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate
+    return rate
+
+
+def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
+    """Return some rows of a log, by their numbers or by a mask, without columns that are not ours."""
+    arrays = {quantity: getattr(log, quantity) for quantity in QUANTITIES}
+    return Log(**{quantity: values[rows] for quantity, values in arrays.items() if values is not None}, notes=log.notes)
+
+
+def _bridged(time: Array, heading: Array | None) -> Array | float:
+    """Return a heading that is interpolated where it was lost."""
+    if heading is None or not (known := np.isfinite(heading)).any():
+        return 0.0
+    return heading if known.all() else np.interp(time, time[known], heading[known])

@@ -1,0 +1,130 @@
+"""
+A log with its surroundings through the compensation: in one piece, in blocks, as a stream; with a heading, and without one.
+
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyro_calibration.compensation import covariance, quadratic_form
+from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.heading import integrate
+from gyro_calibration.history import channels_of
+from gyro_calibration.log import Log, read_log, write_log
+from gyro_calibration.log_compensation import LogCompensation, compensate_log, rows_of
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model_file import read_model, write_model
+from gyro_calibration.simulation import respond
+
+VALUES = {
+    'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05), 'thermal_lag': (120.0, -2e-3),
+    'thermal_hysteresis': (10.0, 2e-3, 3e-4), 'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,), 'bias_step': (200.0, -1e-3),
+    'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4), 'supply_sensitivity': (5.0, 4e-4),
+    'interference_tone': (0.07, 3e-4, -2e-4)}
+HEADING = {'heading_sensitivity': (1e-3, -5e-4)}
+TIME = np.arange(0.0, 900.0, 0.05) + np.random.default_rng(0).uniform(0.0, 0.02, 18000)
+
+
+def model_of(values, **more):
+    return GyroModel(tuple(Term(CATALOGUE[name], each) for name, each in values.items()), **more)
+
+
+def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
+    """Return a log of a gyro that is driven, heated and cooled, and shaken."""
+    rate = motion(TIME)
+    log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0), reference_rate=rate,
+              reference_heading=integrate(TIME, rate), supply=5.0 + 0.2 * np.sin(TIME / 40.0),
+              specific_force=np.where(TIME > 400.0, 2.0, 0.1) * np.random.default_rng(1).standard_normal(len(TIME)))
+    return replace(log, output=respond(model, TIME, channels_of(log).moving(rate, rate)))
+
+
+def test_a_log_with_everything_around_comes_back_to_its_rates():
+    model = model_of(VALUES | HEADING)
+    log = drive(model)
+    assert np.abs(log.output - log.reference_rate).max() > 0.01
+    assert compensate_log(model, log) == pytest.approx(log.reference_rate, abs=1e-10)
+
+
+@pytest.mark.parametrize('size', [1, 700, 5000])
+def test_blocks_are_compensated_as_the_whole(size):
+    model = model_of(VALUES | HEADING, covariance=np.eye(16) * 1e-10)
+    log = drive(model)
+    if size == 1:
+        log = rows_of(log, np.arange(600))
+    whole, sensitivity = LogCompensation(model).add(log)
+    compensation = LogCompensation(model)
+    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size])) for first in range(0, len(log), size)]
+    np.testing.assert_allclose(np.concatenate([part.rate for part, _ in parts]), whole.rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(np.hstack([rows for _, rows in parts]), sensitivity, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('size', [700, 18000])
+def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
+    model = model_of(HEADING | {'scale_factor_error': (0.01,)})
+    log = replace(drive(model), reference_heading=None)
+    compensation = LogCompensation(model)
+    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate for first in range(0, len(log), size)]
+    assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-8)
+    plain = compensate_log(model_of({'scale_factor_error': (0.01,)}), log)
+    assert np.abs(plain - log.reference_rate).max() > 1e-3, 'the heading did not matter'
+
+
+def test_a_reference_heading_that_is_lost_for_a_while_is_bridged():
+    model = model_of(HEADING)
+    log = drive(model)
+    torn = replace(log, reference_heading=np.where((TIME > 100.0) & (TIME < 100.5), np.nan, log.reference_heading))
+    assert compensate_log(model, torn) == pytest.approx(log.reference_rate, abs=1e-5)
+
+
+def test_rows_without_output_are_left_out():
+    model = model_of(VALUES)
+    log = drive(model)
+    torn = replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output))
+    rate = compensate_log(model, torn)
+    assert np.isnan(rate).sum() == 18 and np.nanmax(np.abs(rate - log.reference_rate)) < 1e-3
+
+
+def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():
+    """Against the difference between models whose time constant differs by a standard deviation."""
+    model = model_of({'thermal_lag': (120.0, -2e-3)}, covariance=np.diag([4.0, 0.0]))
+    log = drive(model)
+    result, sensitivity = LogCompensation(model).add(log)
+    other = compensate_log(model_of({'thermal_lag': (122.0, -2e-3)}), log)
+    deviation = np.sqrt(quadratic_form(covariance(model), sensitivity))
+    assert deviation == pytest.approx(np.abs(other - result.rate), rel=0.03, abs=2e-6)
+    assert deviation.max() > 1e-4
+
+
+def test_the_verb_compensates_by_the_surroundings_of_a_log(tmp_path, run):
+    model = model_of(VALUES | HEADING)
+    write_model(tmp_path / 'model.yaml', model)
+    assert read_model(tmp_path / 'model.yaml').terms == model.terms
+    write_log(tmp_path / 'log.csv', drive(model))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    done = read_log(tmp_path / 'out.csv')
+    assert code == 0 and 'no reference heading' not in text
+    assert np.array(done.others['rate_rad_s'], float) == pytest.approx(done.reference_rate, abs=1e-10)
+    assert np.array(done.others['heading_rad'], float) == pytest.approx(done.reference_heading, abs=1e-7)
+
+
+def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
+    (tmp_path / 'model.yaml').write_text('effects: {supply_sensitivity: {supply_sensitivity: 1.0e-4}, time_offset: {time_offset: 0.02},'
+                                         'heading_sensitivity: {sine: 0.0, cosine: 0.0}, saturation: {saturation: 1.0}}')
+    log = drive(GyroModel())
+    write_log(tmp_path / 'log.csv', replace(log, supply=None, reference_heading=None))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    assert code == 0 and all(words in text for words in ('no supply voltage', 'no reference heading', 'saturation: At the limit'))
+    done = read_log(tmp_path / 'out.csv')
+    assert np.array(done.others['rate_time_s'], float) == pytest.approx(done.time - 0.02, abs=1e-12)
+
+
+def test_a_million_samples_that_look_around_take_seconds_and_not_minutes():
+    import time as clock
+    count = 10 ** 6
+    time = np.arange(count) * 0.01
+    log = Log(output=np.sin(time), time=time, temperature=25.0 + np.sin(time / 500.0))
+    begin = clock.process_time()
+    compensate_log(model_of({'thermal_lag': (120.0, -2e-3), 'warm_up': (300.0, 0.004)} | HEADING), log)
+    assert clock.process_time() - begin < 6.0
