@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,13 @@ VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 
 
+class _Loader(yaml.SafeLoader):
+    """Reads numbers as people write them: YAML 1.1 takes 1e-4, without a point, for a text."""
+
+
+_Loader.add_implicit_resolver('tag:yaml.org,2002:float', re.compile(r'[-+]?[0-9]+[eE][-+]?[0-9]+$'), list('-+0123456789'))
+
+
 class ModelError(ValueError):
     """A file is not a model; the message names file, place and remedy."""
 
@@ -36,7 +44,7 @@ def read_model(path: str | Path) -> GyroModel:
 
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        content = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
     except FileNotFoundError:
         raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:

@@ -14,7 +14,7 @@ from gyro_calibration.log import Log
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
 LAGS = [('temperature', 0.01), ('temperature', 20.0), ('temperature', 3000.0), ('specific_force', 1.0), ('vibration', 1.0),
         ('vibration', 30.0)]
-BRANCHES = [(10.0, 2e-3), (3.0, 0.0)]
+BRANCHES = [(10.0, 1e-3), (3.0, 0.0)]
 
 
 def surroundings(time):
@@ -77,14 +77,14 @@ def test_the_branch_turns_soon_after_the_temperature_does_and_not_by_noise(noise
     time = np.arange(0.0, 1800.0, 0.05)
     turned = np.abs((time / 300.0) % 2.0 - 1.0)
     temperature = 40.0 - 6.0 * turned + noise * np.random.default_rng(3).standard_normal(len(time))
-    branch = channels_of(Log(output=time, time=time, temperature=temperature)).heating(10.0, 2e-3)
+    branch = channels_of(Log(output=time, time=time, temperature=temperature)).heating(10.0, 1e-3)
     settled = (time % 300.0) > 20.0
     assert branch[settled].tolist() == np.where((time // 300.0) % 2.0, -1.0, 1.0)[settled].tolist()
 
 
 def test_a_constant_temperature_has_no_branch_and_afterwards_it_keeps_the_last_one():
     time = np.arange(0.0, 600.0, 0.1)
-    branch = channels_of(Log(output=time, time=time, temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 2e-3)
+    branch = channels_of(Log(output=time, time=time, temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 1e-3)
     assert not branch[time < 200.0].any() and branch[time > 210.0].min() == 1.0
 
 

@@ -104,6 +104,22 @@ BAD = {
 }
 
 
+def test_effects_with_a_past_are_written_by_hand(tmp_path):
+    model = read(tmp_path, 'effects: {thermal_lag: {thermal_lag: 1e-4, time_constant: 120}, '
+                           'thermal_hysteresis: {thermal_hysteresis: -2E-5}}')
+    assert [term.values for term in model.terms] == [(120.0, 1e-4), (10.0, 1e-3, -2e-5)]
+    assert model.looks_around and not read(tmp_path, 'effects: {bias: {bias: 1.0}}').looks_around
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_every_effect_survives_its_file(tmp_path, name):
+    values = tuple(0.5 if each.default is None else each.default for each in CATALOGUE[name].parameters)
+    bounds = [each.bounds for each in CATALOGUE[name].parameters]
+    model = GyroModel((Term(CATALOGUE[name], tuple(float(np.clip(value, *limits)) for value, limits in zip(values, bounds))),))
+    write_model(tmp_path / 'model.yaml', model)
+    assert read_model(tmp_path / 'model.yaml').terms == model.terms
+
+
 @pytest.mark.parametrize('text, message', BAD.values(), ids=BAD)
 def test_a_bad_file_is_refused_in_one_sentence_with_file_place_and_remedy(tmp_path, text, message):
     with pytest.raises(ModelError) as refused:

@@ -41,5 +41,5 @@ def _thermal_hysteresis(channels: Channels, filter_time: float, threshold: float
 THERMAL_HYSTERESIS = Effect(
     'thermal_hysteresis', 'The bias is another one while the gyro cools than while it heats.',
     frozenset({'temperature', 'heating'}), (Parameter('thermal_hysteresis', 'rad/s'),), _thermal_hysteresis,
-    (Parameter('filter_time', 's', 10.0, (1e-3, 1e4)), Parameter('threshold', 'K/s', 2e-3, (0.0, 10.0))),
+    (Parameter('filter_time', 's', 10.0, (1e-3, 1e4)), Parameter('threshold', 'K/s', 1e-3, (0.0, 10.0))),
     'go through the same cycle of temperature at two speeds')
