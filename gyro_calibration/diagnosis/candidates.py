@@ -96,8 +96,8 @@ _FITTED_OF_THE_REFERENCE = {'reference_once_per_rev': (), 'reference_slip': (0, 
 
 def fitted_shapes(candidate: Candidate) -> list[int]:
     """Return the places of the shapes that are no conventions."""
-    if candidate.cause in _FITTED_OF_THE_REFERENCE:
-        return list(_FITTED_OF_THE_REFERENCE[candidate.cause])
+    if candidate.cause not in CATALOGUE:
+        return list(_FITTED_OF_THE_REFERENCE.get(candidate.cause, ()))
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
     return [place for place, parameter in enumerate(parameters) if parameter.default is None]
 

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.log import Array
 
 #: Numbers of coefficients.
 Places = NDArray[np.intp]
@@ -26,23 +25,29 @@ Places = NDArray[np.intp]
 LEAST_LEFT = 1e-7
 
 
+#: Columns of one candidate, by their places.
+Group = Sequence[int]
+
+
 @dataclass(frozen=True)
 class Sums:
     """
-    What the bands know of the columns: b bands, p columns.
+    What the bands know of the columns: b bands, q nuisances, p columns of candidates.
 
     Attributes
     ----------
-    columns : X'X of each band, shape (b, p, p)
-    roots : of each band, a matrix R of p rows so that R R' is X'X and R has no more columns than the band has coefficients
+    own : N'N of the nuisances, shape (b, q, q)
+    towards : N'X, shape (b, q, p)
+    blocks : of each candidate, X'X of its columns, shape (b, k, k)
     count : coefficients of each band, shape (b,)
 
     All are of coefficients divided by the standard deviation that a first noise gives them.
 
     """
 
-    columns: Array
-    roots: tuple[Array, ...]
+    own: Array
+    towards: Array
+    blocks: tuple[Array, ...]
     count: Array
 
 
@@ -53,11 +58,13 @@ class Sample:
 
     Attributes
     ----------
+    own : N'z, shape (d, b, q)
     crossed : X'z, shape (d, b, p)
     squared : z'z, shape (d, b)
 
     """
 
+    own: Array
     crossed: Array
     squared: Array
 
@@ -77,86 +84,92 @@ class Noises:
     weights: Array
     log_determinant: Array
 
-    def take(self, kept: Array) -> Noises:
+    def take(self, kept: Places) -> Noises:
         """Return some of them."""
         return Noises(self.weights[kept], self.log_determinant[kept])
 
 
-def sums(columns: Array, starts: Places) -> Sums:
+def sums(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Places) -> Sums:
     """
     Sum whitened columns over bands.
 
     Parameters
     ----------
-    columns : shape (p, m)
+    nuisances : shape (q, m)
+    columns : of the candidates, shape (p, m)
+    groups : the places of the columns of each candidate
     starts : first index of each band, shape (b,)
 
     """
-    parts = np.split(columns, starts[1:], axis=1)
-    products = np.array([part @ part.T for part in parts])
-    roots = tuple(part if part.shape[1] <= len(columns) else _root(product) for part, product in zip(parts, products))
-    return Sums(products, roots, np.array([part.shape[1] for part in parts], float))
+    parts = [slice(begin, end) for begin, end in zip(starts, [*starts[1:], nuisances.shape[1]])]
+    own = np.array([nuisances[:, part] @ nuisances[:, part].T for part in parts])
+    towards = np.array([nuisances[:, part] @ columns[:, part].T for part in parts])
+    squares = np.add.reduceat(columns ** 2, starts, axis=1) if len(columns) else np.empty((0, len(starts)))
+    blocks = tuple(squares[group[0], :, None, None] if len(group) == 1 else _block(columns[list(group)], parts) for group in groups)
+    return Sums(own, towards, blocks, np.array([part.stop - part.start for part in parts], float))
 
 
-def _root(product: Array) -> Array:
-    values, vectors = np.linalg.eigh(product)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+def _block(columns: Array, parts: Sequence[slice]) -> Array:
+    return np.array([columns[:, part] @ columns[:, part].T for part in parts])
 
 
-def measured(residual: Array, columns: Array, starts: Places) -> Sample:
-    """Sum a whitened residual, shape (m,), over bands."""
-    crossed = [part @ z for part, z in zip(np.split(columns, starts[1:], axis=1), np.split(residual, starts[1:]))]
-    return Sample(np.array([crossed]), np.add.reduceat(residual ** 2, starts)[None])
+def sample(residuals: Array, nuisances: Array, columns: Array, starts: Places) -> Sample:
+    """Sum whitened residuals, shape (d, m), over bands."""
+    parts = [slice(begin, end) for begin, end in zip(starts, [*starts[1:], nuisances.shape[1]])]
+    own = np.stack([residuals[:, part] @ nuisances[:, part].T for part in parts], axis=1)
+    crossed = np.stack([residuals[:, part] @ columns[:, part].T for part in parts], axis=1)
+    return Sample(own, crossed, np.add.reduceat(residuals ** 2, starts, axis=1))
 
 
-def drawn(known: Sums, noises: Noises, probability: Array, count: int, generator: np.random.Generator) -> Sample:
-    """Draw residuals that hold nothing but noise, each by one of the noises, as probable as given: no column of theirs is ever made."""
-    which = generator.choice(len(probability), count, p=probability)
-    deviation = 1.0 / np.sqrt(noises.weights[which])
-    crossed, squared = np.empty((count, len(known.count), known.columns.shape[1])), np.empty((count, len(known.count)))
-    for band, (root, size) in enumerate(zip(known.roots, known.count)):
-        white = generator.standard_normal((count, root.shape[1]))
-        rest = generator.chisquare(size - root.shape[1], count) if size > root.shape[1] else 0.0
-        crossed[:, band] = deviation[:, band, None] * (white @ root.T)
-        squared[:, band] = deviation[:, band] ** 2 * ((white ** 2).sum(axis=1) + rest)
-    return Sample(crossed, squared)
+def drawn(noises: Noises, count: Array, probability: Array, draws: int, generator: np.random.Generator) -> Array:
+    """
+    Draw residuals that hold nothing but noise, each by one of the noises, as probable as given: shape (draws, m).
+
+    In single precision, which is enough for what chance shows, and twice as fast.
+
+    """
+    which = generator.choice(len(probability), draws, p=probability)
+    deviation = np.repeat((1.0 / np.sqrt(noises.weights)).astype(np.float32), count.astype(int), axis=1)
+    return generator.standard_normal((draws, deviation.shape[1]), np.float32) * deviation[which]
 
 
 @dataclass(frozen=True)
 class Beside:
     """
-    What nuisances leave of the columns under each noise.
+    What nuisances leave of the candidates under each noise.
 
     Attributes
     ----------
-    nuisances : which columns they are
     own : information of the nuisances, shape (g, q, q)
     towards : the nuisances that each column looks like, shape (g, q, p)
-    left : information of the columns beside the nuisances, shape (g, p, p)
+    left : of each candidate, the information of its columns beside the nuisances, shape (g, k, k)
     log_determinant : of `own` and of the noise, shape (g,)
-    tied : columns that the nuisances leave nothing of, shape (p,)
+    tied : candidates that the nuisances leave nothing of
     freedom : coefficients less nuisances
 
     """
 
-    nuisances: list[int]
     own: Array
     towards: Array
-    left: Array
+    left: tuple[Array, ...]
     log_determinant: Array
-    tied: Mask
+    tied: tuple[bool, ...]
     freedom: float
 
 
-def beside(known: Sums, noises: Noises, nuisances: Sequence[int]) -> Beside:
-    """Take nuisances, which are columns too, out of all columns."""
-    chosen, information = list(nuisances), np.tensordot(noises.weights, known.columns, 1)
-    own = information[:, chosen][:, :, chosen]
-    towards = np.linalg.solve(own, information[:, chosen])
-    left = information - np.swapaxes(information[:, chosen], 1, 2) @ towards
-    tied: Mask = np.any(_diagonal(left) <= LEAST_LEFT * _diagonal(information), axis=0)
-    return Beside(chosen, own, towards, left, noises.log_determinant + np.linalg.slogdet(own)[1], tied,
-                  float(known.count.sum()) - len(chosen))
+def beside(known: Sums, groups: Sequence[Group], noises: Noises) -> Beside:
+    """Take the nuisances out of all candidates."""
+    own = np.tensordot(noises.weights, known.own, 1)
+    crossing = np.tensordot(noises.weights, known.towards, 1)
+    towards = np.linalg.solve(own, crossing)
+    left, tied = [], []
+    for group, block in zip(groups, known.blocks):
+        whole = np.tensordot(noises.weights, block, 1)
+        part = whole - np.swapaxes(crossing[:, :, list(group)], 1, 2) @ towards[:, :, list(group)]
+        left.append(part)
+        tied.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
+    return Beside(own, towards, tuple(left), noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
+                  float(known.count.sum()) - own.shape[1])
 
 
 def _diagonal(matrices: Array) -> Array:
@@ -170,7 +183,7 @@ class Judged:
 
     Attributes
     ----------
-    likelihood : restricted log likelihood without any cause, shape (d, g)
+    likelihood : restricted log likelihood without any candidate, shape (d, g)
     squares : sum of whitened squares that are left, shape (d, g)
     pull : X'z beside the nuisances, shape (d, g, p)
 
@@ -183,35 +196,36 @@ class Judged:
     @property
     def probability(self) -> Array:
         """Return how probable each noise is, shape (d, g)."""
-        return np.exp(self.likelihood - logsumexp(self.likelihood, axis=1, keepdims=True))
+        top = np.exp(self.likelihood - self.likelihood.max(axis=1, keepdims=True))
+        return top / top.sum(axis=1, keepdims=True)
 
 
-def judge(sample: Sample, noises: Noises, by: Beside) -> Judged:
+def judge(given: Sample, noises: Noises, by: Beside) -> Judged:
     """Take the nuisances out of residuals."""
-    crossed = np.einsum('gb,dbp->dgp', noises.weights, sample.crossed, optimize=True)
-    own = crossed[:, :, by.nuisances]
-    squares = sample.squared @ noises.weights.T - np.einsum('dgq,dgq->dg', np.linalg.solve(by.own, own[..., None])[..., 0], own)
+    own = noises.weights @ given.own
+    value = np.linalg.solve(by.own, own[..., None])[..., 0]
+    squares = given.squared @ noises.weights.T - (value * own).sum(axis=-1)
     likelihood = -0.5 * (by.freedom * np.log(squares) + by.log_determinant)
-    return Judged(likelihood, squares, crossed - np.einsum('gqp,dgq->dgp', by.towards, own, optimize=True))
+    pull = noises.weights @ given.crossed - (own[:, :, None, :] @ by.towards)[:, :, 0]
+    return Judged(likelihood, squares, pull)
 
 
-def evidence(judged: Judged, by: Beside, groups: Sequence[Sequence[int]]) -> Array:
+def evidence(judged: Judged, by: Beside, groups: Sequence[Group]) -> Array:
     """
-    Return the evidence of groups of columns, shape (d, groups); minus infinity where one is tied to the nuisances.
-
-    Each group is one set of columns with free values.
+    Return the evidence of candidates, shape (d, groups); minus infinity where one is tied to the nuisances.
 
     """
-    return np.column_stack([_evidence(judged, by, list(group)) for group in groups])
+    return np.column_stack([_evidence(judged, by, place, list(group)) for place, group in enumerate(groups)])
 
 
-def _evidence(judged: Judged, by: Beside, group: list[int]) -> Array:
-    if by.tied[group].any():
+def _evidence(judged: Judged, by: Beside, place: int, group: list[int]) -> Array:
+    if by.tied[place]:
         return np.full(len(judged.squares), -np.inf)
-    own = by.left[:, group][:, :, group] + 1e-12 * np.eye(len(group)) * _diagonal(by.left)[:, group, None]
-    pull = judged.pull[:, :, group]
-    gained = (pull[..., 0] ** 2 / own[:, 0, 0] if len(group) == 1
-              else np.einsum('dgq,dgq->dg', np.linalg.solve(own, pull[..., None])[..., 0], pull))
+    own, pull = by.left[place], judged.pull[:, :, group]
+    own = own + 1e-10 * np.eye(len(group)) * _diagonal(own)[:, None]
+    if len(group) == 1:
+        return _summary(judged, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]), by.freedom, 1)
+    gained = ((pull[:, :, None, :] @ np.linalg.inv(own))[:, :, 0] * pull).sum(axis=-1)
     return _summary(judged, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
 
 
@@ -221,4 +235,11 @@ def _summary(judged: Judged, gained: Array, logarithm: Array, freedom: float, si
     change = 0.5 * (size * np.log(judged.squares) - (freedom - size) * ratio - logarithm)
     best = judged.likelihood.argmax(axis=1)
     scale = 0.5 * (logarithm[best] - size * np.log(judged.squares[np.arange(len(best)), best]))
-    return logsumexp(judged.likelihood + change, axis=1) + scale - logsumexp(judged.likelihood, axis=1)
+    return log_sum(judged.likelihood + change) + scale - log_sum(judged.likelihood)
+
+
+def log_sum(logarithms: Array) -> Array:
+    """Return the logarithm of the sum of exponentials along the last axis."""
+    top = logarithms.max(axis=-1)
+    with np.errstate(invalid='ignore'):
+        return np.where(np.isfinite(top), top + np.log(np.exp(logarithms - top[..., None]).sum(axis=-1)), top)

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
-from gyro_calibration.diagnosis.evidence import Beside, Judged, Noises, Places, Sample, Sums, beside, judge, measured, sums
+from gyro_calibration.diagnosis.evidence import Beside, Judged, Noises, Places, Sample, beside, judge, log_sum, sample, sums
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import Shape, angles, bands, inverse, noise_grid
 from gyro_calibration.effects import CATALOGUE
@@ -80,9 +79,12 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
     starts = np.concatenate([bands(angle, step) + offset for (angle, step), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
-    relative = np.array([
-        np.add.reduceat(np.concatenate([shape.variance(angle, step) / step for angle, step in parts]) / deviation ** 2, starts) / count
-        for shape in shapes])
+    # Some coefficients of a band are enough to know its mean variance.
+    few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int)) for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
+    angle, step = np.concatenate([part[0] for part in parts]), np.concatenate([np.full(len(part[0]), part[1]) for part in parts])
+    chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
+    relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / deviation[chosen] ** 2, first_of)
+                         for shape in shapes]) / [len(part) for part in few]
     noises = Noises(1.0 / relative, np.log(relative) @ count)
     return Field(replays, first, deviation, starts, tuple(shapes), noises)
 
@@ -97,7 +99,7 @@ class Work:
     field : with the rate that the gyro sees, if something happens to it before
     named : causes
     residual : whitened, without what the causes of fixed amplitude make, shape (m,)
-    columns : whitened: scale factor error, then those of the causes, then what their shapes change, shape (q, m)
+    columns : whitened and independent: scale factor error, those of the causes, what their shapes change, shape (q, m)
     owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus one less place of its shape)
     sample, by, judged : see `evidence`
 
@@ -122,13 +124,12 @@ class Work:
         """
         judged, best = self.judged, int(self.judged.likelihood[0].argmax())
         _, logarithm = np.linalg.slogdet(self.by.own[best])
-        units = 0.5 * (logarithm - len(self.by.nuisances) * np.log(judged.squares[0, best]))
-        return float(logsumexp(judged.likelihood[0]) + units)
+        return float(log_sum(judged.likelihood)[0] + 0.5 * (logarithm - len(self.columns) * np.log(judged.squares[0, best])))
 
     def white(self) -> list[Array]:
         """Return what is left of each log by the likeliest noise, as white noise in time of variance 1: shape (points,) each."""
         values, _ = self.estimates
-        left = self.residual - values @ self.columns[self.by.nuisances]
+        left = self.residual - values @ self.columns
         best = int(self.judged.likelihood[0].argmax())
         left = left * self.field.divided(best) * np.sqrt(self.by.freedom / self.judged.squares[0, best])
         return [inverse(part) for part in np.split(left, np.cumsum([each.points - 1 for each in self.field.replays])[:-1])]
@@ -140,7 +141,7 @@ class Work:
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
         covariance = np.linalg.inv(self.by.own[kept])
-        crossed = np.einsum('gb,bp->gp', self.field.noises.weights[kept], self.sample.crossed[0])[:, self.by.nuisances]
+        crossed = self.field.noises.weights[kept] @ self.sample.own[0]
         values = np.einsum('gpq,gq->gp', covariance, crossed)
         mean = weights @ values
         inside = np.einsum('g,gpq->pq', weights * self.judged.squares[0, kept] / self.by.freedom, covariance)
@@ -213,24 +214,22 @@ def free_shapes(candidate: Candidate) -> list[int]:
 
 
 def _worked(whole: Field, named: tuple[Named, ...], residual: Array, columns: Array, owner: tuple[tuple[int, int], ...]) -> Work:
-    white, of = residual / whole.deviation, columns / whole.deviation
-    present = np.flatnonzero((of ** 2).sum(axis=1) > 0.0)
-    of, owner = of[present], tuple(owner[place] for place in present)
-    known = sums(of, whole.starts)
-    by = beside(known, whole.noises, _independent(known))
-    sample = measured(white, of, whole.starts)
-    return Work(whole, named, white, of, owner, sample, by, judge(sample, whole.noises, by))
+    kept = _independent(columns / whole.deviation)
+    white, of = residual / whole.deviation, columns[kept] / whole.deviation
+    nothing = np.empty((0, len(white)))
+    given = sample(white[None], of, nothing, whole.starts)
+    by = beside(sums(of, nothing, (), whole.starts), (), whole.noises)
+    return Work(whole, named, white, of, tuple(owner[place] for place in kept), given, by, judge(given, whole.noises, by))
 
 
-def _independent(known: Sums) -> list[int]:
-    """Return the columns that are not made of those before them."""
-    product = known.columns.sum(axis=0)
+def _independent(columns: Array) -> list[int]:
+    """Return the columns that are not made of those before them, nor zero."""
+    product = columns @ columns.T
     length = np.sqrt(np.diag(product))
-    product = product / np.outer(length, length)
     kept: list[int] = []
-    for place in range(len(product)):
-        own, towards = product[np.ix_(kept, kept)], product[kept, place]
+    for place in np.flatnonzero(length > 0.0).tolist():
+        own = product[np.ix_(kept, kept)] / np.outer(length[kept], length[kept])
+        towards = product[kept, place] / (length[kept] * length[place])
         if 1.0 - (towards @ np.linalg.solve(own, towards) if kept else 0.0) > 1e-9:
             kept.append(place)
     return kept
-

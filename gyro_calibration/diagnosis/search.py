@@ -15,17 +15,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
-from scipy.special import logsumexp
 
 from gyro_calibration.diagnosis.candidates import Candidate, by_cause, candidates, columns_of, effect, fitted_shapes, pulse, with_shape
-from gyro_calibration.diagnosis.evidence import Judged, beside, drawn, evidence, judge, measured, sums
-from gyro_calibration.diagnosis.field import Field, Named, Work, field, seen, work
+from gyro_calibration.diagnosis.evidence import beside, drawn, evidence, judge, log_sum, sample, sums
+from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, work
+from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
 from gyro_calibration.log import Array
 
 #: Residuals drawn to learn what chance shows.
 DRAWS = 400
+#: Of the noises that are likely, so many are used to learn it.
+MOST_NOISES = 60
 #: A cause that explains the data less well than the best by more than this, in logarithms of the likelihood, is ruled out.
 RULED_OUT = 3.2
 #: What a shape costs, for a free one fits a little noise.
@@ -36,6 +38,10 @@ LEAST_PERIODS = 20
 WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
 #: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
 UNLIKELY = 12.0
+#: What each column beyond the first costs, for it fits a little noise.
+PRICE_OF_COLUMN = 1.2
+#: By so much a structure without a name must be better than every cause.
+MARGIN = 4.0
 #: So many causes at most are named.
 MOST_CAUSES = 6
 
@@ -80,22 +86,9 @@ class Bank:
     columns: Array
 
 
-@dataclass(frozen=True)
-class Screen:
-    """The evidence of each candidate beside what is named, and what it was made from."""
-
-    found: Array
-    judged: Judged
-
-    def of_causes(self, places: Mapping[str, list[int]]) -> dict[str, float]:
-        """Return the evidence of each cause, averaged over its first shapes."""
-        return {cause: averaged(self.found[own]) for cause, own in places.items()}
-
-
-def averaged(found: Array) -> float:
-    """Return the logarithm of the mean of likelihoods, of those that can be told."""
-    known = found[np.isfinite(found)]
-    return float(logsumexp(known) - np.log(len(known))) if len(known) else -np.inf
+def averaged(found: Array) -> Array:
+    """Return the logarithm of the mean of likelihoods along the last axis."""
+    return log_sum(found) - np.log(found.shape[-1])
 
 
 def bank(whole: Field, found: Sequence[Candidate], named: Sequence[Named] = ()) -> Bank:
@@ -115,61 +108,75 @@ class Search:
     Attributes
     ----------
     field : the logs
-    candidates : all causes with their first shapes
+    bank : all candidates, where nothing changes the rate
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
 
     """
 
     field: Field
-    candidates: tuple[Candidate, ...]
+    bank: Bank
     chance: Chance
     rate: float
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Return all causes with their first shapes."""
+        return self.bank.candidates
 
     def excess(self, cause: str, found: float) -> float:
         """Return what an evidence is above what chance may show."""
         return found - self.chance.threshold(cause, self.rate)
 
 
-def screen(done: Work, stock: Bank) -> Screen:
-    """Return the evidence of all candidates beside what is named."""
-    count = len(done.columns)
-    columns = np.concatenate([done.columns, stock.columns])
-    known = sums(columns, done.field.starts)
-    by = beside(known, done.field.noises, done.by.nuisances)
-    judged = judge(measured(done.residual, columns, done.field.starts), done.field.noises, by)
-    return Screen(evidence(judged, by, [[place + count for place in group] for group in stock.groups])[0], judged)
+def screen(done: Work, stock: Bank) -> Array:
+    """Return the evidence of all candidates beside what is named, shape (candidates,)."""
+    noises = done.field.noises
+    by = beside(sums(done.columns, stock.columns, stock.groups, done.field.starts), stock.groups, noises)
+    judged = judge(sample(done.residual[None], done.columns, stock.columns, done.field.starts), noises, by)
+    return _priced(evidence(judged, by, stock.groups), stock)[0]
+
+
+def _priced(found: Array, stock: Bank) -> Array:
+    """Return evidence, shape (d, candidates), less the price of columns beyond the first."""
+    return found - PRICE_OF_COLUMN * np.array([len(group) - 1.0 for group in stock.groups])
 
 
 def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
     """Draw residuals of noise alone, as this log may have it, and see what evidence of each cause they show."""
     probable = done.judged.probability[0]
-    kept = np.flatnonzero(probable > 1e-4)
+    kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
     noises = done.field.noises.take(kept)
-    columns = np.concatenate([done.columns, stock.columns])
-    known = sums(columns, done.field.starts)
-    by = beside(known, noises, done.by.nuisances)
-    sample = drawn(known, noises, probable[kept] / probable[kept].sum(), DRAWS, generator)
-    found = evidence(judge(sample, noises, by), by, [[place + len(done.columns) for place in group] for group in stock.groups])
+    known = sums(done.columns, stock.columns, stock.groups, done.field.starts)
+    by = beside(known, stock.groups, noises)
+    single = done.columns.astype(np.float32), stock.columns.astype(np.float32)
+    found = []
+    for _ in range(DRAWS // 100):
+        residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100, generator)
+        found.append(_priced(evidence(judge(sample(residuals, *single, done.field.starts), noises, by), by, stock.groups), stock))
+    return _chance(np.concatenate(found), by_cause(stock.candidates))
+
+
+def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
     start, scale, share = {}, {}, 0.15
-    for cause, places in by_cause(stock.candidates).items():
-        drawn_evidence = np.sort([averaged(each) for each in found[:, places]])
-        most = drawn_evidence[int((1.0 - share) * DRAWS):]
+    for cause, own in places.items():
+        most = np.sort(averaged(found[:, own]))[int((1.0 - share) * len(found)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return Chance(start, scale, share)
 
 
 def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006) -> Search:
     """Lay out logs and learn what chance shows in them."""
-    found = candidates(replays)
+    found = [*candidates(replays), *probes(replays)]
     whole = _of_likely_noises(field(replays), found)
     done = work(whole, [])
-    return Search(whole, tuple(found), chances(done, bank(whole, found), generator), rate / len(by_cause(found)))
+    stock = bank(whole, found)
+    return Search(whole, stock, chances(done, stock, generator), rate / len(by_cause(found)))
 
 
 def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
     """Leave out noises that are out of the question, both where nothing is in the logs and where much may be."""
-    middle = [places[len(places) // 2] for places in by_cause(found).values()]
+    middle = [places[len(places) // 2] for places in by_cause([each for each in found if is_named(each)]).values()]
     tried = [work(whole, []), work(whole, [], [found[place] for place in middle])]
     kept = np.flatnonzero(np.any([each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried], axis=0))
     return replace(whole, shapes=tuple(whole.shapes[place] for place in kept), noises=whole.noises.take(kept))
@@ -224,7 +231,9 @@ class Step:
 def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Step:
     """Add a cause with the best of its shapes near those given."""
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
-        return Step((*named, Named(candidate)), work(search.field, [*named, Named(candidate)]).score)
+        done = work(search.field, [*named, Named(candidate)])
+        width = sum(place == len(named) for place, _ in done.owner)
+        return Step((*named, Named(candidate)), done.score - (0.0 if is_named(candidate) else MARGIN) - PRICE_OF_COLUMN * max(width - 1, 0))
     begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
     place = fitted_shapes(candidate)[0]
     low, high = _around(search, begin, place)
@@ -281,16 +290,17 @@ def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] 
 
     """
     done = work(search.field, named)
-    stock = bank(search.field, search.candidates, named)
-    found = screen(done, stock).found
+    stock = search.bank if not any(is_of_the_rate(each.candidate.cause) for each in named) else bank(search.field, search.candidates, named)
+    found = screen(done, stock)
     scanned = [*tones(done), *slips(done)]
-    first = [(search.candidates[max(own, key=lambda place: found[place])], averaged(found[own]), float(found[own].max()))
+    first = [(search.candidates[max(own, key=lambda place: found[place])], float(averaged(found[own])), float(found[own].max()))
              for own in by_cause(search.candidates).values()]
     first += [(candidate, value, value) for candidate, value in scanned]
     if not any(search.excess(candidate.cause, value) > 0.0 for candidate, value, _ in first):
         return None, []
     top = max(most for _, _, most in first)
-    steps = [refined(search, named, candidate) for candidate, _, most in first if most > 0.8 * top - 8.0]
+    steps = [refined(search, named, candidate) for candidate, value, most in first
+             if most > 0.8 * top - 8.0 and (is_named(candidate) or search.excess(candidate.cause, value) > 0.0)]
     steps.sort(key=lambda step: -step.score)
     return steps[0], steps
 
@@ -307,7 +317,7 @@ def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
 
 def _updated(done: Work, place: int, values: Array) -> Named:
     known = done.named[place]
-    own = {done.owner[column]: values[rank] for rank, column in enumerate(done.by.nuisances)}
+    own = dict(zip(done.owner, values))
     free = tuple(float(own[place, number]) for number in range(8) if (place, number) in own)
     found = free if known.candidate.amplitude is None else (known.candidate.amplitude,)
     candidate = known.candidate

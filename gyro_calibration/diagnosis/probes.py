@@ -1,0 +1,152 @@
+"""
+Structure without a name: families of functions of each variable, of two of them, and of time.
+
+They compete with the causes. Where one of them is clearly better than every cause, the cause is none that is known here.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from gyro_calibration.diagnosis.candidates import Candidate
+from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.log import Array
+
+#: Begins the name of what has none; the variable follows along which it lies.
+UNNAMED = '~'
+#: Knots of a spline over a variable.
+KNOTS = 8
+#: Moments and widths of a bump in a log, as parts of it.
+MOMENTS, BUMPS = 40, (0.007, 0.02, 0.05)
+#: Waves over the range of a variable.
+WAVES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
+HARMONICS = range(2, 9)
+
+Of = Callable[[Replay], Array]
+
+
+def is_named(candidate: Candidate) -> bool:
+    """Tell a cause from a structure without a name."""
+    return not candidate.cause.startswith(UNNAMED)
+
+
+def along(candidate: Candidate) -> str:
+    """Return the variable of a structure without a name."""
+    return candidate.cause[len(UNNAMED):]
+
+
+def probes(replays: Sequence[Replay]) -> list[Candidate]:
+    """Return what may be in these logs without a name."""
+    variables = dict(_variables(replays))
+    found = [each for name, of in variables.items() for each in _of_one(name, of)]
+    if 'rate' in variables:
+        found += [*_of_rate(variables['rate']), *_of_heading(variables)]
+        found += [_probe(f'rate and {name}', _product(of, variables['rate'], square)) for name, of in variables.items()
+                  if name not in ('rate', 'temperature') for square in (False,)]
+    for first, second in combinations([name for name in variables if name != 'rate'], 2):
+        found.append(_probe(f'{first} and {second}', _product(variables[first], variables[second], False)))
+    return [*found, *_of_time(replays)]
+
+
+def _probe(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None, *shapes: float) -> Candidate:
+    return Candidate(UNNAMED + name, shapes, columns, run)
+
+
+def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
+    """Give the variables that these logs have and that change in them, each scaled to -1 to 1."""
+    has = frozenset.intersection(*(each.has for each in replays))
+    known: dict[str, Of] = {'rate': lambda each: each.channels.rate}
+    if 'temperature' in has:
+        known['temperature'] = lambda each: each.channels.temperature
+    if 'supply' in has:
+        known['supply'] = lambda each: each.channels.supply
+    if 'specific_force' in has:
+        known['specific_force'] = lambda each: each.channels.lagged('specific_force', 0.3)
+    for name, of in known.items():
+        low = min(float(of(each).min()) for each in replays)
+        high = max(float(of(each).max()) for each in replays)
+        if high > low:
+            yield name, _scaled(of, low, high)
+
+
+def _scaled(of: Of, low: float, high: float) -> Of:
+    return lambda each: np.clip((2.0 * of(each) - low - high) / (high - low), -1.0, 1.0)
+
+
+def _of_one(name: str, of: Of) -> Iterator[Candidate]:
+    for waves in WAVES:
+        yield _probe(name, _wave(of, waves))
+    for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
+        if (name, power) != ('rate', 2):
+            yield _probe(name, _power(of, power))
+    for steep in (-8.0, -4.0, 4.0, 8.0):
+        yield _probe(name, _exponential(of, steep))
+    yield _probe(name, _spline(of))
+
+
+def _wave(of: Of, waves: float) -> Callable[[Replay], Sequence[Array]]:
+    def columns(each: Replay) -> Sequence[Array]:
+        phase = np.pi * waves * of(each)
+        return np.sin(phase), np.cos(phase)
+    return columns
+
+
+def _power(of: Of, power: int) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (of(each) ** power,)
+
+
+def _exponential(of: Of, steep: float) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (np.exp(steep * of(each) - abs(steep)),)
+
+
+def _spline(of: Of) -> Callable[[Replay], Sequence[Array]]:
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, KNOTS - 2), [1.0] * 3])
+
+    def columns(each: Replay) -> Sequence[Array]:
+        table = BSpline.design_matrix(of(each), knots, 3).toarray().T
+        return tuple(table[1:])  # together they are constant, which is the bias
+    return columns
+
+
+def _product(first: Of, second: Of, square: bool) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (first(each) * second(each) ** (2 if square else 1),)
+
+
+def _of_rate(rate: Of) -> Iterator[Candidate]:
+    for power in (0.25, 0.5, 0.75, 1.5):
+        yield _probe('rate', lambda each, power=power: (np.abs(rate(each)) ** power,))
+        yield _probe('rate', lambda each, power=power: (np.sign(rate(each)) * np.abs(rate(each)) ** power,))
+
+
+def _of_heading(variables: dict[str, Of]) -> Iterator[Candidate]:
+    rate = variables['rate']
+    for harmonic in HARMONICS:
+        yield _probe('heading', _harmonic(harmonic, None))
+    for harmonic in HARMONICS[:3]:
+        yield _probe('rate and heading', _harmonic(harmonic, rate))
+    for name in ('temperature', 'supply'):
+        if name in variables:
+            yield _probe(f'{name} and heading', _harmonic(1, variables[name]))
+
+
+def _harmonic(number: int, times: Of | None) -> Callable[[Replay], Sequence[Array]]:
+    def columns(each: Replay) -> Sequence[Array]:
+        phase, factor = number * each.channels.heading, 1.0 if times is None else times(each)
+        return factor * np.sin(phase), factor * np.cos(phase)
+    return columns
+
+
+def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
+    for run, each in enumerate(replays):
+        for width in BUMPS:
+            for moment in np.linspace(0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
+                yield _probe('time', _bump(moment * each.duration, width * each.duration), run, moment * each.duration)
+
+
+def _bump(middle: float, width: float) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (np.exp(-0.5 * ((each.channels.time - each.channels.time[0] - middle) / width) ** 2),)
