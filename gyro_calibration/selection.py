@@ -27,7 +27,7 @@ from gyro_calibration.effects import (
     Channels,
     Effect,
 )
-from gyro_calibration.log import DataRefused, Progress
+from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.scatter import Scatter, find_scatter
 
 #: How often an effect is taken that is not there, in one calibration.
@@ -101,7 +101,7 @@ class Selection:
 
 def select_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter) -> Selection:
     """
-    Fit the effects that the dwells support.
+    Fit the effects that the dwells support, each with its reason.
 
     Parameters
     ----------
@@ -114,14 +114,27 @@ def select_effects(dwells: Dwells, technology: str | None = None, progress: Prog
     DataRefused : too few dwells for anything
 
     """
+    best, twins = supported_effects(dwells, technology, progress)
+    tried = _tried(best.effects)
+    choices = tuple(_choice(best, effect, tried, twins) for effect in progress(list(STEADY.values())))
+    return Selection(best, choices, twins)
+
+
+def supported_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter,
+                      rate: float = FALSE_ALARM_RATE) -> tuple[Calibration, tuple[Twins, ...]]:
+    """Fit the effects that the dwells support, without reasons; `rate` is how often one is taken that is not there."""
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
     candidates = [effect for effect in STEADY.values() if effect not in base.effects]
-    best = _grow(base, candidates, scatter, progress)
-    best = _prune(best, base.effects, len(candidates), scatter)
-    best, twins = _part(best, technology, scatter)
-    choices = tuple(_choice(best, effect, len(candidates), twins, scatter) for effect in progress(list(STEADY.values())))
-    return Selection(best, choices, twins)
+    limit = rate / len(candidates)
+    best = _grow(base, candidates, limit, progress)
+    best = _prune(best, base.effects, limit)
+    return part_twins(best, technology)
+
+
+def _tried(effects: Sequence[Effect]) -> int:
+    """Return how many effects were tried beside those that belong to every model."""
+    return len(STEADY) - sum(effect in effects for effect in (BIAS, SCALE_FACTOR_ERROR))
 
 
 def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
@@ -140,19 +153,19 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
         return None
 
 
-def _supported(smaller: Calibration, larger: Calibration, tried: int) -> bool:
+def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
     """Tell whether left-out sweeps are predicted better with more effects, and the evidence of each is beyond chance."""
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.predicted_misfit() < smaller.predicted_misfit()
-    return predicts and all(larger.chance_of(effect) < FALSE_ALARM_RATE / tried for effect in added)
+    return predicts and all(larger.chance_of(effect) < limit for effect in added)
 
 
-def _grow(fit: Calibration, candidates: Sequence[Effect], scatter: Scatter, progress: Progress) -> Calibration:
+def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float, progress: Progress) -> Calibration:
     """Add the effect that predicts left-out sweeps best, again and again."""
     while True:
         new = [effect for effect in candidates if _may_join(effect, fit.effects)]
-        tried = [_try(fit.dwells, _joined(fit.effects, effect), scatter) for effect in progress(new)]
-        better = [each for each in tried if each is not None and _supported(fit, each, len(candidates))]
+        tried = [_try(fit.dwells, _joined(fit.effects, effect), fit.scatter) for effect in progress(new)]
+        better = [each for each in tried if each is not None and _supported(fit, each, limit)]
         if not better:
             return fit
         fit = min(better, key=Calibration.predicted_misfit)
@@ -168,28 +181,28 @@ def _joined(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
     return (*effects, effect) if needed is None or needed in effects else (*effects, needed, effect)
 
 
-def _prune(fit: Calibration, base: Sequence[Effect], tried: int, scatter: Scatter) -> Calibration:
+def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibration:
     """Take away what is of no use any more beside effects that came later."""
     for effect in fit.effects:
         rest = tuple(each for each in fit.effects if each is not effect)
         if effect in base or effect in map(_NEEDS.get, rest):
             continue
-        smaller = _try(fit.dwells, rest, scatter)
-        if smaller is not None and not _supported(smaller, fit, tried):
-            return _prune(smaller, base, tried, scatter)
+        smaller = _try(fit.dwells, rest, fit.scatter)
+        if smaller is not None and not _supported(smaller, fit, limit):
+            return _prune(smaller, base, limit)
     return fit
 
 
 # twins
 
-def _part(fit: Calibration, technology: str | None, scatter: Scatter) -> tuple[Calibration, tuple[Twins, ...]]:
+def part_twins(fit: Calibration, technology: str | None) -> tuple[Calibration, tuple[Twins, ...]]:
     """Decide between effects that explain the same."""
     found = []
     for pair in _TWINS:
         for taken, other in (pair, pair[::-1]):
             swapped = None
             if taken in fit.effects:
-                swapped = _try(fit.dwells, _swapped(fit.effects, taken, other), scatter)
+                swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other), fit.scatter)
             if swapped is not None:
                 fit, twins = _decide((fit, taken), (swapped, other), technology)
                 found.append(twins)
@@ -214,17 +227,17 @@ def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
     """Return the slowest rate, beyond those that were measured, at which two dwells each way would part two fits, rad/s."""
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):
-        if _separation(fit, swapped, rate) >= PARTED + 1.0:
+        if separation(fit, swapped, np.array([rate, rate, -rate, -rate]), fit.model.reference_temperature) >= PARTED + 1.0:
             return float(rate)
     return None
 
 
-def _separation(fit: Calibration, swapped: Calibration, rate: float) -> float:
-    """Return by how many standard deviations two fits differ in a sweep of two dwells each way at a rate."""
-    ways = np.array([rate, rate, -rate, -rate])
-    known = fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
-    sweep = Dwells(ways, ways, None, np.full(4, np.median(known) if len(known) else np.nan), np.zeros(4, dtype=int), ('',) * 4)
-    channels = Channels(ways, ways, np.full(4, fit.model.reference_temperature))
+def separation(fit: Calibration, swapped: Calibration, rates: Array, temperature: float) -> float:
+    """Return by how many standard deviations two fits differ in one more sweep, of dwells at these rates, shape (n,), and a temperature."""
+    count, known = len(rates), fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
+    deviation = np.full(count, np.median(known) if len(known) else np.nan)
+    sweep = Dwells(rates, rates, None, deviation, np.zeros(count, dtype=int), ('',) * count)
+    channels = Channels(rates, rates, np.full(count, temperature))
     rows = np.column_stack([row for term in fit.terms for row in term.sensitivity(channels)])
     uncertain = 0.0 if fit.model.covariance is None else rows @ fit.model.covariance @ rows.T
     shared = fit.scatter.shared(sweep)
@@ -235,11 +248,11 @@ def _separation(fit: Calibration, swapped: Calibration, rate: float) -> float:
 
 # reasons
 
-def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins], scatter: Scatter) -> Choice:
+def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]) -> Choice:
     """Return what a fit with the effect has over one without it, or with its twin, everything else being as it was chosen."""
     for pair in twins:
         if effect.name == pair.other:
-            swapped = fit_effects(fit.dwells, _swapped(fit.effects, STEADY[pair.taken], effect), scatter)
+            swapped = fit_effects(fit.dwells, swapped_effects(fit.effects, STEADY[pair.taken], effect), fit.scatter)
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
             return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan, reason)
     taken = effect in fit.effects
@@ -247,15 +260,17 @@ def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]
     if taken and not rest:
         return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan, 'nothing else can be seen')
     try:
-        other = fit_effects(fit.dwells, rest if taken else _joined(rest, effect), scatter)
+        other = fit_effects(fit.dwells, rest if taken else _joined(rest, effect), fit.scatter)
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
-    reason = _reason(taken, _supported(smaller, larger, tried)) if larger.freedom else 'as many values as dwells tell nothing from chance'
+    limit = FALSE_ALARM_RATE / tried
+    reason = _reason(taken, _supported(smaller, larger, limit)) if larger.freedom else 'as many values as dwells tell nothing from chance'
     return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, larger.chance_of(effect), reason)
 
 
-def _swapped(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
+def swapped_effects(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
+    """Return the effects with another one in place of one of them."""
     return tuple(other if each is taken else each for each in effects)
 
 
