@@ -133,5 +133,5 @@ _OTHERS = (
 )
 
 CAUSES: Mapping[str, Cause] = {
-    **{name: _of_an_effect(name, likeness) for name, likeness in _OF_THE_GYRO.items() if name in CATALOGUE},
+    **{name: _of_an_effect(name, likeness) for name, likeness in _OF_THE_GYRO.items()},
     **{cause.name: cause for cause in _OTHERS}}

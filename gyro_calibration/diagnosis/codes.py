@@ -1,0 +1,189 @@
+"""
+Codes: the values that a digital output takes, the step between them, and the limit that it cannot go beyond.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from gyro_calibration.diagnosis.compared import Compared
+from gyro_calibration.log import Array, Mask
+
+#: Values closer than this, relative to the largest, are one: a change of units rounds them.
+_SAME = 1e-12
+#: How well codes must lie on a lattice: the length of their mean phase, which is 1 for exact ones and 0 for any values.
+_ALIGNED = 0.7
+#: Where among the gaps between codes the step is looked for: where codes are left out, only few gaps are as small.
+_STARTS = (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)
+#: Codes on each side that a step is found among before it is carried further.
+_SOME = 8
+#: The count of the extreme code is compared with that of so many next to it, or of those within a part of the white noise.
+_NEIGHBOURS, _WITHIN = 4, 0.05
+#: Codes finer than this part of the white noise hardly ever repeat by chance.
+_FINE = 0.1
+#: A code that is reached in so many separate runs is none that was stuck.
+_SEPARATE = 3
+
+
+@dataclass(frozen=True)
+class Codes:
+    """
+    The values that occur, in order, and how often: arrays of shape (m,).
+
+    Attributes
+    ----------
+    step : between neighbouring codes; 0 where there is no such step
+    aligned : how well the codes lie on it, 0 to 1
+    deviation : standard deviation of the step
+
+    """
+
+    values: Array
+    counts: Array
+    step: float = 0.0
+    aligned: float = 0.0
+    deviation: float = 0.0
+
+
+def codes_of(values: Array) -> Codes:
+    """Return the codes of some values, none of them nan: the coarsest lattice that they lie on, up to rounding in print."""
+    found, counts = np.unique(values, return_counts=True)
+    apart = np.concatenate([[True], np.diff(found) > _SAME * np.abs(found[[0, -1]]).max()])
+    first = np.flatnonzero(apart)
+    codes = Codes(found[first], np.add.reduceat(counts, first))
+    gaps = np.diff(codes.values)
+    if not gaps.size:
+        return codes
+    for start in sorted({float(gap) for gap in np.quantile(gaps, _STARTS)}, reverse=True):
+        step, aligned, deviation = _lattice(codes, start)
+        if aligned > _ALIGNED:
+            return Codes(codes.values, codes.counts, step, aligned, deviation)
+    return codes
+
+
+def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
+    """Refine a step from codes near each other to codes far apart; return it, how well they lie on it, and its standard deviation."""
+    gaps = np.diff(codes.values)
+    near = gaps < 8.5 * step
+    step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
+    place, span = _about_the_densest(codes.values)
+    reach, deviation = span / step + 0.5, 0.0
+    while True:
+        within = np.abs(place) < reach * step
+        aligned, offset = _alignment(place[within], codes.counts[within], step)
+        if aligned < _ALIGNED:
+            return step, aligned, deviation
+        number = np.rint((place[within] - offset) / step)
+        if np.ptp(number) > 0.0:
+            step, deviation = _slope(number, place[within])
+        if within.all():
+            return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
+        reach *= 4.0
+
+
+def _about_the_densest(values: Array) -> tuple[Array, float]:
+    """Return how far values are from where they stand closest, and how far to go for the next ones: neighbours give the step at first."""
+    width = min(2 * _SOME, len(values) - 1)
+    span = values[width:] - values[:-width]
+    first = int(np.argmin(span))
+    return values - values[first + width // 2], float(span[first])
+
+
+def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
+    """Return the length of the mean phase of some places on a lattice, and by how much the lattice is moved."""
+    mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
+    return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
+
+
+def _slope(number: Array, place: Array) -> tuple[float, float]:
+    """Return the slope of a line through places over whole numbers, and its standard deviation; wild places do not count."""
+    slope, off, spread = _line(number, place)
+    good = np.abs(off) <= 0.3 * abs(slope)
+    if np.ptp(number[good]) > 0.0:
+        slope, off, spread = _line(number[good], place[good])
+    return slope, float(np.std(off) / spread)
+
+
+def _line(number: Array, place: Array) -> tuple[float, Array, float]:
+    """Return the slope of a line, how far places are off it, and the root of the sum of squares of the numbers about their mean."""
+    centred, apart = number - number.mean(), place - place.mean()
+    squares = float(centred @ centred)
+    slope = float(centred @ apart) / squares
+    return slope, apart - slope * centred, float(np.sqrt(squares))
+
+
+@dataclass(frozen=True)
+class Limit:
+    """
+    Codes that the output cannot go beyond.
+
+    Attributes
+    ----------
+    low, high : the limit on each side, infinite where there is none
+    p_value : the chance that an output without one repeats its extreme codes as often
+
+    """
+
+    low: float
+    high: float
+    p_value: float
+
+    @property
+    def size(self) -> float:
+        """Return the limit as a rate without sign."""
+        return min(-self.low, self.high)
+
+    def reached(self, output: Array) -> Mask:
+        """Mark the samples at the limit."""
+        slack = 1e-9 * self.size
+        return (output >= self.high - slack) | (output <= self.low + slack)
+
+
+def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
+    """
+    Return the limit of an output, or None where it shows none.
+
+    An extreme code is one if it stands more often than its neighbours further in, where an output that is free to go beyond has fewer; and
+    if the output would have gone beyond by what is expected of it, which a coarse code at a constant rate would not.
+
+    Parameters
+    ----------
+    codes : of the output
+    seen : output and expectation
+    level : chance of a false alarm on one side
+
+    """
+    chances = {}
+    for sign in (1.0, -1.0):
+        values, counts = (codes.values, codes.counts) if sign > 0.0 else (-codes.values[::-1], codes.counts[::-1])
+        chance = _chance(values, counts, codes.step, seen.white)
+        if chance < level and _held_back(seen, sign, values[-1], codes.step):
+            chances[sign] = (sign * values[-1], chance)
+    if not chances:
+        return None
+    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0], min(chance for _, chance in chances.values()))
+
+
+def _chance(values: Array, counts: Array, step: float, white: float) -> float:
+    """Return the chance of as many samples at the last code as the first of them has company, if the density falls towards it."""
+    reach = max(_NEIGHBOURS * step, _WITHIN * white)
+    neighbours = min(reach / step, 1e6) if step else 1e6
+    before = int(counts[:-1][values[:-1] > values[-1] - reach - 0.5 * step].sum())
+    return float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + before, 1.0 / (neighbours + 1.0)))
+
+
+def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
+    """Tell whether samples at their largest value, in one sense of rotation, would have gone beyond it."""
+    at = sign * seen.output >= top - 1e-9 * abs(top)
+    runs = int(np.count_nonzero(np.diff(at.astype(np.int8), prepend=0) > 0))
+    fine = step < _FINE * seen.white
+    beyond = np.array([]) if seen.expected is None else sign * seen.expected[at & np.isfinite(seen.expected)] - top
+    if not beyond.size:
+        return fine and runs >= _SEPARATE
+    middle = float(np.median(beyond))
+    near = middle > -3.0 * max(seen.white, seen.scatter)
+    return middle > 0.5 * step + 2.0 * seen.white / np.sqrt(len(beyond)) or (fine and (runs >= _SEPARATE or near))

@@ -1,0 +1,135 @@
+"""
+The output beside what the reference lets expect of it, sample by sample, as far as a straight line between the two tells.
+
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.signal import savgol_filter
+
+from gyro_calibration.log import Array, Log
+
+#: A rate is taken from a heading by parabolas over so long, s, for its steps would hide it over one sample.
+_SMOOTHING = 0.15
+#: Lengths of the blocks in which output and reference are compared, s; the shorter where the motion averages out in the longer.
+_BLOCKS = (0.5, 0.1)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Output = factor * rate + offset: what regression finds, with the standard deviation of the factor from the scatter between parts."""
+
+    factor: float
+    offset: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Compared:
+    """
+    Output and expectation, in rad/s, shape (n,).
+
+    Attributes
+    ----------
+    output : without nan; what was lost is bridged
+    expected : by the reference, nan where that was lost; None without reference
+    white : standard deviation of the white noise of a sample
+    scatter : robust standard deviation of the output about the expectation; infinite without one
+
+    """
+
+    output: Array
+    expected: Array | None
+    white: float
+    scatter: float = math.inf
+
+
+def compare(output: Array, rate: Array | None, line: Line | None) -> Compared:
+    """Put an output beside what a line expects of it by the rate."""
+    whole = bridged(output)
+    if rate is None or line is None:
+        return Compared(whole, None, white_noise(output))
+    expected = line.factor * rate + line.offset
+    off = output - expected
+    scatter = 1.4826 * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else math.inf
+    return Compared(whole, expected, min(white_noise(output), white_noise(off)), scatter)
+
+
+def bridged(values: Array) -> Array:
+    """Return values with nan bridged by straight lines."""
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    places = np.arange(len(values))
+    return np.interp(places, places[known], values[known])
+
+
+def white_noise(values: Array) -> float:
+    """Return the standard deviation of the white part of a signal, by third differences: a smooth motion has next to none."""
+    off = np.abs(np.diff(values, 3))
+    off = off[np.isfinite(off)]
+    # Not by the median: an output of few codes has differences of zero mostly.
+    return float(np.quantile(off, 0.9)) / (stats.norm.isf(0.05) * math.sqrt(20.0)) if off.size else math.inf
+
+
+def reference_rate(log: Log) -> Array | None:
+    """Return the rate by the reference, rad/s, nan where it was lost; None without reference."""
+    if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
+        return log.reference_rate
+    if log.reference_heading is None or log.time is None or np.isfinite(log.reference_heading).sum() < 2:
+        return None
+    known = np.isfinite(log.reference_heading)
+    length = min(max(5, 2 * round(0.5 * _SMOOTHING / float(np.median(np.diff(log.time)))) + 1), (len(known) - 1) // 2 * 2 + 1)
+    if length < 3:
+        return None
+    smooth = savgol_filter(bridged(log.reference_heading), length, 2)
+    return np.where(known, np.gradient(smooth, log.time), np.nan)
+
+
+def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
+    """Return the line of the output over the rate by means over blocks, or None where there is no motion to find it from."""
+    known = np.isfinite(rate) & np.isfinite(output)
+    if np.count_nonzero(known) < 8 or not np.ptp(rate[known]) > 0.0:
+        return None
+    rate, output = rate[known], output[known]
+    if time is not None:
+        rate, output = _block_means(time[known], rate, output)
+    return _line(rate, output) if len(rate) >= 8 else None
+
+
+def _block_means(time: Array, rate: Array, output: Array) -> tuple[Array, Array]:
+    means = rate, output
+    for length in _BLOCKS:
+        block = np.floor((time - time[0]) / length).astype(np.int64)
+        count = np.bincount(block)
+        sums = [np.bincount(block, values)[count > 0] / count[count > 0] for values in (rate, output)]
+        means = sums[0], sums[1]
+        if np.std(means[0]) > 0.8 * np.std(rate):
+            break
+    return means
+
+
+def _line(rate: Array, output: Array) -> Line | None:
+    good = np.ones(len(rate), dtype=bool)
+    for _ in range(3):
+        if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.0:
+            return None
+        columns = np.column_stack([rate, np.ones(len(rate))])
+        solution = np.linalg.lstsq(columns[good], output[good], rcond=None)[0]
+        off = output - columns @ solution
+        good = np.abs(off) <= 5.0 * 1.4826 * np.median(np.abs(off)) + 1e-15
+    return Line(float(solution[0]), float(solution[1]), _scatter(columns[good], off[good]))
+
+
+def _scatter(columns: Array, off: Array) -> float:
+    """Return the standard deviation of the slope, by what up to 20 parts of the record would change it by: their noise has a colour."""
+    pieces = np.minimum(np.arange(len(off)) * min(20, len(off) // 2) // len(off), 19)
+    scores = np.array([np.bincount(pieces, column * off) for column in columns.T])
+    inverse = np.linalg.pinv(columns.T @ columns)
+    student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
+    return float(student * math.sqrt((inverse @ scores @ scores.T @ inverse)[0, 0]))

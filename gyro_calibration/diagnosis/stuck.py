@@ -1,0 +1,146 @@
+"""
+Stuck samples: the last value once more, where a new one was due. An output of coarse codes repeats itself honestly.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from gyro_calibration.diagnosis.compared import Compared
+from gyro_calibration.log import Array, Mask
+
+#: Motions that are told apart, by the change that is expected from one sample to the next.
+_CLASSES = 8
+#: From this share of repeats on, an output is too coarse for single ones to mean anything; runs may.
+_COARSE = 0.3
+#: Single repeats are believed to be stuck where honest ones are as rare as this.
+_RARE = 0.02
+#: Excess of repeats over the honest ones, as a part of these, below which their number is not known well enough.
+_EXCESS = 0.5
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """
+    Samples that repeat the one before.
+
+    Attributes
+    ----------
+    repeats : those that are not honest, shape (n,)
+    honest : how many repeats the codes and the noise explain
+    p_value : the chance of as many, or of runs as long
+
+    """
+
+    repeats: Mask
+    honest: float
+    p_value: float
+
+    @property
+    def runs(self) -> int:
+        """Return how often it stuck."""
+        return int(np.count_nonzero(np.diff(self.repeats.astype(np.int8), prepend=0) > 0))
+
+
+def stuck_samples(seen: Compared, step: float, good: Mask, level: float) -> Stuck | None:
+    """
+    Find samples that are stuck, or return None.
+
+    Parameters
+    ----------
+    seen : output and expectation
+    step : between codes, rad/s; 0 for none
+    good : samples to look at; those at a limit repeat honestly
+    level : chance of a false alarm
+
+    """
+    looked, change = good[1:] & good[:-1], np.diff(seen.output)
+    same, expected = (change == 0.0) & looked, _expected_change(seen.expected, len(change))
+    if not same.any():
+        return None
+    chance = _honest_chances(change, expected, step, looked)
+    repeats, p_value = np.zeros(len(good), dtype=bool), 1.0
+    honest = float(chance[looked].sum())
+    rare = (chance < _COARSE) & looked
+    excess, believed = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
+    by_number = float(stats.poisson.sf(excess - 1, believed)) if excess > believed * (1.0 + _EXCESS) else 1.0
+    if by_number < level:
+        repeats[1:], p_value = same & (chance < _RARE), by_number
+    for start, stop, unlikely in _runs(same, chance, expected, step, seen.white):
+        if unlikely * len(good) < level:
+            repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
+    return Stuck(repeats, honest, p_value) if repeats.any() else None
+
+
+def _expected_change(expected: Array | None, count: int) -> Array:
+    return np.zeros(count) if expected is None else np.nan_to_num(np.diff(expected))
+
+
+def _honest_chances(change: Array, expected: Array, step: float, looked: Mask) -> Array:
+    """
+    Return the chance of each change to be none.
+
+    It is the part of a code that the sample before leaves for this one, averaged over the noise, among changes that are expected alike.
+
+    """
+    if step == 0.0:
+        return np.zeros(len(change))
+    chances = np.ones(len(change))
+    edges = np.quantile(np.abs(expected), np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1])
+    classes = np.searchsorted(edges, np.abs(expected), side='left')
+    for each in np.unique(classes):
+        members = np.flatnonzero((classes == each) & looked)
+        if len(members):
+            deviation = _deviation_of_changes(change[members] - expected[members], change[members] == 0.0, step)
+            chances[members] = np.maximum(_same_code(expected[members], deviation, step), _share_of_neighbours(change[members], step))
+    return chances
+
+
+def _share_of_neighbours(change: Array, step: float) -> float:
+    """Return the share of changes by one code or two, each way: no fewer are none, whatever the noise is like."""
+    size = np.abs(change)
+    count = np.count_nonzero((size > 0.5 * step) & (size < 2.5 * step))
+    return float((count + 2.0 * np.sqrt(count)) / 4.0 / len(change))
+
+
+def _deviation_of_changes(change: Array, same: Mask, step: float) -> float:
+    """Return the standard deviation of changes by noise, of which those of zero may be stuck and are replaced by those due."""
+    moved = np.abs(change[~same])
+    if len(moved) < 2:
+        return 0.0
+    moved = np.minimum(moved, 4.0 * np.median(moved))
+    square = float(np.mean(moved ** 2))
+    variance = square
+    for _ in range(20):
+        variance = square * (1.0 - float(_same_code(np.zeros(1), np.sqrt(variance), step)[0]))
+    return float(np.sqrt(variance))
+
+
+def _same_code(expected: Array, deviation: float, step: float) -> Array:
+    """Return the mean of max(0, 1 - |D| / step) for D of this mean and standard deviation: two samples then have one code."""
+    scale = max(deviation, 1e-9 * step)
+    low, middle, high = ((edge - expected) / scale for edge in (-step, 0.0, step))
+    inside = [stats.norm.cdf(high) - stats.norm.cdf(middle), stats.norm.cdf(middle) - stats.norm.cdf(low)]
+    means = [expected * inside[0] + scale * (stats.norm.pdf(middle) - stats.norm.pdf(high)),
+             expected * inside[1] + scale * (stats.norm.pdf(low) - stats.norm.pdf(middle))]
+    return np.clip(inside[0] + inside[1] - (means[0] - means[1]) / step, 0.0, 1.0)
+
+
+def _runs(same: Mask, chance: Array, expected: Array, step: float, white: float) -> Iterator[tuple[int, int, float]]:
+    """Give where runs of at least two repeats begin and end, and how unlikely each is."""
+    edges: NDArray[np.intp] = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+    starts, stops = edges[::2], edges[1::2]
+    product, due = (np.concatenate([[0.0], np.cumsum(each)]) for each in (np.log(np.maximum(chance, 1e-12)), expected))
+    for start, stop in zip(starts[stops - starts >= 2].tolist(), stops[stops - starts >= 2].tolist()):
+        if chance[start:stop].max() < _COARSE:
+            yield start, stop, float(np.exp(max(product[stop] - product[start], -700.0)))
+        else:
+            # Repeats of a coarse code depend on each other: it is stuck only if it should have left the code.
+            left = abs(due[stop] - due[start]) - step
+            yield start, stop, float(2.0 * stats.norm.sf(left / (np.sqrt(2.0) * white))) if left > 0.0 else 1.0

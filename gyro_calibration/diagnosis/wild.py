@@ -1,0 +1,164 @@
+"""
+Wild samples: single ones far from their neighbours, and not because the gyro moves.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import stats
+
+from gyro_calibration.diagnosis.compared import Compared, bridged
+from gyro_calibration.log import Array, Mask
+
+#: Wild is beyond so many standard deviations, or more where so many samples reach that by chance.
+_WILD = 6.0
+#: Samples on each side that one is compared with.
+_SIDE = 3
+#: Samples in which the scatter is taken to be the same.
+_BLOCK = 256
+#: Kinds of motion that are told apart, by how much the expectation changes about a sample.
+_KINDS = 16
+#: Shares of the farthest samples that the scatter is measured at, so that the tail of a rough motion is seen.
+_TAILS = (0.05, 0.01)
+#: So many side by side are no single samples any more.
+_LONGEST = 2
+#: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on the motion.
+_TIED = 0.85
+#: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
+_FEW, _BY_CHANCE = 3, 1e-3
+#: From here to wild there must be fewer samples than wild ones, in standard deviations: else they are the tail of something.
+_NEAR = 4.5
+
+
+@dataclass(frozen=True)
+class Wild:
+    """
+    Samples that are wild.
+
+    Attributes
+    ----------
+    samples : shape (n,)
+    largest : in standard deviations
+    p_value : the chance of as many among Gaussian ones
+
+    """
+
+    samples: Mask
+    largest: float
+    p_value: float
+
+
+def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild | None:
+    """
+    Find wild samples, or return None.
+
+    Parameters
+    ----------
+    seen : output and expectation
+    good : samples that count
+    floor : the scatter is at least this, rad/s: half a code
+    level : chance of a false alarm
+
+    """
+    output, expected = bridged(np.where(good, seen.output, np.nan)), _known(seen)
+    limit = max(_WILD, float(stats.norm.isf(0.25 * level / len(output))))
+    moved = np.zeros(len(output)) if expected is None else _moved(expected)
+    far = _far(output, moved, good, floor)
+    if expected is not None:
+        beside = _far(output - expected, moved, good, floor)
+        # Where the reference is wild itself, the gyro is not to blame.
+        far = np.maximum(far, np.where(_off(output) > 0.5 * _off(output - expected), beside, 0.0))
+    wild = _single((far > limit) & good)
+    count, near = int(np.count_nonzero(wild)), int(np.count_nonzero((far > _NEAR) & (far <= limit) & good))
+    if not count or near > 2 * count + 3 or _tied(wild, moved, seen):
+        return None
+    p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
+    return Wild(wild, float(far[wild].max()), p_value) if p_value < level else None
+
+
+def _neighbours(values: Array, side: int) -> Array:
+    """Return the samples before and after each one, shape (n, 2 side)."""
+    window = sliding_window_view(np.pad(values, side, mode='reflect'), 2 * side + 1)
+    return np.delete(window, side, axis=1)
+
+
+def _known(seen: Compared) -> Array | None:
+    return None if seen.expected is None or not np.isfinite(seen.expected).any() else bridged(seen.expected)
+
+
+def _moved(expected: Array) -> Array:
+    """Return how much the output is expected to change about each sample, shape (n,)."""
+    window = sliding_window_view(np.pad(expected, 2 * _SIDE, mode='edge'), 4 * _SIDE + 1)
+    return np.ptp(window, axis=1)
+
+
+def _off(values: Array) -> Array:
+    """Return how far each sample is from the median of its neighbours."""
+    return np.abs(values - np.median(_neighbours(values, _SIDE), axis=1))
+
+
+def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
+    """Return how far each sample is from its neighbours, in standard deviations of such distances about here and in such motion."""
+    near = _neighbours(values, _SIDE)
+    off = np.abs(values - np.median(near, axis=1))
+    # A step, a corner or a steep slope leaves the median, but not what its neighbours span.
+    outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
+    scale = np.maximum(np.maximum(_about_here(off, good), _in_such_motion(off, moved, good)), max(floor, 1e-300))
+    return np.where(outside > 0.5 * off, off / scale, 0.0)
+
+
+def _about_here(off: Array, good: Mask) -> Array:
+    """Return the robust standard deviation in blocks, the larger of each two that meet about a sample."""
+    blocks = max(1, len(off) // _BLOCK)
+    scales = np.array([_robust(part[kept]) for part, kept in zip(np.array_split(off, blocks), np.array_split(good, blocks))])
+    edged = np.pad(scales, 1, mode='edge')
+    scales = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
+    return np.repeat(scales, [len(part) for part in np.array_split(off, blocks)])
+
+
+def _robust(off: Array) -> float:
+    return float(np.quantile(off, 0.6827)) if off.size else 0.0
+
+
+def _in_such_motion(off: Array, moved: Array, good: Mask) -> Array:
+    """Return the standard deviation among samples with as much motion, by the share of far ones too where there are enough."""
+    edges = np.unique(np.quantile(moved[good], np.linspace(0.0, 1.0, _KINDS + 1)[1:-1])) if good.any() else np.array([])
+    kinds = np.searchsorted(edges, moved, side='left')
+    scales = np.zeros(len(edges) + 1)
+    for kind in range(len(scales)):
+        members = off[(kinds == kind) & good]
+        if members.size:
+            tails = [np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share) for share in _TAILS if share * members.size > 5]
+            scales[kind] = max([_robust(members), *tails])
+    return scales[kinds]
+
+
+def _single(wild: Mask) -> Mask:
+    """Leave out those with more wild ones at their side than single samples have."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wild.astype(np.int8), [0]])))
+    single = np.zeros(len(wild), dtype=bool)
+    for start, stop in zip(edges[::2], edges[1::2]):
+        single[start:stop] = stop - start <= _LONGEST
+    return single
+
+
+def _tied(wild: Mask, moved: Array, seen: Compared) -> bool:
+    """Tell whether wild samples stand where the motion changes most, or at certain rates, as at the edges of a dead zone."""
+    if np.count_nonzero(wild) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
+        return False
+    ranks = _ranks(moved[wild], moved)
+    if ranks.mean() > max(_TIED, 0.5 + stats.norm.isf(_BY_CHANCE) / np.sqrt(12.0 * len(ranks))):
+        return True
+    turning = (moved > 3.0 * seen.white) & np.isfinite(seen.expected)
+    if np.count_nonzero(wild & turning) < _FEW:
+        return False
+    speeds = np.abs(seen.expected)
+    return bool(stats.kstest(_ranks(speeds[wild & turning], speeds[turning]), 'uniform').pvalue < _BY_CHANCE)
+
+
+def _ranks(values: Array, among: Array) -> Array:
+    return np.searchsorted(np.sort(among), values) / len(among)
