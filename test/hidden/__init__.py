@@ -1,9 +1,15 @@
 """
 Logs with something hidden in them, made apart from the package: nothing of it is imported here.
 
-`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE` those that are not in it.
+`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE` those that are not in it; `twin` and `part` make the
+logs on which two causes cannot be told apart, and on which they can; `oracle_gain` says what is won by who knows the truth.
 
-Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `log`.
+A size is a multiple of what is just detectable beside a bias of each recording and one scale (`size`), with these exceptions: faults of
+samples are counted, and three are just detectable; steps of codes and encoders have the size whose added variance is just detectable; a
+wrong unit has no size; a figure of the noise changes until its spectrum is as far from the expected one as a just detectable effect is from
+none.
+
+Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `likeness`, `log`, `twins`, `oracle`.
 
 """
 
@@ -11,8 +17,10 @@ from .effects import FORMS
 from .log import ALL, Cause, Gyro, HiddenLog, Truth, draw_gyro, hide, record
 from .motion import Session, described, session
 from .noise import KINDS, NoiseFigures
+from .oracle import OracleGain, oracle_gain
 from .outside import OUTSIDE
 from .size import DETECTABLE
+from .twins import TWINS, part, twin
 
-__all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'Cause', 'Gyro', 'HiddenLog', 'NoiseFigures', 'Session', 'Truth',
-           'described', 'draw_gyro', 'hide', 'record', 'session']
+__all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog', 'NoiseFigures', 'OracleGain', 'Session',
+           'Truth', 'described', 'draw_gyro', 'hide', 'oracle_gain', 'part', 'record', 'session', 'twin']

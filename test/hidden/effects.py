@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.stats import norm
 
 from .filters import lag
 from .motion import Session
@@ -22,6 +23,15 @@ from .motion import Session
 REFERENCE_TEMPERATURE = 25.0
 REFERENCE_SUPPLY = 5.0
 Shapes = dict[str, float]
+
+#: What is a finding only beside a model that says otherwise.
+AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk', 'bias_instability', 'rate_random_walk')
+#: What is counted, and how many of them are just detectable: enough that chance does not make them.
+COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
+#: Steps that are sized by the variance that they add, which a test of the variance would just see.
+STEPPED = ('quantization', 'reference_quantization')
+#: What adds no column of its own.
+WITHOUT_COLUMN = {*AGAINST_A_MODEL, *COUNTED, *STEPPED, 'unit_error'}
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,7 @@ def _frequency(sessions: list[Session], generator: np.random.Generator) -> Shape
 
 def _step_time(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     run = int(generator.integers(len(sessions)))
-    return {'run': run, 'step_time': generator.uniform(0.15, 0.85) * sessions[run].time[-1]}
+    return {'run': run, 'step_time': float(generator.uniform(0.15, 0.85) * sessions[run].time[-1])}
 
 
 def temperature_rate(session: Session) -> np.ndarray:
@@ -142,10 +152,16 @@ def _slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
 
 def _slip(session: Session, shapes: Shapes) -> np.ndarray:
     """Return the rate of slips by 1 rad each, smooth in time, rad/s."""
-    times = [value for name, value in shapes.items() if name.startswith('slip_time')]
-    width = shapes['width']
-    pulses = [np.exp(-0.5 * ((session.time - at) / width) ** 2) / (width * math.sqrt(2.0 * math.pi)) for at in times]
-    return np.sum(pulses, axis=0)
+    return np.sum([norm.pdf(session.time, at, shapes['width']) for at in _slip_times(shapes)], axis=0)
+
+
+def slipped(session: Session, shapes: Shapes) -> np.ndarray:
+    """Return the integral of the rate of slips by 1 rad each, rad."""
+    return np.sum([norm.cdf(session.time, at, shapes['width']) for at in _slip_times(shapes)], axis=0)
+
+
+def _slip_times(shapes: Shapes) -> list[float]:
+    return [value for name, value in shapes.items() if name.startswith('slip_time')]
 
 
 def _eccentric(session: Session, shapes: Shapes) -> np.ndarray:
@@ -203,6 +219,13 @@ FORMS: Mapping[str, Form] = {
     'bias_instability': Form(_samples, 'rad/s', stage='noise', signed=False),
     'rate_random_walk': Form(_samples, 'rad/s/√s', stage='noise', signed=False),
 }
+
+
+def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
+    """Return what an effect of a size adds in each recording, less the reference, at the true rate, rad/s."""
+    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run else np.zeros(len(each.time))
+            for run, each in enumerate(sessions)]
+
 
 #: What a wrong unit multiplies the output by; and delays, in samples.
 UNIT_FACTORS = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-1': -1.0, '2': 2.0, '1024/1000': 1.024, '4096/1000': 4.096}

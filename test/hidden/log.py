@@ -11,21 +11,25 @@ from __future__ import annotations
 import gzip
 import io
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from .effects import FORMS, UNIT_DELAYS, UNIT_FACTORS, Form, Shapes, seen, top_rate
+from .effects import COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN, Form, Shapes, errors, seen, slipped, top_rate
+from .likeness import Likeness
 from .motion import Session, session
 from .noise import NoiseFigures, draw_figures, make
 from .outside import OUTSIDE
 from .size import DETECTABLE, Metric, solve_noise, solve_size
 
 ALL: Mapping[str, Form] = {**FORMS, **OUTSIDE}
-#: What is a finding only beside a model that says otherwise.
-AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk', 'bias_instability', 'rate_random_walk')
+#: Share of an effect outside the catalogue that no effect in it may explain, and how often its shapes are drawn for that.
+MOST_ALIKE = 0.25
+DRAWS = 30
+#: Bias of a gyro and its scatter from one power-on to the next, rad/s, and the largest scale factor error.
+BIAS, BIAS_SPREAD, SCALE = 3e-3, 3e-4, 0.02
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class Cause:
     minimum_detectable : size that is just found, alone; for saturation a limit, for a figure of the noise a change; nan without meaning
     multiple : of it, that is hidden
     apart : the multiple that is left when the other hidden effects take from it what they can explain
+    likeness : of an effect outside the catalogue, the share that the best effect in it could explain, and
+    likeness_of_three : that the best three could
 
     """
 
@@ -52,6 +58,13 @@ class Cause:
     minimum_detectable: float
     multiple: float
     apart: float = math.nan
+    likeness: float = math.nan
+    likeness_of_three: float = math.nan
+
+    @property
+    def left(self) -> float:
+        """The multiple that is left of an effect outside the catalogue when three effects in it take what they can."""
+        return self.multiple * math.sqrt(1.0 - self.likeness_of_three)
 
     @property
     def standard_deviation(self) -> float:
@@ -74,16 +87,20 @@ class Gyro:
     causes : what is hidden
     figures : its noise
     scale_factor_error : 1
+    biases : of the recordings that the sizes are for, rad/s
     bias_spread : standard deviation of the bias from one power-on to the next, rad/s
-    bias : rad/s, common to all
 
     """
 
     causes: tuple[Cause, ...]
     figures: NoiseFigures
     scale_factor_error: float
-    bias: float
+    biases: tuple[float, ...]
     bias_spread: float
+
+    def bias_of(self, run: int, generator: np.random.Generator) -> float:
+        """Return the bias of one recording, rad/s; a new one for a recording that was not planned."""
+        return self.biases[run] if run < len(self.biases) else float(generator.normal(np.mean(self.biases), self.bias_spread))
 
     def value(self, name: str) -> float:
         """Return the size of a hidden effect, 0 where it is not hidden."""
@@ -134,16 +151,15 @@ class Truth:
 
 @dataclass(frozen=True)
 class HiddenLog:
-    """Columns in the log format, by name, and the truth."""
+    """Columns in the log format, by name, the truth, and the conditions."""
 
     columns: Mapping[str, np.ndarray]
     truth: Truth
-    notes: tuple[str, ...] = field(default=())
+    session: Session
 
     def write(self, path: str | Path) -> Path:
         """Write a CSV file, compressed where the name ends in .gz, and return its path."""
         text = io.StringIO()
-        text.writelines(f'# {note}\n' for note in self.notes)
         text.write(','.join(self.columns) + '\n')
         rows = zip(*(column.tolist() for column in self.columns.values()))
         text.writelines(','.join(map(repr, row)) + '\n' for row in rows)
@@ -154,7 +170,9 @@ class HiddenLog:
 
 def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, *, noise: str = 'mixed',
          reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0, runs: int = 1, encoder_step: float = 0.0,
-         figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None) -> list[HiddenLog]:
+         figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None,
+         shapes: Callable[[list[Session]], Mapping[str, Shapes]] | None = None, against_a_model: bool = False,
+         signs: Mapping[str, float] | None = None) -> list[HiddenLog]:
     """
     Hide effects in recordings of a random gyro under random conditions.
 
@@ -170,6 +188,9 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     encoder_step : of a reference heading, rad; 0 is a heading without steps
     figures : the noise instead of a random one
     conditions : words for `session`: motion, temperature, supply, force, top_rate
+    shapes : recordings -> name of an effect -> its shapes, where they are not to be random
+    against_a_model : a model is known that says bias and scale, so that they hide nothing
+    signs : of sizes, by name, where they are not to be random
 
     Returns
     -------
@@ -178,13 +199,15 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     """
     sessions = [session(generator, duration, sample_rate, **(conditions or {})) for _ in range(runs)]
     expected = figures or draw_figures(noise, generator)
-    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step)
+    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step,
+                      shapes(sessions) if shapes else {}, ('bias', 'scale') if against_a_model else (), signs)
     return [record(gyro, each, generator, expected=expected, reference=reference, encoder_step=encoder_step, run=run)
             for run, each in enumerate(sessions)]
 
 
 def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, sessions: list[Session],
-              expected: NoiseFigures, encoder_step: float = 0.0) -> Gyro:
+              expected: NoiseFigures, encoder_step: float = 0.0, shapes: Mapping[str, Shapes] | None = None,
+              known: tuple[str, ...] = (), signs: Mapping[str, float] | None = None) -> Gyro:
     """Draw a gyro whose hidden effects have these multiples of what is just detectable in these recordings."""
     multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
     figures, causes = expected, []
@@ -192,82 +215,113 @@ def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], gener
         if FORMS.get(name) and FORMS[name].stage == 'noise':
             cause, figures = _draw_noise(name, multiples[name], generator, sessions, figures)
             causes.append(cause)
-    plain = 'unit_error' in names
-    gyro = Gyro((), figures, 0.0 if plain else generator.uniform(-0.02, 0.02), 0.0 if plain else generator.normal(0.0, 3e-3),
-                0.0 if plain else 3e-4)
+    biases = generator.normal(generator.normal(0.0, BIAS), BIAS_SPREAD, len(sessions))
+    scale = generator.uniform(-SCALE, SCALE)
+    if 'unit_error' in names:  # a scale factor error would be taken for a part of it
+        scale, biases = 0.0, 0.0 * biases
+    gyro = Gyro((), figures, scale, tuple(biases.tolist()), BIAS_SPREAD)
     metric = Metric(sessions, figures, encoder_step)
-    causes += [_draw_cause(name, multiples[name], generator, sessions, gyro, metric) for name in names if ALL[name].stage != 'noise']
-    return replace(gyro, causes=_apart(causes, sessions, metric))
+    sizing = _Sizing(sessions, gyro, metric, known)
+    causes += [_draw_cause(name, multiples[name], generator, sizing, (shapes or {}).get(name), (signs or {}).get(name))
+               for name in names if ALL[name].stage != 'noise']
+    return replace(gyro, causes=_apart(causes, sizing))
 
 
-def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session], gyro: Gyro, metric: Metric) -> Cause:
-    form = ALL[name]
-    shapes = form.shapes(sessions, generator)
-    sign = float(generator.choice([-1.0, 1.0])) if form.signed else 1.0
+@dataclass(frozen=True)
+class _Sizing:
+    """What sizes are measured by: the recordings, the gyro without its effects, the information, and what a model says of the nuisances."""
+
+    sessions: list[Session]
+    gyro: Gyro
+    metric: Metric
+    known: tuple[str, ...]
+
+    def errors(self, name: str, size: float, shapes: Shapes) -> list[np.ndarray]:
+        """Return what an effect adds in each recording; one on the output has bias and scale before it."""
+        if ALL[name].stage != 'output':
+            return errors(ALL[name], size, shapes, self.sessions)
+        outputs = [(1.0 + self.gyro.scale_factor_error) * each.rate + bias for each, bias in zip(self.sessions, self.gyro.biases)]
+        return [ALL[name].error(each, output, size, shapes) for each, output in zip(self.sessions, outputs)]
+
+    def norm(self, name: str, size: float, shapes: Shapes) -> float:
+        """Return how many standard deviations an effect is."""
+        of_the_same = {'bias': ('bias',), 'scale_factor_error': ('scale',), 'reference_scale': ('scale',)}.get(name, ())
+        return self.metric.norm(self.errors(name, size, shapes), (*self.known, *of_the_same))
+
+
+def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing, shapes: Shapes | None,
+                sign: float | None) -> Cause:
+    form, sessions = ALL[name], sizing.sessions
     if name in COUNTED or name in STEPPED or name == 'unit_error':
-        return _draw_uncommon(name, multiple, generator, sessions, gyro, metric)
-    without = {'bias': 'bias', 'scale_factor_error': 'scale', 'reference_scale': 'scale'}.get(name, '')
+        return _draw_uncommon(name, multiple, generator, sizing)
+    if name in OUTSIDE:
+        return _draw_outside(name, multiple, generator, sizing)
+    shapes = form.shapes(sessions, generator) if shapes is None else shapes
+    sign = sign or (float(generator.choice([-1.0, 1.0])) if form.signed else 1.0)
     if form.linear:
-        least = DETECTABLE / metric.norm(errors(form, 1.0, shapes, sessions), without)
+        least = DETECTABLE / sizing.norm(name, 1.0, shapes)
         return Cause(name, sign * multiple * least, shapes, form.unit, least, multiple)
     if name == 'saturation':
-        return _draw_saturation(multiple, sessions, metric)
+        return _draw_saturation(multiple, sizing)
     most = form.most(sessions)
 
     def norm(size: float) -> float:
-        return metric.norm(errors(form, sign * size, shapes, sessions))
-    guess = 1e-3 * most
-    least = solve_size(norm, DETECTABLE, guess, most)
-    size = solve_size(norm, DETECTABLE * multiple, min(least * multiple, most), most) if multiple != 1.0 else least
-    return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTABLE if size == most else multiple)
+        return sizing.norm(name, sign * size, shapes)
+    least = solve_size(norm, DETECTABLE, 1e-3 * most, most)
+    size = solve_size(norm, DETECTABLE * multiple, min(least * multiple, most), most)
+    return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTABLE)
 
 
-def _draw_saturation(multiple: float, sessions: list[Session], metric: Metric) -> Cause:
-    """Solve for how far below the top rate the limit is; the higher, the less there is to see."""
-    top, form = top_rate(sessions), FORMS['saturation']
+def _draw_outside(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing) -> Cause:
+    """Draw shapes until no effect of the catalogue explains much of it; the least explained of all where that takes long."""
+    form, likeness = OUTSIDE[name], Likeness(sizing.sessions, sizing.gyro.figures)
+    drawn = []
+    for _ in range(DRAWS):
+        shapes = form.shapes(sizing.sessions, generator)
+        column = errors(form, 1.0, shapes, sizing.sessions)
+        drawn.append((max(likeness.shares(column).values()), len(drawn), shapes, column))
+        if drawn[-1][0] < MOST_ALIKE:
+            break
+    share, _, shapes, column = min(drawn, key=lambda each: each[:2])
+    least = DETECTABLE / sizing.norm(name, 1.0, shapes)
+    size = float(generator.choice([-1.0, 1.0])) * multiple * least
+    return Cause(name, size, shapes, form.unit, least, multiple, likeness=share, likeness_of_three=likeness.together(column))
 
+
+def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
+    """Solve for how far below the largest output the limit is; the higher, the less there is to see."""
+    top = (1.0 + sizing.gyro.scale_factor_error) * top_rate(sizing.sessions) + max(map(abs, sizing.gyro.biases))
     def norm(below: float) -> float:
-        return metric.norm(errors(form, top - below, {}, sessions))
+        return sizing.norm('saturation', top - below, {})
     below = solve_size(norm, DETECTABLE, 1e-3 * top, 0.9 * top)
     further = solve_size(norm, DETECTABLE * multiple, below, 0.9 * top)
-    return Cause('saturation', top - further, {}, form.unit, top - below, multiple)
+    return Cause('saturation', top - further, {}, FORMS['saturation'].unit, top - below, norm(further) / DETECTABLE)
 
 
-def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
-    """Return what an effect of a size adds in each recording, less the reference, at the true rate."""
-    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run else np.zeros(len(each.time))
-            for run, each in enumerate(sessions)]
-
-
-def _apart(causes: list[Cause], sessions: list[Session], metric: Metric) -> tuple[Cause, ...]:
+def _apart(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
     """Tell of each cause that has a column what the others leave of its multiple."""
-    shown = [cause for cause in causes if cause.name not in (*AGAINST_A_MODEL, *COUNTED, *STEPPED, 'unit_error')]
+    shown = [cause for cause in causes if cause.name not in WITHOUT_COLUMN]
     if not shown:
         return tuple(causes)
-    gram = metric.gram([errors(ALL[cause.name], cause.size, cause.shapes, sessions) for cause in shown])
+    columns = [sizing.errors(cause.name, cause.size, cause.shapes) for cause in shown]
+    gram = sizing.metric.gram(columns, sizing.known)
     scale = np.sqrt(np.diag(gram))
     left = 1.0 / np.sqrt(np.diag(np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12, hermitian=True)))
     apart = {cause.name: float(length * share) / DETECTABLE for cause, length, share in zip(shown, scale, left)}
     return tuple(replace(cause, apart=apart.get(cause.name, math.nan)) for cause in causes)
 
 
-#: What is counted, and how many of them are just detectable: enough that chance does not make them.
-COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
-#: Steps that are sized by the variance that they add, which a test of the variance would just see.
-STEPPED = ('quantization', 'reference_quantization')
-
-
-def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session], gyro: Gyro,
-                   metric: Metric) -> Cause:
+def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing) -> Cause:
     """Draw what has no column: counted faults, steps, and wrong units."""
-    form, interval = FORMS[name], sessions[0].interval
+    form, interval = FORMS[name], sizing.sessions[0].interval
     if name in COUNTED:
         return Cause(name, float(max(1, round(COUNTED[name] * multiple))), {}, form.unit, COUNTED[name], multiple)
     if name == 'unit_error':
         kind = str(generator.choice([*UNIT_FACTORS, *UNIT_DELAYS]))
-        return Cause(f'{name}', UNIT_FACTORS.get(kind, 1.0), {'delay': UNIT_DELAYS.get(kind, 0.0) * interval}, form.unit, math.nan, math.nan)
-    count = sum(len(each.time) for each in sessions)
-    extra = DETECTABLE * math.sqrt(2.0 / count) * gyro.figures.sample_deviation(interval) ** 2
+        shapes = {'delay': UNIT_DELAYS.get(kind, 0.0) * interval}
+        return Cause(name, UNIT_FACTORS.get(kind, 1.0), shapes, form.unit, math.nan, math.nan)
+    count = sum(len(each.time) for each in sizing.sessions)
+    extra = DETECTABLE * math.sqrt(2.0 / count) * sizing.gyro.figures.sample_deviation(interval) ** 2
     # a step q adds q² / 12 to the variance; a heading's, differenced, twice that over the interval squared
     least = math.sqrt(12.0 * extra) if name == 'quantization' else math.sqrt(6.0 * extra) * interval
     return Cause(name, multiple * least, {}, form.unit, least, multiple)
@@ -291,7 +345,7 @@ def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sess
 def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expected: NoiseFigures | None = None, reference: str = 'rate',
            encoder_step: float = 0.0, run: int = 0) -> HiddenLog:
     """Record a gyro under the conditions of a session, which need not be those that its effects were sized for."""
-    bias = gyro.bias + generator.normal(0.0, 1.0) * gyro.bias_spread
+    bias = gyro.bias_of(run, generator)
     delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'), 0.0)
     w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'), gyro.value('bandwidth'))
     prediction = w + _sum(gyro, each, w, bias, run)
@@ -305,7 +359,7 @@ def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expecte
     truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error, _expected(gyro, bias, expected),
                   each.rate[rows], each.heading[rows], (prediction - each.rate)[rows], reference_rate[rows], (white + slow)[rows],
                   wanted[rows], good[rows])
-    return HiddenLog(columns, truth)
+    return HiddenLog(columns, truth, each)
 
 
 def _sum(gyro: Gyro, each: Session, w: np.ndarray, bias: float, run: int) -> np.ndarray:
@@ -341,7 +395,7 @@ def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndar
             wrong = -form.error(each, each.rate, cause.size, cause.shapes)
             rate = rate + wrong
             if cause.name == 'reference_slip':
-                heading = heading + np.cumsum(wrong) * each.interval
+                heading = heading + cause.size * slipped(each, cause.shapes)
     return rate, heading
 
 

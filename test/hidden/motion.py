@@ -78,7 +78,7 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
     motion : rich, one_speed (never at rest), two_way (one speed both ways, and rest), slow (below 0.3 rad/s), smooth (slow swings only)
     temperature : rich, ramp, cold_start, triangle (one turn), triangles (one speed both ways), smooth, constant
     supply : rich, heating (follows the temperature), constant
-    force : rich, one_pose, turning (vibrates exactly while it turns), rest_too (vibrates at rest as well), off_axis (centripetal)
+    force : rich, one_pose, turning (its power goes as the speed), off_axis (centripetal)
     top_rate : rad/s; random between 1 and 5 where it is None
 
     """
@@ -207,7 +207,7 @@ def _two_way(generator: np.random.Generator, duration: float, top: float) -> np.
     pieces, length = [], 0
     while length < duration / KNOT:
         for sign in (1.0, -1.0):
-            pieces += [_rest(generator, top), np.full(_length(generator, 8.0, 15.0), sign * top)]
+            pieces += [_rest(generator, top, 20.0, 40.0), np.full(_length(generator, 30.0, 60.0), sign * top)]
         length = sum(len(piece) for piece in pieces)
     return gaussian_filter1d(np.concatenate([*pieces[:-1], _rest(generator, top)])[:round(duration / KNOT)], 2.0)
 
@@ -218,8 +218,8 @@ def _slow(generator: np.random.Generator, duration: float, top: float) -> np.nda
 
 def _smooth(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
     """Swing so slowly that no lag and no delay can be told apart."""
-    shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT)), 1.5 / KNOT)
-    edge = np.minimum(1.0, np.arange(len(shape)) * KNOT / 5.0)
+    shape = gaussian_filter1d(generator.standard_normal(round(duration / KNOT)), 6.0 / KNOT)
+    edge = 0.5 - 0.5 * np.cos(np.pi * np.minimum(1.0, np.arange(len(shape)) * KNOT / 30.0))
     return top * shape / np.abs(shape).max() * edge * edge[::-1]
 
 
@@ -261,8 +261,8 @@ def _triangles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
 
 
 def _smooth_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """One sine, slow beside any lag of a gyro."""
-    return 25.0 + 8.0 * np.sin(2.0 * np.pi * (time / time[-1] + generator.random()))
+    """Half a wave, slow beside any lag of a gyro."""
+    return 25.0 + generator.uniform(-10.0, 10.0) * np.cos(np.pi * time / time[-1])
 
 
 def _constant_temperature(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
@@ -276,7 +276,7 @@ TEMPERATURES = {'rich': _warm_up_and_cycles, 'ramp': _one_ramp, 'cold_start': _c
 def _steps_and_wander(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     """Draw a supply that is switched between levels some times, and wanders by some millivolts."""
     interval = time[1] - time[0]
-    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(4, 9)))
+    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(12, 25)))
     levels = generator.uniform(-0.25, 0.25, len(edges) + 1)
     wander = gaussian_filter1d(generator.standard_normal(len(time)), 20.0 / interval)
     return generator.choice([3.3, 5.0]) + lag(levels[np.searchsorted(edges, time)], interval, 0.2) + 0.01 * wander / np.std(wander)
@@ -295,7 +295,7 @@ SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _
 
 def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tilt between poses, slowly, and vibrate while a motor runs, which it does at rest and in motion."""
-    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(4, 8)))
+    edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(8, 15)))
     poses = generator.uniform(-np.pi / 3.0, np.pi / 3.0, len(edges) + 1)
     angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 4.0), time[1] - time[0], 4.0)
     starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
@@ -313,8 +313,8 @@ def _one_pose(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray
 
 
 def _turning_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vibrate in proportion to the speed's square root, so that the power goes as the speed."""
-    return np.full(len(time), GRAVITY), generator.standard_normal(len(time)) * np.sqrt(np.abs(rate))
+    """Shake to and fro in proportion to the speed's square root, so that the power goes as the speed."""
+    return np.full(len(time), GRAVITY), generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate))
 
 
 def _off_axis(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

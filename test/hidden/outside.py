@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .effects import Form, Shapes, _column, _log_uniform, _phase, top_rate
+from .effects import Form, Shapes, _column, _phase, top_rate
 from .motion import Session
 
 
@@ -25,12 +25,18 @@ def _temperature_wave(sessions: list[Session], generator: np.random.Generator) -
 
 def _pulse(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     run = int(generator.integers(len(sessions)))
-    duration = sessions[run].time[-1]
+    duration = float(sessions[run].time[-1])
     return {'run': run, 'pulse_time': generator.uniform(0.15, 0.85) * duration, 'width': duration * generator.uniform(0.01, 0.03)}
 
 
-def _square_wave(sessions: list[Session], generator: np.random.Generator) -> Shapes:
-    return {'period': _log_uniform(generator, 15.0, 60.0), **_phase(sessions, generator)}
+def _telegraph(sessions: list[Session], generator: np.random.Generator) -> Shapes:
+    """Draw the moments at which a bias jumps to its other value and back."""
+    times = np.sort(generator.uniform(0.05, 0.95, generator.integers(12, 25)) * sessions[0].time[-1])
+    return {f'jump_time_{number}': float(at) for number, at in enumerate(times)}
+
+
+def _two_levels(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    return np.searchsorted(np.array(list(shapes.values())), session.time) % 2.0
 
 
 def _harmonic(number: int) -> Form:
@@ -41,12 +47,9 @@ def _warm_heading(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray
     return (session.temperature - shapes['middle']) * np.sin(session.heading + shapes['phase'])
 
 
-def _root(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    return np.sqrt(np.abs(w))
-
-
-def _exponential(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
-    return np.exp((w - shapes['top']) / shapes['rate_constant'])
+def _resonance(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
+    """Return a bump over the speed, as of something that resonates at one."""
+    return np.exp(-0.5 * ((np.abs(w) - shapes['speed']) / shapes['width']) ** 2)
 
 
 def _supply_parabola(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
@@ -57,13 +60,13 @@ OUTSIDE: Mapping[str, Form] = {
     'second_harmonic_of_heading': _harmonic(2),
     'third_harmonic_of_heading': _harmonic(3),
     'gear_of_heading': _harmonic(7),
-    'root_of_speed': Form(_column(_root), '(rad/s)^0.5'),
     'wave_over_rate': Form(
         _column(lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes['period'] + shapes['phase'])), 'rad/s',
-        lambda sessions, generator: {'period': top_rate(sessions) / generator.uniform(2.0, 4.0), **_phase(sessions, generator)}),
-    'exponential_of_rate': Form(
-        _column(_exponential), 'rad/s',
-        lambda sessions, generator: {'top': top_rate(sessions), 'rate_constant': top_rate(sessions) / generator.uniform(8.0, 15.0)}),
+        lambda sessions, generator: {'period': top_rate(sessions) / generator.uniform(3.0, 6.0), **_phase(sessions, generator)}),
+    'resonance_at_a_speed': Form(
+        _column(_resonance), 'rad/s',
+        lambda sessions, generator: {'speed': top_rate(sessions) * generator.uniform(0.2, 0.8),
+                                     'width': top_rate(sessions) * generator.uniform(0.03, 0.1)}),
     'wave_over_temperature': Form(
         _column(lambda session, w, shapes: np.sin(2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase'])),
         'rad/s', _temperature_wave),
@@ -73,12 +76,10 @@ OUTSIDE: Mapping[str, Form] = {
     'bias_pulse': Form(
         _column(lambda session, w, shapes: np.exp(-0.5 * ((session.time - shapes['pulse_time']) / shapes['width']) ** 2)),
         'rad/s', _pulse, once=True),
-    'square_wave': Form(
-        _column(lambda session, w, shapes: np.sign(np.sin(2.0 * math.pi * session.time / shapes['period'] + shapes['phase']))),
-        'rad/s', _square_wave),
+    'telegraph': Form(_column(_two_levels), 'rad/s', _telegraph),
     'supply_parabola': Form(
         _column(_supply_parabola), 'rad/s/V²',
-        lambda sessions, generator: {'middle': _middle([session.supply for session in sessions])}),
+        lambda sessions, generator: {'middle': float(np.quantile(sessions[0].supply, generator.uniform(0.35, 0.65)))}),
     'supply_times_rate': Form(
         _column(lambda session, w, shapes: (session.supply - shapes['middle']) * w), '1/V',
         lambda sessions, generator: {'middle': _middle([session.supply for session in sessions])}),

@@ -10,7 +10,7 @@ which all that it adds, as it is, has the norm `DETECTABLE`: sqrt(x' S^-1 x - ..
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import brentq
@@ -33,39 +33,48 @@ class Metric:
     sessions : the recordings
     figures : the noise
     encoder_step : of the reference's heading, rad
-    without : nuisance to leave out, 'bias' or 'scale_factor_error', because a model says its value
+
+    thin : average so many samples to one first, which keeps what is slow
+
+    A nuisance whose value a model says ('bias', 'scale') can be left out of a question.
 
     """
 
-    def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0):
-        self._whitenings = [Whitening(figures, len(session.time), session.interval, encoder_step) for session in sessions]
-        self._sessions = sessions
-        self._nuisances = {f'bias {run}': [np.full(len(each.time), float(run == number)) for number, each in enumerate(sessions)]
-                           for run in range(len(sessions))}
-        self._nuisances['scale_factor_error'] = [session.rate for session in sessions]
-        self._solved = {name: self.solve(columns) for name, columns in self._nuisances.items()}
+    def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0, thin: int = 1):
+        self._thin = thin
+        self._whitenings = [Whitening(figures, len(each.time) // thin, each.interval * thin, encoder_step) for each in sessions]
+        self.nuisances = {f'bias {run}': [np.full(len(each.time), float(run == number)) for number, each in enumerate(sessions)]
+                          for run in range(len(sessions))}
+        self.nuisances['scale'] = [each.rate for each in sessions]
+        self.nuisances = {name: thinned(columns, thin) for name, columns in self.nuisances.items()}
+        self._solved = {name: self.solve(columns) for name, columns in self.nuisances.items()}
 
     def solve(self, columns: Columns) -> Columns:
-        """Return S^-1 times the columns."""
+        """Return S^-1 times columns that are thinned already."""
         return [whitening.solve(column) for whitening, column in zip(self._whitenings, columns)]
 
-    def _kept(self, without: str) -> list[str]:
-        return [name for name in self._nuisances if not (without and name.startswith(without))]
-
-    def gram(self, several: list[Columns], without: str = '') -> np.ndarray:
+    def gram(self, several: list[Columns], without: Sequence[str] = ()) -> np.ndarray:
         """Return the inner products of several columns, less what the nuisances explain, shape (m, m)."""
-        names = self._kept(without)
+        names = [name for name in self.nuisances if name.split()[0] not in without]
+        several = [thinned(columns, self._thin) for columns in several]
         solved = [self.solve(columns) for columns in several]
         full = np.array([[_inner(a, b) for b in solved] for a in several])
-        beside = np.array([[_inner(self._nuisances[name], b) for b in solved] for name in names])
-        among = np.array([[_inner(self._nuisances[a], self._solved[b]) for b in names] for a in names])
+        if not names:
+            return full
+        beside = np.array([[_inner(self.nuisances[name], b) for b in solved] for name in names])
+        among = np.array([[_inner(self.nuisances[a], self._solved[b]) for b in names] for a in names])
         scale = np.sqrt(np.diag(among))
         beside, among = beside / scale[:, None], among / np.outer(scale, scale)
         return full - beside.T @ np.linalg.pinv(among, rcond=1e-12, hermitian=True) @ beside
 
-    def norm(self, columns: Columns, without: str = '') -> float:
+    def norm(self, columns: Columns, without: Sequence[str] = ()) -> float:
         """Return the length of what the nuisances do not explain, in standard deviations."""
         return math.sqrt(max(float(self.gram([columns], without)[0, 0]), 0.0))
+
+
+def thinned(columns: Columns, factor: int) -> Columns:
+    """Return means of so many samples each."""
+    return columns if factor == 1 else [column[:len(column) // factor * factor].reshape(-1, factor).mean(axis=1) for column in columns]
 
 
 def _inner(a: Columns, b: Columns) -> float:

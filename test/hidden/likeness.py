@@ -1,0 +1,102 @@
+"""
+What else in the catalogue looks like what is hidden, as far as these recordings can tell.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .effects import FORMS, WITHOUT_COLUMN, Shapes, errors, top_rate
+from .motion import Session
+from .noise import NoiseFigures
+from .size import Columns, Metric, thinned
+
+#: A reference may slip at any moment, and a tone has any frequency: enough of them explain anything.
+ANYTHING = {'reference_slip', 'interference_tone'}
+#: Samples that are averaged to one: what looks alike in fifths of a second looks alike.
+THIN = 10
+
+
+class Likeness:
+    """
+    The columns of all effects of the catalogue in some recordings, over a grid of their shapes.
+
+    Parameters
+    ----------
+    sessions : the recordings
+    figures : the noise, in whose covariance the share of a column is counted
+
+    """
+
+    def __init__(self, sessions: list[Session], figures: NoiseFigures):
+        self._metric = Metric(sessions, figures, thin=THIN)
+        self._groups: list[tuple[str, list[int]]] = []
+        columns = list(self._metric.nuisances.values())
+        for name in FORMS:
+            for group in () if name in WITHOUT_COLUMN | ANYTHING else _candidates(name, sessions):
+                self._groups.append((name, list(range(len(columns), len(columns) + len(group)))))
+                columns += [thinned(each, THIN) for each in group]
+        joined = np.column_stack([np.concatenate(each) for each in columns])
+        self._solved = np.column_stack([np.concatenate(self._metric.solve(each)) for each in columns])
+        gram = joined.T @ self._solved
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        self._solved, self._gram = self._solved / scale, gram / np.outer(scale, scale)
+        self._always = list(range(len(self._metric.nuisances)))
+
+    def shares(self, hidden: Columns, without: str = '') -> dict[str, float]:
+        """Return what each effect alone could explain of a column beside bias and scale, as a share of its information."""
+        total, along = self._measure(hidden)
+        start = self._explained(along, self._always)
+        best: dict[str, float] = {}
+        for name, group in self._groups:
+            share = (self._explained(along, self._always + group) - start) / max(total - start, 1e-300)
+            best[name] = max(best.get(name, 0.0), min(1.0, share))
+        best.pop(without, None)
+        return best
+
+    def together(self, hidden: Columns, count: int = 3) -> float:
+        """Return what some effects could explain together, each chosen as the best beside those before it."""
+        total, along = self._measure(hidden)
+        start, chosen = self._explained(along, self._always), self._always
+        for _ in range(count):
+            chosen = max((chosen + group for _, group in self._groups), key=lambda places: self._explained(along, places))
+        return (self._explained(along, chosen) - start) / max(total - start, 1e-300)
+
+    def _measure(self, hidden: Columns) -> tuple[float, np.ndarray]:
+        signal = thinned(hidden, THIN)
+        total = sum(float(x @ y) for x, y in zip(signal, self._metric.solve(signal)))
+        return total, self._solved.T @ np.concatenate(signal)
+
+    def _explained(self, along: np.ndarray, places: list[int]) -> float:
+        inverse = np.linalg.pinv(self._gram[np.ix_(places, places)], rcond=1e-10, hermitian=True)
+        return float(along[places] @ inverse @ along[places])
+
+
+def _candidates(name: str, sessions: list[Session]) -> Iterator[list[Columns]]:
+    """Go through the columns that an effect may have, those that go together side by side."""
+    for shapes in _shapes(name, sessions):
+        for size in _sizes(name, sessions):
+            phases = [{'phase': 0.0}, {'phase': 0.5 * math.pi}] if name in ('heading_sensitivity', 'reference_once_per_rev') else [{}]
+            yield [errors(FORMS[name], size, {**shapes, **phase}, sessions) for phase in phases]
+
+
+def _shapes(name: str, sessions: list[Session]) -> Iterator[Shapes]:
+    duration = float(sessions[0].time[-1])
+    if name in ('thermal_lag', 'warm_up'):
+        yield from ({'time_constant': duration * share} for share in np.geomspace(0.01, 2.0, 10))
+    elif name == 'bias_step':
+        yield from ({'run': run, 'step_time': duration * share} for run in range(len(sessions)) for share in np.linspace(0.05, 0.95, 37))
+    else:
+        yield {}
+
+
+def _sizes(name: str, sessions: list[Session]) -> Sequence[float]:
+    """Return sizes at which a column of the effect is taken: one where it is in proportion, some where it is not."""
+    top = top_rate(sessions)
+    return {'sine_response': [0.1 / top, 0.5 / top, 1.0 / top], 'dead_zone': list(top * np.geomspace(1e-3, 0.2, 8)),
+            'saturation': list(top * np.linspace(0.6, 0.98, 8)), 'time_offset': [1e-4], 'bandwidth': [1e-4, 0.05],
+            'clock_rate': [1e-6]}.get(name, [1.0])

@@ -1,0 +1,62 @@
+"""
+What is won by who knows the truth.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .log import HiddenLog
+
+
+@dataclass(frozen=True)
+class OracleGain:
+    """Root mean squares of output less prediction, rad/s, and of its integral over windows, rad; before: best bias and scale alone."""
+
+    rate_before: float
+    rate_after: float
+    heading_before: float
+    heading_after: float
+
+    @property
+    def rate(self) -> float:
+        """The share of the rate error that is won, 0 to 1."""
+        return 1.0 - self.rate_after / self.rate_before
+
+    @property
+    def heading(self) -> float:
+        """The share of the heading error that is won, 0 to 1."""
+        return 1.0 - self.heading_after / self.heading_before
+
+
+def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None), window: float = 60.0) -> OracleGain:
+    """
+    Return what the gyro's model gains by all that is hidden, known exactly.
+
+    Parameters
+    ----------
+    log : a hidden log
+    rows : of a part of it, in one piece, such as the part that a diagnosis held out
+    window : over which the heading error is counted, s
+
+    """
+    truth, time = log.truth, log.columns['time_s'][rows]
+    output, good = log.columns['gyro_rad_s'], truth.good
+    design = np.column_stack([np.ones_like(output), truth.reference])
+    simple = design @ np.linalg.lstsq(design[good], output[good], rcond=None)[0]
+    before, after = (np.where(good, output - each, 0.0)[rows] for each in (simple, truth.prediction))
+    return OracleGain(_rms(before), _rms(after), *(_rms(_over_windows(time, each, window)) for each in (before, after)))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values ** 2))) if len(values) else float('nan')
+
+
+def _over_windows(time: np.ndarray, rate_error: np.ndarray, window: float) -> np.ndarray:
+    """Return the change of the integral over windows that follow one another."""
+    angle = np.concatenate([[0.0], np.cumsum(np.diff(time) * rate_error[1:])])
+    edges = np.searchsorted(time, np.arange(time[0], time[-1], window))
+    return np.diff(angle[edges])

@@ -1,0 +1,120 @@
+"""
+Twins: conditions under which two causes cannot be told apart, and those under which they can.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .effects import Shapes
+from .log import HiddenLog, hide, record
+from .motion import Session, session
+from .noise import NoiseFigures
+
+
+@dataclass(frozen=True)
+class Twins:
+    """
+    Two causes of one column.
+
+    Attributes
+    ----------
+    alike : words for `session`, so that they cannot be parted
+    apart : words for `session`, so that they can; None where no recording with this reference can
+    shapes : recordings -> shapes of effects, where only these are alike
+    multiple : of the minimum detectable effect, at which they are alike there and parted here
+    figures : of a gyro whose noise makes it so; any where it is None
+    longer : the parting recording is so many times as long
+    signs : of sizes, by name, where the twin has that sign alone
+    against_a_model : they show only beside a model that knows bias and scale
+
+    """
+
+    alike: Mapping[str, object]
+    apart: Mapping[str, object] | None
+    shapes: Callable[[list[Session]], Mapping[str, Shapes]] | None = None
+    multiple: float = 4.0
+    figures: NoiseFigures | None = None
+    longer: float = 1.0
+    signs: Mapping[str, float] | None = None
+    against_a_model: bool = False
+
+
+def _as_the_cold_start(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'warm_up': {'time_constant': 0.2 * float(sessions[0].time[-1])}}
+
+
+def _very_slowly(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'warm_up': {'time_constant': 2.0 * float(sessions[0].time[-1])}}
+
+
+def _at_the_turn(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'bias_step': {'run': 0, 'step_time': float(sessions[0].time[np.argmax(sessions[0].temperature)])}}
+
+
+def _quickly(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'thermal_lag': {'time_constant': 0.01 * float(sessions[0].time[-1])}}
+
+
+TWINS: Mapping[tuple[str, str], Twins] = {
+    ('bias_temperature', 'rate_ramp'): Twins({'temperature': 'ramp'}, {}),
+    ('bias_temperature', 'warm_up'): Twins({'temperature': 'cold_start'}, {}, _as_the_cold_start),
+    ('warm_up', 'rate_ramp'): Twins({}, {}, _very_slowly, longer=4.0),
+    ('heading_sensitivity', 'reference_once_per_rev'): Twins({'motion': 'one_speed'}, {}),
+    ('scale_factor_asymmetry', 'quadratic_nonlinearity'): Twins({'motion': 'two_way'}, {}, multiple=8.0),
+    ('scale_factor_asymmetry', 'vibration_rectification'): Twins({'motion': 'two_way', 'force': 'turning'}, {}),
+    ('quadratic_nonlinearity', 'acceleration_sensitivity'): Twins({'force': 'off_axis'}, {}),
+    ('cubic_nonlinearity', 'sine_response'): Twins(
+        {'motion': 'slow'}, {'top_rate': 3.0}, figures=NoiseFigures(2e-5), signs={'cubic_nonlinearity': -1.0}),
+    ('time_offset', 'bandwidth'): Twins(
+        {'motion': 'smooth', 'top_rate': 2.0}, {'top_rate': 3.0}, multiple=20.0, figures=NoiseFigures(5e-4),
+        signs={'time_offset': 1.0}),
+    ('bias_temperature_rate', 'thermal_lag'): Twins({'temperature': 'smooth'}, {'temperature': 'triangles'}, _quickly),
+    ('bias_temperature_rate', 'thermal_hysteresis'): Twins({'temperature': 'triangles'}, {}),
+    ('bias_step', 'thermal_hysteresis'): Twins({'temperature': 'triangle'}, {}, _at_the_turn),
+    ('bias_step', 'bias_temperature_rate'): Twins({'temperature': 'triangle'}, {}, _at_the_turn),
+    ('bias_temperature', 'supply_sensitivity'): Twins({'supply': 'heating'}, {}),
+    ('bias', 'acceleration_sensitivity'): Twins({'force': 'one_pose'}, {}, multiple=8.0, against_a_model=True),
+    ('scale_factor_error', 'reference_scale'): Twins({}, None, against_a_model=True),
+}
+
+
+def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *, multiple: float | None = None, noise: str = 'white',
+         duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
+    """
+    Hide one of a pair where it cannot be told from the other.
+
+    Parameters
+    ----------
+    pair : a key of `TWINS`
+    hidden : one of the pair
+    generator : source of all that is random
+    multiple : of the minimum detectable effect; that of the pair where it is None
+    noise : as for `hide`, where the pair says nothing of it
+    duration, sample_rate : s and Hz
+
+    """
+    twins = TWINS[pair]
+    return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration, sample_rate=sample_rate,
+                figures=twins.figures, conditions=twins.alike, shapes=twins.shapes, against_a_model=twins.against_a_model,
+                signs=twins.signs)[0]
+
+
+def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) -> HiddenLog:
+    """
+    Record the same gyro again, under conditions that part the pair; what happens once does not happen again.
+
+    Raises
+    ------
+    ValueError : no recording with this reference parts them
+
+    """
+    twins, first = TWINS[pair], log.session
+    if twins.apart is None:
+        raise ValueError(f'{pair[0]} and {pair[1]} are parted by another reference alone')
+    duration = twins.longer * len(first.time) * first.interval
+    return record(log.truth.gyro, session(generator, duration, 1.0 / first.interval, **twins.apart), generator, run=1)
