@@ -95,8 +95,8 @@ def processes(figures: NoiseFigures, count: int, interval: float) -> list[Markov
     if figures.bias_instability:
         # integrated over ln(time constant), processes of variance v a factor e have the spectrum v / (2 f)
         each = figures.bias_instability * math.sqrt(math.log(STEP_OF_LADDER) / math.pi)
-        rungs = math.ceil(math.log(8.0 * count) / math.log(STEP_OF_LADDER))
-        found += [_stationary(each, 2.0 * interval * STEP_OF_LADDER ** rung, interval) for rung in range(rungs)]
+        rungs = math.ceil(math.log(16.0 * count) / math.log(STEP_OF_LADDER))
+        found += [_stationary(each, 0.5 * interval * STEP_OF_LADDER ** rung, interval) for rung in range(rungs)]
     return found
 
 
