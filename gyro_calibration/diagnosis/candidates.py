@@ -84,14 +84,14 @@ def pulse(time: Array, middle: float, width: float) -> Array:
     return np.exp(-0.5 * ((time - middle) / width) ** 2) / (width * math.sqrt(2.0 * math.pi))
 
 
-def _slip(each: Replay, middle: float, width: float) -> Sequence[Array]:
-    return (-pulse(each.channels.time, middle, width),)
+def _slip(each: Replay, width: float, *moments: float) -> Sequence[Array]:
+    return tuple(-pulse(each.channels.time, moment, width) for moment in moments)
 
 
 _OF_THE_REFERENCE: Mapping[str, Callable[..., Sequence[Array]]] = {
     'reference_once_per_rev': _once_per_revolution, 'reference_slip': _slip}
 #: Cause -> the shapes of it that a fit finds; all that are no conventions.
-_FITTED_OF_THE_REFERENCE = {'reference_once_per_rev': (), 'reference_slip': (0, 1)}
+_FITTED_OF_THE_REFERENCE = {'reference_once_per_rev': (), 'reference_slip': (0,)}
 
 
 def fitted_shapes(candidate: Candidate) -> list[int]:
@@ -164,7 +164,7 @@ def _of_rate(replays: Sequence[Replay], has: frozenset[str]) -> Iterator[Candida
     yield effect('reference_once_per_rev')
     if 'temperature' in has:
         yield effect('scale_factor_temperature', reference_temperatures(replays)[2])
-    for zone in np.geomspace(2e-3, 0.5, 8) * fastest:
+    for zone in np.geomspace(1e-5, 0.5, 14) * fastest:
         yield effect('dead_zone', zone)
     for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
         yield effect('saturation', limit * fastest)

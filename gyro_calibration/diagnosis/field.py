@@ -177,7 +177,7 @@ def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) 
     """
     replays = [seen(each, named) for each in whole.replays]
     residual = np.concatenate([
-        each.coefficients(each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
+        each.noisy(each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
         for each, new in zip(whole.replays, replays)])
     columns, owner = [np.concatenate([each.coefficients(each.channels.rate) for each in replays])[None]], [(-1, 0)]
     for place, known in enumerate(named):

@@ -15,6 +15,7 @@ from gyro_calibration.diagnosis.spectrum import transform
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Array, Log, Mask
+from gyro_calibration.model import GyroModel
 
 #: More points of the grid than this are averaged in neighbours, for a million samples are more than are needed to part causes.
 MOST_POINTS = 100_000
@@ -35,6 +36,7 @@ class Replay:
     place : number of each kept sample on the even grid
     interval : of the grid, s
     every : so many points of the grid are averaged into one
+    filling : white noise of variance 1 for the points of the grid that are lost, shape (place[-1] + 1,)
     rounded : the reference is the difference of a heading, whose error is white times (2 - 2 cos)
     has : names of the channels that the log has
 
@@ -46,6 +48,7 @@ class Replay:
     place: Array
     interval: float
     every: int
+    filling: Array
     rounded: bool
     has: frozenset[str]
 
@@ -64,11 +67,28 @@ class Replay:
         """Return the length of the log, s."""
         return self.points * self.step
 
-    def on_grid(self, values: Array) -> Array:
-        """Return samples, shape (n,), on the even grid: lost ones are bridged, and neighbours averaged where there are many."""
+    def on_grid(self, values: Array, filling: float = 0.0) -> Array:
+        """
+        Return samples, shape (n,), on the even grid: lost ones are bridged, and neighbours averaged where there are many.
+
+        A bridge has no noise of its own. Where that would matter, white noise of a standard deviation fills it.
+
+        """
         known = values[self.kept]
-        whole = known if len(known) == self.place[-1] + 1 else np.interp(np.arange(self.place[-1] + 1), self.place, known)
+        whole = known
+        if len(known) < self.place[-1] + 1:
+            whole = np.interp(np.arange(self.place[-1] + 1), self.place, known)
+            if filling:
+                lost = np.ones(len(whole), dtype=bool)
+                lost[self.place] = False
+                whole[lost] += filling * self.filling[lost]
         return whole[:self.points * self.every].reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
+
+    def noisy(self, values: Array) -> Array:
+        """Return the cosine transform of a residual, whose bridges get the white noise that the rest has."""
+        known = values[self.kept]
+        white = 1.4826 * float(np.median(np.abs(np.diff(known, 2)))) / math.sqrt(6.0)
+        return transform(self.on_grid(values, white))
 
     def coefficients(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -79,7 +99,7 @@ class Replay:
         return replace(self, channels=replace(self.channels, rate=rate))
 
 
-def replay(log: Log, trusted: Mask, update: float | None = None) -> Replay:
+def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, model: GyroModel | None = None) -> Replay:
     """
     Lay a log out.
 
@@ -87,28 +107,40 @@ def replay(log: Log, trusted: Mask, update: float | None = None) -> Replay:
     ----------
     log : with output, time and a reference; one at rest needs no reference
     trusted : samples to use, shape (n,)
+    generator : source of the noise that fills what is lost
     update : interval at which the reference is renewed, s, where it is held in between
+    model : the simulation that the output is compared with; that of an ideal gyro where it is None
 
     """
     assert log.time is not None and log.output is not None
     time = log.time - log.time[0]
-    seen = channels_of(log)
-    if log.reference_rate is not None:
-        rate = _between_updates(time, log.reference_rate, update)
-        reference, smooth, rounded = rate, rate, False
-    elif log.reference_heading is not None:
-        heading = _between_updates(time, log.reference_heading, update)
-        reference, smooth, rounded = *_rates(time, heading), True
-    else:
-        reference = smooth = np.zeros(len(log))
-        rounded = False
+    reference, smooth, rounded = _reference(log, time, update)
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
     place, interval = numbered(time, kept)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
+    channels = replace(channels_of(log), rate=smooth, time=time, heading=_heading(time, log, smooth))
     output = _at_intervals(log.output) if rounded else log.output
-    heading = _heading(time, log, smooth)
-    return Replay(replace(seen, rate=smooth, output=output, time=time, heading=heading), reference, kept, place, interval, every,
-                  rounded, _known(log))
+    filling = generator.standard_normal(place[-1] + 1)
+    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log))
+    return plain if model is None else _simulated(plain, model)
+
+
+def _reference(log: Log, time: Array, update: float | None) -> tuple[Array, Array, bool]:
+    """Return the reference rate as it is compared, and as effects look at it, and whether it is that of a heading."""
+    if log.reference_rate is not None:
+        rate = _between_updates(time, log.reference_rate, update)
+        return rate, rate, False
+    if log.reference_heading is not None:
+        return *_rates(time, _between_updates(time, log.reference_heading, update)), True
+    return np.zeros(len(time)), np.zeros(len(time)), False
+
+
+def _simulated(plain: Replay, model: GyroModel) -> Replay:
+    """Take what a model adds out of the output, and let effects look at the rate that its gyro sees."""
+    channels = plain.channels
+    rate = model.distorted('rate', channels.rate, channels.time)
+    added = model.output_in(channels.moving(rate, rate)) - rate
+    return replace(plain, channels=channels.moving(rate, channels.output - added), reference=plain.reference + (rate - channels.rate))
 
 
 def numbered(time: Array, kept: Mask) -> tuple[Array, float]:

@@ -36,6 +36,8 @@ PRICE_OF_SHAPE = 1.5
 LEAST_PERIODS = 20
 #: Within which times a reference may slip, s.
 WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
+#: So many slips at most are counted in a log.
+MOST_SLIPS = 8
 #: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
 UNLIKELY = 12.0
 #: What each column beyond the first costs, for it fits a little noise.
@@ -188,34 +190,42 @@ def tones(done: Work) -> list[tuple[Candidate, float]]:
     """Return the strongest tone of each log with its evidence, less what the number of frequencies makes likely."""
     found = []
     for each, white in zip(done.field.replays, done.white()):
-        power = np.abs(np.fft.rfft(white)) ** 2 / len(white)
-        lowest = LEAST_PERIODS
+        # Twice as long, since a tone between two frequencies of the log alone would lose more than half of its power.
+        power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
+        lowest = 2 * LEAST_PERIODS
         if len(power) > 2 * lowest:
-            best = lowest + int(power[lowest:-1].argmax())
-            found.append((effect('interference_tone', best / each.duration), float(power[best] - np.log(len(power)))))
+            best = lowest + int(power[lowest:-2].argmax())
+            found.append((effect('interference_tone', 0.5 * best / each.duration), float(power[best] - np.log(len(power)))))
     return [max(found, key=lambda one: one[1])] if found else []
 
 
 def slips(done: Work) -> list[tuple[Candidate, float]]:
-    """Return the clearest jump of the reference's heading, of those moments where it accelerates."""
+    """Return the clearest jumps of the reference's heading, of those moments where it accelerates."""
     found = []
-    best_noise = int(done.judged.likelihood[0].argmax())
-    divided = np.split(done.field.divided(best_noise) / done.field.deviation, np.cumsum([e.points - 1 for e in done.field.replays])[:-1])
+    parts = np.cumsum([each.points - 1 for each in done.field.replays])[:-1]
+    divided = np.split(done.field.divided(int(done.judged.likelihood[0].argmax())) / done.field.deviation, parts)
     for run, (each, white, factor) in enumerate(zip(done.field.replays, done.white(), divided)):
-        time = np.arange(each.points) * each.step
-        rate = each.on_grid(each.channels.rate)
-        acceleration = np.abs(np.gradient(rate, each.step))
-        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max()) if acceleration.max() > 0.0 else []
-        if not len(moments):
-            continue
-        for width in WIDTHS:
-            kernel = inverse(transform(pulse(time, time[len(time) // 2], max(width, 0.5 * each.step))) * factor)
-            match = np.roll(correlate(white, kernel, 'same'), 0) / np.sqrt(kernel @ kernel)
-            best = moments[int(np.abs(match[moments]).argmax())]
-            value = 0.5 * match[best] ** 2 - np.log(len(moments) * len(WIDTHS))
-            begin = float(each.channels.time[each.kept][0])
-            found.append((effect('reference_slip', begin + float(time[best]), max(width, 0.5 * each.step), run=run), float(value)))
+        acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
+        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
+        if acceleration.max() > 0.0 and len(moments):
+            found += [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step)) for width in WIDTHS]
     return [max(found, key=lambda one: one[1])] if found else []
+
+
+def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Array, width: float) -> tuple[Candidate, float]:
+    """Return the jumps of one width, a second apart or more, each with evidence beyond what so many moments make likely."""
+    time = np.arange(each.points) * each.step
+    kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
+    value = 0.5 * correlate(white, kernel, 'same')[moments] ** 2 / (kernel @ kernel) - np.log(len(moments) * len(WIDTHS)) - PRICE_OF_COLUMN
+    chosen, total = [], 0.0
+    for place in np.argsort(-value)[:200]:
+        if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
+            break
+        at = float(each.channels.time[each.kept][0] + time[moments[place]])
+        if all(abs(at - other) > 1.0 for other in chosen):
+            chosen.append(at)
+            total += float(value[place])
+    return effect('reference_slip', width, *chosen, run=run), total
 
 
 # one cause more
@@ -232,7 +242,7 @@ def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Ste
     """Add a cause with the best of its shapes near those given."""
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
         done = work(search.field, [*named, Named(candidate)])
-        width = sum(place == len(named) for place, _ in done.owner)
+        width = sum(place == len(named) and value >= 0 for place, value in done.owner)
         return Step((*named, Named(candidate)), done.score - (0.0 if is_named(candidate) else MARGIN) - PRICE_OF_COLUMN * max(width - 1, 0))
     begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
     place = fitted_shapes(candidate)[0]
@@ -318,7 +328,7 @@ def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
 def _updated(done: Work, place: int, values: Array) -> Named:
     known = done.named[place]
     own = dict(zip(done.owner, values))
-    free = tuple(float(own[place, number]) for number in range(8) if (place, number) in own)
+    free = tuple(float(own[place, number]) for number in range(len(values)) if (place, number) in own)
     found = free if known.candidate.amplitude is None else (known.candidate.amplitude,)
     candidate = known.candidate
     for shape in fitted_shapes(candidate):
