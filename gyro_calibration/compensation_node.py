@@ -21,10 +21,11 @@ from rclpy.duration import Duration
 from rclpy.node import Node, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
+from gyro_calibration.effects import Channels
 from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, with_self_calibration
@@ -125,7 +126,9 @@ class CompensationNode(Node):
         self._use(self._model)
         self._temperature: tuple[float, float] | None = None
         self._epoch: int | None = None
-        self._last_time, self._last_heard, self._interval = -math.inf, self._now(), math.inf
+        self._last_time, self._last_heard, self._interval, self._rate = -math.inf, self._now(), math.inf, 0.0
+        self._history, self._elapsed, self._turned_before = self._model.history(), 0.0, 0.0
+        self._brought: set[str] = set()
         self._run: Run | None = None
         self._counts = dict.fromkeys(('samples', 'not_finite', 'stamps_ignored', 'restarts', 'temperature_clipped', 'beyond_range'), 0)
         self._last_counts = dict(self._counts)
@@ -190,6 +193,7 @@ class CompensationNode(Node):
     def _use(self, model: GyroModel) -> None:
         """Compensate by this model from the next sample on; the heading does not jump."""
         self._model, self._covariance = model, covariance(model)
+        self._offset = round(1e9 * model.true_time(0.0))
         self._heading.use(model.noise, self._covariance)
 
     def _apply(self, calibration: SelfCalibration) -> str:
@@ -238,20 +242,40 @@ class CompensationNode(Node):
             self._counts['not_finite'] += 1
             return
         time = self._time(message.header.stamp)
-        temperature = self._known_temperature(time)
-        result = compensate(self._model, output, temperature)
-        self._counts['temperature_clipped'] += int(result.temperature_clipped)
-        self._counts['beyond_range'] += int(result.beyond_range)
-        if self._advance(time, float(result.rate), output, result.temperature):
-            self._collect(time, float(result.modelled), temperature)
-            self._publish(message.header)
-
-    def _advance(self, time: float, rate: float, output: float, temperature: float) -> bool:
-        """Take the heading on to this sample; return whether the sample counts."""
         if time == self._last_time:
             self._counts['stamps_ignored'] += 1
             self._events = f'the stamp stands still at {time:.3f} s; the sample is not used'
-            return False
+            return
+        temperature = self._known_temperature(time)
+        around = self._look_around(time, temperature, message) if self._model.looks_around else None
+        result = compensate(self._model, output, temperature, around)
+        self._counts['temperature_clipped'] += int(result.temperature_clipped)
+        self._counts['beyond_range'] += int(result.beyond_range)
+        rate = float(result.rate)
+        self._sensitivity = rate_sensitivity(self._model, output, rate, result.temperature, around)
+        self._advance(time, rate)
+        self._collect(time, float(result.modelled), temperature)
+        self._publish(message.header)
+
+    def _look_around(self, time: float, temperature: float | None, message: Imu) -> Channels:
+        """
+        Return what effects look at beside rate, output and temperature.
+
+        Time goes on with the stamps, also over gaps, and stands while they jump back. The heading is the own one, as if it had never been
+        reset, and goes on at the last rate up to this sample.
+
+        """
+        interval = max(time - self._last_time, 0.0) if self._last_time > -math.inf else 0.0
+        self._elapsed += interval
+        ahead = self._rate * interval if interval <= self._settings.maximum_gap else 0.0
+        force = message.linear_acceleration.z
+        known = message.linear_acceleration_covariance[0] != NOT_REPORTED and math.isfinite(force)
+        self._brought = {'specific_force'} if known else set()
+        return self._history.follow(self._elapsed, temperature, force if known else None,
+                                    heading=self._turned_before + self._heading.heading + ahead)
+
+    def _advance(self, time: float, rate: float) -> None:
+        """Take the heading on to this sample."""
         interval = time - self._last_time
         if 0.0 < interval <= self._settings.maximum_gap:
             self._interval = interval
@@ -259,9 +283,7 @@ class CompensationNode(Node):
             self._filter.clear()
         self._last_time, self._last_heard = time, self._now()
         self._rate = self._filter.filter(time, rate)
-        self._sensitivity = rate_sensitivity(self._model, output, rate, temperature)
         self._note(self._heading.add(time, rate, self._rate, self._sensitivity))
-        return True
 
     def _note(self, restarted: str) -> None:
         """Report that integration began anew, if it did; a calibration cannot go on over that."""
@@ -278,7 +300,7 @@ class CompensationNode(Node):
 
     def _publish(self, header) -> None:
         imu, heading = self._imu_message, self._heading.heading
-        imu.header = header
+        imu.header = self._true(header)
         imu.angular_velocity.z = self._rate
         imu.orientation.z, imu.orientation.w = math.sin(0.5 * heading), math.cos(0.5 * heading)
         self._set_covariances(imu)
@@ -286,6 +308,13 @@ class CompensationNode(Node):
         self._rate_message.data, self._heading_message.data = self._rate, heading
         self._yaw_rate.publish(self._rate_message)
         self._yaw.publish(self._heading_message)
+
+    def _true(self, header: Header) -> Header:
+        """Move the stamp to when the gyro was in the motion that it reports."""
+        if self._offset:
+            nanoseconds = header.stamp.sec * 10 ** 9 + header.stamp.nanosec + self._offset
+            header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10 ** 9)
+        return header
 
     def _set_covariances(self, imu: Imu) -> None:
         """Set both covariances; all zeros, unknown, where the noise of the gyro is not known or its model could not be read."""
@@ -374,6 +403,7 @@ class CompensationNode(Node):
         return self._answer(response, True, 'cancelled; the calibration in use is the old one')
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._turned_before += self._heading.heading
         self._heading.reset()
         return self._answer(response, True, 'the heading is zero here and now')
 
@@ -458,6 +488,8 @@ class CompensationNode(Node):
         if self._model.looks_at('temperature') and self._known_temperature(self._last_time) is None:
             reference = self._model.reference_temperature
             found.append(f'no temperature comes; the model is used at its reference temperature of {reference:g} degC')
+        found += [f'the model looks at the {channel.replace("_", " ")}, which no message brings; that effect is left out'
+                  for channel in ('supply', 'specific_force') if self._model.looks_at(channel) and channel not in self._brought]
         if self._hint:
             found.append(self._hint)
         return (DiagnosticStatus.WARN, found[0]) if found else (DiagnosticStatus.OK, 'heading goes on')

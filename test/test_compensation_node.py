@@ -2,11 +2,11 @@
 
 import math
 import signal
-import time
 
 import numpy as np
 import pytest
 import yaml
+from fake_gyro import INTERVAL, FakeGyro
 
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
@@ -14,98 +14,13 @@ from gyro_calibration.motion import CALIBRATION, from_rates
 from gyro_calibration.self_calibration import fit_likelihood
 
 try:
-    from builtin_interfaces.msg import Time
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+    from diagnostic_msgs.msg import DiagnosticStatus
     from geometry_msgs.msg import Twist
-    from sensor_msgs.msg import Imu, Temperature
-    from std_msgs.msg import Float64
     from std_srvs.srv import Trigger
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
 SCALE_FACTOR_ERROR, BIAS = 0.0373, 0.75 * DEGREE / 60
-INTERVAL = 0.01
-PACE = 0.0015  # s between messages: stamps run 7 times faster than the clock, and nothing may depend on that
-
-
-class FakeGyro:
-    """Publishes raw rates with stamps of its own clock, and hears what the node makes of them."""
-
-    def __init__(self, ros, wait_until):
-        self.ros, self.wait_until, self.nanoseconds = ros, wait_until, 1_700_000_000_000_000_000
-        self._imu = ros.publisher(Imu, 'imu/data_raw')
-        self._temperature = ros.publisher(Temperature, 'imu/temperature')
-        self.imu, self.rate, self.heading = ros.collect(Imu, 'imu/data'), ros.collect(Float64, 'yaw_rate'), ros.collect(Float64, 'heading')
-        self.diagnostics = ros.collect(DiagnosticArray, '/diagnostics', 10)
-        self.status = ros.collect(DiagnosticStatus, 'calibration_status', _latched())
-        self._meet()
-
-    def _meet(self):
-        """Send zeros until everything is heard, for discovery takes its time each way; then begin at heading zero."""
-        def all_heard():
-            self.send(0.0)
-            return self.imu and self.rate and self.heading and self.status and self._temperature.get_subscription_count()
-        self.wait_until(all_heard, 15.0, 'the node')
-        assert self.ros.call(Trigger, 'reset_heading').success
-        self.play([0.0])
-        for heard in (self.imu, self.rate, self.heading, self.diagnostics):
-            heard.clear()
-
-    def stamp(self):
-        """Return the gyro's time as a stamp."""
-        return Time(sec=self.nanoseconds // 10 ** 9, nanosec=self.nanoseconds % 10 ** 9)
-
-    def send(self, rate, temperature=None):
-        """Publish one sample and let the gyro's time go on."""
-        message = Imu()
-        message.header.stamp, message.header.frame_id = self.stamp(), 'gyro'
-        message.angular_velocity.z = float(rate)
-        if temperature is not None:
-            self._temperature.publish(Temperature(header=message.header, temperature=float(temperature)))
-        self._imu.publish(message)
-        self.wait(INTERVAL)
-
-    def wait(self, seconds):
-        """Let the gyro's time go on without a sample."""
-        self.nanoseconds += round(seconds * 1e9)
-
-    def play(self, rates, temperature=None, until=lambda: False):
-        """Publish many samples at the pace of the test; return after the node has taken the last one."""
-        self._wait_for_quiet()
-        heard, sent = len(self.heading), 0
-        for rate in rates:
-            self.send(rate, temperature)
-            sent += 1
-            time.sleep(PACE)
-            if until():
-                break
-        self.wait_until(lambda: len(self.heading) >= heard + sent, 5.0, f'{sent} headings; {len(self.heading) - heard} came')
-
-    def says(self, words):
-        """Tell whether the newest diagnostics hold the words."""
-        return any(words in status.message for array in self.diagnostics[-1:] for status in array.status)
-
-    def _wait_for_quiet(self):
-        """Wait until the node has answered what was sent before, if anything is still on its way."""
-        last = -1
-        while last != len(self.heading):
-            last = len(self.heading)
-            time.sleep(0.02)
-
-    def call_later(self, name):
-        """Call a service without waiting for its answer."""
-        client = self.ros.node.create_client(Trigger, name)
-        assert client.wait_for_service(15.0)
-        return client.call_async(Trigger.Request())
-
-    def calibrating(self):
-        """Tell whether the node says that a calibration goes on."""
-        return bool(self.status) and self.status[-1].message.startswith('calibrating')
-
-
-def _latched():
-    from gyro_calibration.node import LATCHED_QUALITY
-    return LATCHED_QUALITY
 
 
 def output(rates):
