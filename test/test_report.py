@@ -7,6 +7,7 @@ import base64
 import json
 import os
 import select
+import signal
 import subprocess
 import time
 from dataclasses import replace
@@ -29,6 +30,7 @@ from gyro_calibration.diagnosis.finding import (
     Unexplained,
 )
 from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.units import chance, for_people, quantity
 from gyro_calibration.diagnosis.words import headline, lines
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import DEGREE
@@ -253,12 +255,35 @@ def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
 def test_a_set_is_named_with_the_experiment_that_parts_it():
     text = ' '.join(' '.join(lines(extended())).split())
     assert 'bias temperature or rate ramp, which these data cannot tell apart' in text
-    assert 'To part them: Heat and cool the gyro within one log.' in text
+    assert 'To part them: heat and cool the gyro within one log.' in text
 
 
 def test_sizes_are_in_the_units_of_people():
     text = ' '.join(lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
+
+
+@pytest.mark.parametrize('value, interval, unit, words', [
+    (0.0201, (0.0198, 0.0204), 's', '20.10 (19.80 to 20.40) ms'),
+    (-0.0123, (-0.0130, -0.0116), '1', '−1.230 (−1.300 to −1.160) %'),
+    (1.5e-5, (1e-5, 2e-5), '1', '15.0 (10.0 to 20.0) ppm'),
+    (-2.1e-3, (-2.4e-3, -1.8e-3), 's²/rad²', '−6.40 (−7.31 to −5.48) × 10⁻⁷ s²/deg²'),  # (pi / 180)² of it
+    (np.pi / 180.0, (0.0, np.pi / 90.0), '(rad/s)/(m/s²)', '1.0 (0.0 to 2.0) (deg/s)/(m/s²)'),
+    (1.0, (0.9, 1.1), 's/rad', '0.0175 (0.0157 to 0.0192) s/deg'),
+    (0.1, (0.1, 0.1), 'V', '0.1 V'), (0.5, (-np.inf, np.inf), 'Hz', '0.5 (−∞ to ∞) Hz')])
+def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, interval, unit, words):
+    assert str(quantity(Estimate(value, interval, unit))) == words
+
+
+def test_noise_is_in_the_units_of_data_sheets():
+    for unit, of_people in (('rad/√s', 'deg/√h'), ('rad/s/√s', 'deg/h/√h')):
+        assert for_people(unit) == (of_people, pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
+
+
+@pytest.mark.parametrize('probability, words', [
+    (0.0, 'less than 1 in a million'), (1 / 250, '1 in 250'), (0.3, '30 %'), (np.nan, 'not known')])
+def test_a_chance_is_said_in_words(probability, words):
+    assert chance(probability) == words
 
 
 @pytest.mark.parametrize('interval, words', [((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'within chance'), ((-0.02, -0.01), 'worse')])
@@ -286,7 +311,7 @@ class Browser:
         self._in, back = os.pipe()
         command = ['bash', '-c', f'exec "$@" 3<&{there} 4>&{back}', 'bash', str(CHROMIUM), '--headless', '--remote-debugging-pipe',
                    '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--no-first-run', f'--user-data-dir={folder}', 'about:blank']
-        self._process = subprocess.Popen(command, pass_fds=(there, back), stderr=subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, pass_fds=(there, back), stderr=subprocess.DEVNULL, start_new_session=True)
         os.close(there)
         os.close(back)
         self._rest, self._number, self.events, self._session = b'', 0, [], None
@@ -305,7 +330,7 @@ class Browser:
         assert 'error' not in message, message
         return message['result']
 
-    def _next(self, timeout=30.0):
+    def _next(self, timeout=20.0):
         deadline = time.monotonic() + timeout
         while b'\0' not in self._rest:
             assert select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))[0], 'the browser does not answer'
@@ -342,11 +367,14 @@ class Browser:
         path.write_bytes(base64.b64decode(self('Page.captureScreenshot', captureBeyondViewport=True, clip=clip)['data']))
 
     def close(self):
-        """End it."""
-        self('Browser.close')
-        self._process.wait(20.0)
-        os.close(self._in)
+        """End it, also where it does not answer; without its pipe it ends by itself."""
         os.close(self._out)
+        os.close(self._in)
+        try:
+            self._process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
 
 
 @pytest.fixture(scope='module')
@@ -359,7 +387,7 @@ def browser(tmp_path_factory):
     browser.close()
 
 
-SCREENS = {'phone': (360, 800), 'desk': (1280, 900)}
+SCREENS = {'watch': (320, 480), 'phone': (360, 800), 'tablet': (768, 1024), 'desk': (1280, 900)}
 
 
 @pytest.fixture(params=SCREENS)
@@ -425,7 +453,7 @@ def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
     temperatures = []
     browser.tell('[...document.querySelectorAll("figure")].find(each => '
                  'each.textContent.startsWith("Residual along temperature")).id = "thermal"')
-    for part in (46.0 / 360.0, 198.0 / 360.0, 350.0 / 360.0):  # left end, middle and right end of the axis
+    for part in (46.0 / 360.0, 195.0 / 360.0, 344.0 / 360.0):  # left end, middle and right end of the axis
         browser.point('#thermal > svg', part)
         temperatures.append(float(browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
     assert temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51 and temperatures[2] == 41.0

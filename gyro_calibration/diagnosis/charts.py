@@ -14,7 +14,7 @@ from gyro_calibration.log import Array, Mask
 
 #: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 350.0, 24.0, 196.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 344.0, 24.0, 196.0
 #: Of a normal distribution, for bands of 95 %.
 _BAND = 1.96
 

@@ -42,11 +42,11 @@ _VERDICTS = {'adequate': 'Adequate: nothing was found', 'extended': 'Extended: a
 _METHOD = (
     '{logs} replayed through the simulation: the motion and the temperature as recorded, the output as the model has it.',
     'What the output then differs by, the residual, was compared with every cause of the catalogue, under a noise of angle random walk,',
-    'flicker and rate random walk that was found together with the causes. A cause is named where it shows more than the strongest of',
-    'all causes does in noise drawn for this very log, so that of logs without any cause {share} give an alarm. Causes were added one at a',
-    'time, refined, exchanged, and taken back where another one explains more. Those that explain the same are given as a set, of which the',
-    'simplest is in the model. Bias and scale factor are fitted in any case. What is won was measured on parts that took no part in this;',
-    'intervals are of 95 %.')
+    'flicker and rate random walk that was found together with the causes.',
+    'A cause is named where it shows more than the strongest of all causes does in noise drawn for this very log, so that of logs without',
+    'any cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and taken back where another one explains more.',
+    'Those that explain the same are given as a set, of which the simplest is in the model. Bias and scale factor are fitted in any case.',
+    'What is won was measured on parts that took no part in this; intervals are of 95 %.')
 
 
 def report(diagnosis: Diagnosis) -> str:
@@ -188,12 +188,11 @@ def _predicted(curve: Curve, place: int) -> Chart | None:
 def _residual(curve: Curve, place: int) -> Chart:
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     across, scale = _across(curve)
-    lines = [Line('before', 'before', factor * curve.before, factor * curve.deviation)]
-    if not _same(curve):
-        lines.append(Line('after', 'after', factor * curve.after, factor * curve.deviation))
-    along = spoken(curve.along)
-    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}, before and after the '
-                 'extension, with bands of 95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+    named = [('residual', curve.before)] if _same(curve) else [('before', curve.before), ('after', curve.after)]
+    lines = [Line(name, 'after' if name == 'after' else 'before', factor * values, factor * curve.deviation) for name, values in named]
+    along, when = spoken(curve.along), '' if _same(curve) else ', before and after the extension'
+    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}{when}, with bands of '
+                 '95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
 
 
 def _thinned(at: Array, *values: Array) -> list[Array]:
@@ -231,13 +230,14 @@ def _parameters(found: Finding) -> Markup | None:
     if not found.parameters:
         return None
     return _folding(['', 'estimate', '95 % interval'], [
-        [spoken(name), f'{size.value} {size.unit}'.strip(), size.interval or '–'] for name, size in sizes(found).items()])
+        [spoken(name), size.estimate, size.bounds or '–'] for name, size in sizes(found).items()])
 
 
 def _folding(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
     """Return a table whose rows become lists on a narrow screen."""
-    return element('table', element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
-                   element('tbody', *(_row(heads, row) for row in rows)), class_='fold')
+    table = element('table', element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
+                    element('tbody', *(_row(heads, row) for row in rows)))
+    return element('div', table, class_='fold')
 
 
 def _row(heads: Sequence[str], row: Sequence[str]) -> Markup:

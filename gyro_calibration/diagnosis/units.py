@@ -34,21 +34,39 @@ def for_people(unit: str, parameter: str = '') -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class Quantity:
-    """An estimate in the unit and with the digits that people read; a power of ten, where there is one, stands before the unit."""
+    """
+    An estimate in the unit and with the digits that people read.
+
+    Attributes
+    ----------
+    value, interval : both without the power; the interval is empty where there is none
+    power : such as × 10⁻⁵; empty where there is none
+    unit : of people
+
+    """
 
     value: str
     interval: str
+    power: str
     unit: str
 
     def __str__(self) -> str:
         """Return it for a sentence, such as 20.1 (19.8 to 20.4) ms."""
-        if not self.interval:
-            return _joined(self.value, self.unit)
-        return _joined(f'{self.value} ({self.interval})', f'× {self.unit}' if self.unit.startswith('10') else self.unit)
+        return _joined(self.value, f'({self.interval})' if self.interval else '', self.power, self.unit)
+
+    @property
+    def estimate(self) -> str:
+        """Return the value alone."""
+        return _joined(self.value, self.power, self.unit)
+
+    @property
+    def bounds(self) -> str:
+        """Return the interval alone, without the unit."""
+        return _joined(f'({self.interval})', self.power) if self.interval and self.power else self.interval
 
 
-def _joined(number: str, unit: str) -> str:
-    return f'{number} {unit}'.rstrip()
+def _joined(*parts: str) -> str:
+    return ' '.join(filter(None, parts))
 
 
 def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
@@ -59,9 +77,9 @@ def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     power = _power(max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
-    decimals = _decimals(0.5 * width) if math.isfinite(width) and width > 0.0 else None
-    interval = '' if decimals is None else f'{_fixed(low, decimals)} to {_fixed(high, decimals)}'
-    return Quantity(_fixed(value, decimals), interval, f'10{raised(power)} {unit}'.rstrip() if power else unit)
+    decimals = _decimals(0.5 * width) if 0.0 < width < math.inf else None
+    interval = f'{_fixed(low, decimals)} to {_fixed(high, decimals)}' if width > 0.0 else ''
+    return Quantity(_fixed(value, decimals), interval, _times(power), unit)
 
 
 def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str, float]:
@@ -83,9 +101,13 @@ def _decimals(deviation: float) -> int:
 
 def _fixed(value: float, decimals: int | None) -> str:
     if not math.isfinite(value):
-        return 'not known' if math.isnan(value) else 'without limit'
+        return 'not known' if math.isnan(value) else '∞' if value > 0.0 else '−∞'
     text = f'{value:.4g}' if decimals is None else f'{value:.{decimals}f}'
     return text.replace('-', '−')
+
+
+def _times(power: int) -> str:
+    return f'× 10{raised(power)}' if power else ''
 
 
 def raised(power: int) -> str:
@@ -106,7 +128,7 @@ def number(value: float, digits: int = 3) -> str:
         return _fixed(value, None)
     power = _power(abs(value))
     text = f'{value / 10.0 ** power:.{digits}g}' if abs(value) < 10.0 ** digits or power else f'{value:.0f}'
-    return (f'{text} × 10{raised(power)}' if power else text).replace('-', '−')
+    return _joined(text, _times(power)).replace('-', '−')
 
 
 def span(seconds: float) -> tuple[str, float]:
@@ -123,4 +145,6 @@ def chance(probability: float) -> str:
         return 'not known'
     if probability < 1e-6:
         return 'less than 1 in a million'
-    return f'1 in {number(1.0 / probability, 2)}' if probability < 0.1 else f'{100.0 * probability:.0f} %'
+    if probability >= 0.1:
+        return f'{100.0 * probability:.0f} %'
+    return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', '\u202f')

@@ -121,8 +121,9 @@ def doubt(found: Finding) -> str:
     if not found.ambiguous_with:
         return ''
     others = listed([spoken(name) for name in found.ambiguous_with], 'or')
-    remedy = f' To part them: {sentence(found.separate_by)}' if found.separate_by else ' No experiment is known that would part them.'
-    return f'These data cannot rule out that it is {others} instead.{remedy}'
+    experiment = clean(found.separate_by).rstrip('.')
+    remedy = f'To part them: {experiment}.' if experiment else 'No experiment is known that would part them.'
+    return f'These data cannot rule out that it is {others} instead. {remedy}'
 
 
 def smallest(found: Finding) -> str:
