@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.signal import savgol_filter
 
 from gyro_calibration.log import Array, Log
+from gyro_calibration.model import GyroModel
 
 #: A rate is taken from a heading by parabolas over so long, s, for its steps would hide it over one sample.
 _SMOOTHING = 0.15
@@ -100,6 +101,16 @@ def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
     if time is not None:
         rate, output = _block_means(time[known], rate, output)
     return _line(rate, output) if len(rate) >= 8 else None
+
+
+def scale_of(model: GyroModel, rate: Array) -> float:
+    """Return by what the output of a model grows with a rate, between the two senses of a speed that is usual in a log."""
+    speeds = np.abs(rate[np.isfinite(rate)])
+    speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
+    if speed == 0.0:
+        return 1.0
+    forth, back = (float(model.output(sign * speed, model.reference_temperature)) for sign in (1.0, -1.0))
+    return (forth - back) / (2.0 * speed)
 
 
 def _block_means(time: Array, rate: Array, output: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from scipy import stats
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.codes import Codes, Limit, codes_of, limit_of
-from gyro_calibration.diagnosis.compared import Compared, Line, compare, line_between, reference_rate
+from gyro_calibration.diagnosis.compared import Compared, Line, compare, line_between, reference_rate, scale_of
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding
 from gyro_calibration.diagnosis.stuck import Stuck, stuck_samples
@@ -77,7 +77,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
     output, rate = output_of(log), reference_rate(log)
     known = np.isfinite(output)
     line = None if rate is None else line_between(log.time, rate, output)
-    unit = [] if line is None else list(_unit(line, model))
+    unit = [] if rate is None or line is None else list(_unit(line, 1.0 if model is None else scale_of(model, rate)))
     factor = 1.0 / FACTORS[unit[0][0]] if unit else 1.0
     found = Hygiene(tuple(finding for _, finding in unit), (), known, factor)
     if log.time is None:
@@ -103,9 +103,8 @@ def _counted(name: str, count: int, p_value: float, evidence: str) -> Finding:
     return finding(name, float(count), (float(count), float(count)), p_value, evidence)
 
 
-def _unit(line: Line, model: GyroModel | None) -> Iterator[tuple[str, Finding]]:
-    """Give the confusion of units, if the factor between output and reference is one."""
-    own = 1.0 if model is None else scale_of(model)
+def _unit(line: Line, own: float) -> Iterator[tuple[str, Finding]]:
+    """Give the confusion of units, if the factor between output and reference is one, beside the scale that a model has of its own."""
     factor, deviation = line.factor / own, line.deviation / abs(own)
     name = unit_of_scale(factor, deviation)
     if name is None:
@@ -114,11 +113,6 @@ def _unit(line: Line, model: GyroModel | None) -> Iterator[tuple[str, Finding]]:
     chance = float(2.0 * stats.norm.sf(abs(factor - 1.0) / max(deviation, 1e-300)))
     said = f'the output is {factor:.5g} +- {deviation:.2g} times what the reference says, and {name} is {FACTORS[name]:.5g}'
     yield name, finding('unit_error', factor, (factor - 1.96 * deviation, factor + 1.96 * deviation), chance, said, twins)
-
-
-def scale_of(model: GyroModel) -> float:
-    """Return by what the output of a model grows with a small rate, 1."""
-    return 1.0 + sum(value for term in model.terms if term.effect.name == 'scale_factor_error' for value in term.values)
 
 
 def _of_stamps(found: Hygiene, log: Log, known: Mask) -> Hygiene:

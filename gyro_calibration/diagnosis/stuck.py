@@ -5,12 +5,14 @@ Stuck samples: the last value once more, where a new one was due. An output of c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import ndtr
 
 from gyro_calibration.diagnosis.compared import Compared
 from gyro_calibration.log import Array, Mask
@@ -126,10 +128,13 @@ def _same_code(expected: Array, deviation: float, step: float) -> Array:
     """Return the mean of max(0, 1 - |D| / step) for D of this mean and standard deviation: two samples then have one code."""
     scale = max(deviation, 1e-9 * step)
     low, middle, high = ((edge - expected) / scale for edge in (-step, 0.0, step))
-    inside = [stats.norm.cdf(high) - stats.norm.cdf(middle), stats.norm.cdf(middle) - stats.norm.cdf(low)]
-    means = [expected * inside[0] + scale * (stats.norm.pdf(middle) - stats.norm.pdf(high)),
-             expected * inside[1] + scale * (stats.norm.pdf(low) - stats.norm.pdf(middle))]
-    return np.clip(inside[0] + inside[1] - (means[0] - means[1]) / step, 0.0, 1.0)
+    above, below = ndtr(high) - ndtr(middle), ndtr(middle) - ndtr(low)
+    sizes = expected * (above - below) + scale * (2.0 * _density(middle) - _density(high) - _density(low))
+    return np.clip(above + below - sizes / step, 0.0, 1.0)
+
+
+def _density(values: Array) -> Array:
+    return np.exp(-0.5 * values ** 2) / math.sqrt(2.0 * math.pi)
 
 
 def _runs(same: Mask, chance: Array, expected: Array, step: float, white: float) -> Iterator[tuple[int, int, float]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
+from scipy.ndimage import maximum_filter1d
 
 from gyro_calibration.diagnosis.compared import Compared, bridged
 from gyro_calibration.log import Array, Mask
@@ -18,6 +19,8 @@ from gyro_calibration.log import Array, Mask
 _WILD = 6.0
 #: Samples on each side that one is compared with.
 _SIDE = 3
+#: Samples by which a reference may tell of a jolt sooner or later.
+_SOON = 10
 #: Samples in which the scatter is taken to be the same.
 _BLOCK = 256
 #: Kinds of motion that are told apart, by how much the expectation changes about a sample.
@@ -30,7 +33,7 @@ _LONGEST = 2
 _TIED = 0.85
 #: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
 _FEW, _BY_CHANCE = 3, 1e-3
-#: From here to wild there must be fewer samples than wild ones, in standard deviations: else they are the tail of something.
+#: From here to wild there must be half as many samples as wild ones at most, in standard deviations: else they are a tail of the noise.
 _NEAR = 4.5
 
 
@@ -70,11 +73,10 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
     far = _far(output, moved, good, floor)
     if expected is not None:
         beside = _far(output - expected, moved, good, floor)
-        # Where the reference is wild itself, the gyro is not to blame.
-        far = np.maximum(far, np.where(_off(output) > 0.5 * _off(output - expected), beside, 0.0))
+        far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
     wild = _single((far > limit) & good)
     count, near = int(np.count_nonzero(wild)), int(np.count_nonzero((far > _NEAR) & (far <= limit) & good))
-    if not count or near > 2 * count + 3 or _tied(wild, moved, seen):
+    if not count or near > 0.5 * count + stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
     return Wild(wild, float(far[wild].max()), p_value) if p_value < level else None
@@ -82,7 +84,8 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
 
 def _neighbours(values: Array, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
-    window = sliding_window_view(np.pad(values, side, mode='reflect'), 2 * side + 1)
+    # Turned over about the first and last sample, a slope goes on as it is.
+    window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'), 2 * side + 1)
     return np.delete(window, side, axis=1)
 
 
@@ -99,6 +102,12 @@ def _moved(expected: Array) -> Array:
 def _off(values: Array) -> Array:
     """Return how far each sample is from the median of its neighbours."""
     return np.abs(values - np.median(_neighbours(values, _SIDE), axis=1))
+
+
+def _explained(output: Array, expected: Array) -> Mask:
+    """Mark samples near which the reference jumps half as much: it is a jolt that it tells of sooner or later, or it is wild itself."""
+    jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
+    return jumps > 0.5 * np.minimum(_off(output), _off(output - expected))
 
 
 def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:

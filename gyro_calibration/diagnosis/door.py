@@ -1,0 +1,157 @@
+"""
+The door: logs and models that allow no diagnosis are refused before any work is done, in one sentence that says what would do.
+
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gyro_calibration.diagnosis.codes import codes_of
+from gyro_calibration.diagnosis.compared import bridged, line_between, reference_rate, scale_of, white_noise
+from gyro_calibration.dwells.samples import output_of
+from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.model import GyroModel
+
+#: Samples and seconds that a log in time has at least, rows that a rate table has, and the part of a log that must not be lost.
+FEWEST, SHORTEST, FEWEST_ROWS, LEAST = 100, 20.0, 8, 0.1
+#: Without a reference, a gyro is taken to rest as long as its means over a second stay this close to each other, rad/s.
+REST = 3.0 * DEGREE
+#: An output that is nearer than this part of its spread to a line over the reference was made from it.
+_COPY = 1e-6
+#: Steps of print up to this part of the spread hide in a copy.
+_PRINT = 1e-5
+#: A model in deg/s is off by 57.3; with errors of its own it is off by something near it.
+_NEAR = 1.3
+#: No gyro is noisier or quieter than its model by more than this.
+_ABSURD = 1000.0
+#: Nor turns it faster than its model was made for by more than this.
+_TOO_FAST = 20.0
+
+
+def refuse(log: Log, model: GyroModel | None = None) -> None:
+    """
+    Refuse a log, or a model for it, that allows no diagnosis.
+
+    Raises
+    ------
+    DataRefused : with the reason and the remedy
+
+    """
+    output = output_of(log)
+    if log.time is None:
+        _refuse_table(log, output)
+    else:
+        _refuse_few(log.time, output)
+        _refuse_without_reference(log, output)
+    _refuse_constant(output)
+    _refuse_copy(log, output)
+    if model is not None:
+        _refuse_units(log, output, model)
+
+
+def rests(log: Log) -> bool:
+    """Tell whether a gyro rests all the time: by the reference, by what the log says of being moved, or by its own output."""
+    rate = reference_rate(log)
+    if rate is not None:
+        return float(np.nanmax(np.abs(rate))) == 0.0
+    return bool((log.moving == 0.0).all()) if log.moving is not None else _is_steady(log)
+
+
+def _is_steady(log: Log) -> bool:
+    if log.time is None or log.output is None or np.isfinite(log.output).sum() < FEWEST:
+        return False
+    second = np.floor(log.time - log.time[0]).astype(np.int64)
+    second = np.unique(second, return_inverse=True)[1]
+    means = np.bincount(second, bridged(log.output)) / np.bincount(second)
+    return float(np.abs(means - np.median(means)).max()) < REST
+
+
+def _refuse_table(log: Log, output: Array) -> None:
+    rate = log.reference_rate
+    rows = 0 if rate is None else int(np.count_nonzero(np.isfinite(rate) & np.isfinite(output)))
+    if rows < FEWEST_ROWS:
+        raise DataRefused(f'the log has no time_s, and {rows} rows with output and reference_rate_dps; as a rate table it needs at least '
+                          f'{FEWEST_ROWS}, and as samples in time it needs time_s: add rows, or give --rate')
+
+
+def _refuse_few(time: Array, output: Array) -> None:
+    known = int(np.count_nonzero(np.isfinite(output)))
+    if known < FEWEST or known < LEAST * len(output):
+        raise DataRefused(f'the gyro has a value in {known} of {len(output)} samples; at least {FEWEST} and a tenth are needed: record '
+                          'again, and mend the line if it loses samples')
+    if time[-1] - time[0] < SHORTEST:
+        raise DataRefused(f'the log lasts {time[-1] - time[0]:.1f} s; a diagnosis wants at least {SHORTEST:g} s: record longer')
+
+
+def _refuse_without_reference(log: Log, output: Array) -> None:
+    given = [values for values in (log.reference_rate, log.reference_heading) if values is not None]
+    known = max((int(np.count_nonzero(np.isfinite(values) & np.isfinite(output))) for values in given), default=0)
+    if given and 0 < known < max(FEWEST, LEAST * len(output)):
+        raise DataRefused(f'the reference has a value in {known} of {len(output)} samples; at least {FEWEST} and a tenth are needed: '
+                          'mend its line and record again')
+    if known == 0 and not rests(log):
+        raise DataRefused('the log has no reference, and the gyro is not at rest: add reference_rate_dps or reference_heading_deg, or let '
+                          'it rest, and say so with a column moving of zeros')
+
+
+def _refuse_constant(output: Array) -> None:
+    values, counts = np.unique(output[np.isfinite(output)], return_counts=True)
+    share = counts.max() / counts.sum()
+    if share > 0.99:
+        raise DataRefused(f'the gyro gives {values[counts.argmax()] / DEGREE:.6g} deg/s in {100.0 * share:.4g} % of the samples: it is '
+                          'dead, or its steps are coarser than all that it measures; check it, and record again')
+
+
+def _refuse_copy(log: Log, output: Array) -> None:
+    """Refuse a reference that was made from the output, or an output made from the reference."""
+    for rate in _made_of(log):
+        known = np.isfinite(rate) & np.isfinite(output)
+        if np.count_nonzero(known) < FEWEST_ROWS or not np.ptp(rate[known]) > 0.0:
+            continue
+        slope, offset = np.polyfit(rate[known], output[known], 1)
+        off, spread = float(np.std(output[known] - slope * rate[known] - offset)), float(np.std(output[known]))
+        printed = math.hypot(codes_of(output[known]).step, slope * codes_of(rate[known]).step)
+        if off < _COPY * spread or off < 0.5 * printed < _PRINT * spread:
+            raise DataRefused(f'the output is {slope:.6g} times the reference plus {offset / DEGREE:.4g} deg/s, to the last digit: one is '
+                              'made of the other, without noise; give a reference of its own, or a simulation with noise')
+
+
+def _made_of(log: Log) -> list[Array]:
+    """Return the rates that an output would be, had the reference been made of it: its rate, or what its heading was summed up from."""
+    rates = [] if log.reference_rate is None else [log.reference_rate]
+    if log.reference_heading is None or log.time is None:
+        return rates
+    steps = np.diff(log.reference_heading) / np.diff(log.time)
+    before, after = np.append(steps, np.nan), np.insert(steps, 0, np.nan)
+    return [*rates, before, after, 0.5 * (before + after)]
+
+
+def _refuse_units(log: Log, output: Array, model: GyroModel) -> None:
+    """Refuse a model that is absurd for the log: most likely it was written in deg/s."""
+    rate = reference_rate(log)
+    line = None if rate is None else line_between(log.time, rate, output)
+    if rate is not None and line is not None:
+        scale = scale_of(model, rate)
+        if not 0.1 < abs(scale) < 10.0:
+            raise DataRefused(f'the model makes {scale:.4g} rad/s of each rad/s, which no gyro does: it is of other units; write it in '
+                              'rad/s, or fit it again')
+    # By the reference, for the unit of the output may be wrong itself, which is a finding.
+    fastest = float(np.nanquantile(np.abs(output if rate is None else rate), 0.99))
+    widest = max(abs(limit) for limit in model.rate_range)
+    if fastest > _TOO_FAST * widest:
+        raise DataRefused(f'the model is for rates up to {widest / DEGREE:.4g} deg/s, and the log goes to {fastest / DEGREE:.4g} deg/s: '
+                          'it is of other units, or of another gyro; write it in rad/s, or fit it again')
+    if log.time is not None and model.noise.angle_random_walk > 0.0:
+        _refuse_noise(white_noise(output) * math.sqrt(float(np.median(np.diff(log.time)))), model.noise.angle_random_walk, rests(log))
+
+
+def _refuse_noise(measured: float, simulated: float, resting: bool) -> None:
+    """Refuse an angle random walk that is absurd, or at rest, where nothing shakes the gyro, off by what deg and rad differ by."""
+    ratio = measured / simulated
+    confused = resting and any(1.0 / _NEAR < ratio * factor < _NEAR for factor in (DEGREE, 1.0 / DEGREE))
+    if confused or not 1.0 / _ABSURD < ratio < _ABSURD:
+        raise DataRefused(f'the log has {ratio:.3g} times the angle random walk of the model, {simulated:.3g} rad/√s: the model is of '
+                          'other units, or of another gyro; write its noise in rad/√s, or take it from `allan`')

@@ -1,0 +1,336 @@
+"""Hygiene: faults of a record are found at stated sizes, a record without any brings nothing, and what allows no diagnosis is refused."""
+
+import math
+import os
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden.log import hide
+
+from gyro_calibration.diagnosis.codes import codes_of
+from gyro_calibration.diagnosis.door import refuse, rests
+from gyro_calibration.diagnosis.factors import FACTORS, unit_of_offset, unit_of_scale
+from gyro_calibration.diagnosis.hygiene import LEVEL, encoder_step, inspect, update_interval
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.log import COLUMNS, DEGREE, DataRefused, Log, read_log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.stamps import number_stamps
+
+INTERVAL = 0.01
+WHITE = Noise(1e-4)
+SIGMA = 1e-4 / math.sqrt(INTERVAL)
+
+
+@pytest.fixture
+def generator():
+    """Draw from another seed in each run, and say which."""
+    seed = int.from_bytes(os.urandom(4), 'little')
+    print(f'seed {seed}')
+    return np.random.default_rng(seed)
+
+
+def swing(generator, count=6000, noise=WHITE, scale=1.01, offset=2e-3):
+    """Return a log of a gyro that swings and rests, 100 samples a second."""
+    time = np.arange(count) * INTERVAL
+    rate = np.sin(0.9 * time + generator.uniform(0.0, 6.0)) * np.clip(3.0 * np.sin(0.11 * time), 0.0, 1.0)
+    return Log(output=scale * rate + offset + simulate_noise(noise, count, INTERVAL, generator), time=time, reference_rate=rate)
+
+
+def found(log, model=None):
+    """Return the findings by name."""
+    return {finding.effect: finding for finding in inspect(log, model).findings}
+
+
+def value(finding):
+    return finding.parameters[finding.effect].estimate
+
+
+def log_of(hidden):
+    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1] for name, values in hidden.columns.items()})
+
+
+def printed(values, decimals):
+    """Return what is left of values that were written in deg and read again."""
+    return np.round(values / DEGREE, decimals) * DEGREE
+
+
+def in_print(log):
+    return replace(log, output=printed(log.output, 5))
+
+
+def coarse(log, step):
+    return replace(log, output=np.round(log.output / step) * step)
+
+
+def late(log, generator):
+    """Return a log with stamps that a host gave when it got to it."""
+    return replace(log, time=log.time + generator.exponential(0.1 * INTERVAL, len(log)))
+
+
+CLEAN = {
+    'white': lambda generator: swing(generator),
+    'walk and flicker': lambda generator: swing(generator, noise=Noise(1e-4, 3e-5, 1e-5)),
+    'in print': lambda generator: in_print(swing(generator)),
+    'fine codes': lambda generator: coarse(swing(generator), 0.1 * SIGMA),
+    'at rest': lambda generator: replace(swing(generator, scale=0.0), reference_rate=None, moving=np.zeros(6000)),
+    'late stamps': lambda generator: late(swing(generator), generator),
+}
+
+
+@pytest.mark.parametrize('kind', CLEAN)
+def test_a_clean_log_has_no_findings(kind, generator):
+    """At 0.1 % a log, 60 logs have two false alarms once in 570 times."""
+    assert 5 * LEVEL <= 1e-3
+    alarms = [name for _ in range(60) for name in found(CLEAN[kind](generator))]
+    assert len(alarms) <= 1, alarms
+
+
+@pytest.mark.parametrize('noise, reference', [('mixed', 'rate'), ('flicker', 'heading'), ('walk', 'heading')])
+def test_a_clean_log_of_the_generator_has_no_findings(noise, reference, generator):
+    logs = [log_of(hide([], 1.0, generator, noise=noise, reference=reference, duration=120.0)[0]) for _ in range(8)]
+    assert sum(len(found(log)) for log in logs) <= 1
+
+
+@pytest.mark.parametrize('name', ['bandwidth', 'time_offset', 'cubic_nonlinearity', 'interference_tone', 'reference_slip', 'bias_step'])
+def test_a_large_effect_of_the_gyro_brings_no_fault_of_the_record(name, generator):
+    logs = [log_of(hide([name], 50.0, generator, reference=reference, duration=120.0)[0]) for reference in ('rate', 'heading')]
+    assert sum(len(found(log)) for log in logs) <= 1
+
+
+FAULTS = ['outliers', 'stuck_samples', 'dropped_samples', 'quantization', 'reference_quantization']
+
+
+@pytest.mark.parametrize('multiple', [1.2, 5.0])
+@pytest.mark.parametrize('name', FAULTS)
+def test_a_hidden_fault_is_found_alone(name, multiple, generator):
+    hidden = [hide([name], multiple, generator, reference=reference, duration=200.0)[0] for reference in ('rate', 'heading') * 3]
+    assert sum(list(found(log_of(each))) == [name] for each in hidden) >= 5
+
+
+@pytest.mark.parametrize('name', ['quantization', 'reference_quantization'])
+def test_a_step_is_measured(name, generator):
+    hidden = hide([name], 2.0, generator, duration=200.0)[0]
+    assert value(found(log_of(hidden))[name]) == pytest.approx(hidden.truth[name].size, rel=1e-6)
+
+
+def test_wild_samples_are_told_from_others(generator):
+    log = swing(generator)
+    wild = generator.choice(np.arange(20, 5980), 8, replace=False)
+    log.output[wild] += 12.0 * SIGMA * generator.choice([-1.0, 1.0], 8)
+    hygiene = inspect(log)
+    assert [finding.effect for finding in hygiene.findings] == ['outliers']
+    assert np.count_nonzero(~hygiene.trusted[wild]) >= 7 and np.count_nonzero(~hygiene.trusted) <= 9
+
+
+@pytest.mark.parametrize('rough', ['steps', 'jolts', 'heavy tails'])
+def test_a_rough_motion_or_rough_noise_is_not_wild(rough, generator):
+    log = swing(generator)
+    steps = np.repeat(np.cumsum(generator.random(600) < 0.1) % 2, 10) * 0.5
+    jolts = np.convolve((generator.random(6000) < 0.01) * generator.normal(0.0, 1.0, 6000), [0.3, 1.0, 0.4], 'same')
+    more = {'steps': steps, 'jolts': jolts, 'heavy tails': generator.laplace(0.0, SIGMA, 6000)}[rough]
+    # The reference is two samples late, so that it does not explain the motion at once.
+    seen = log.reference_rate if rough == 'heavy tails' else np.roll(log.reference_rate + more, 2)
+    assert 'outliers' not in found(replace(log, output=log.output + more, reference_rate=seen))
+
+
+def test_a_wild_reference_is_not_blamed_on_the_gyro(generator):
+    log = swing(generator)
+    log.reference_rate[generator.choice(np.arange(20, 5980), 8, replace=False)] += 30.0 * SIGMA
+    assert 'outliers' not in found(log)
+
+
+def test_a_single_repeat_of_exact_values_is_seen_and_left_out(generator):
+    log = swing(generator)
+    log.output[1000:1003] = log.output[999]
+    hygiene = inspect(log)
+    assert [finding.effect for finding in hygiene.findings] == ['stuck_samples'] and value(hygiene.findings[0]) == 3.0
+    assert not hygiene.trusted[1000:1003].any() and hygiene.trusted[999] and hygiene.trusted[1003]
+
+
+@pytest.mark.parametrize('step', [0.3, 1.0, 3.0, 30.0])
+def test_coarse_codes_repeat_honestly(step, generator):
+    assert list(found(coarse(swing(generator), step * SIGMA))) == ['quantization']
+
+
+def test_a_coarse_gyro_that_sticks_while_it_turns_is_seen(generator):
+    log = coarse(swing(generator), 3.0 * SIGMA)
+    start = int(np.argmax(np.abs(np.diff(log.reference_rate[:5900], prepend=0.0))))
+    log.output[start:start + 30] = log.output[start]
+    assert 'stuck_samples' in found(log)
+
+
+def test_a_moving_average_of_coarse_codes_is_not_stuck(generator):
+    """As some trackers give it: a new sample that equals the one seven before leaves the mean of seven as it is."""
+    log = swing(generator)
+    mean = np.convolve(coarse(log, 0.2 * SIGMA).output, np.full(7, 1.0 / 7.0), 'valid') * (1.0 + 0.02 * np.sin(31.0 * log.time[3:-3]))
+    assert not found(Log(printed(mean, 4), time=log.time[3:-3], reference_rate=log.reference_rate[3:-3]))
+
+
+@pytest.mark.parametrize('low, high', [(-0.8, 0.8), (-math.inf, 0.7), (-0.9, math.inf)])
+def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
+    log = swing(generator)
+    hygiene = inspect(replace(log, output=np.clip(log.output, low, high)))
+    assert [finding.effect for finding in hygiene.findings] == ['saturation'] and hygiene.limit == min(-low, high)
+    beyond = (log.output > high) | (log.output < low)
+    assert not hygiene.trusted[beyond].any() and hygiene.trusted[np.abs(log.reference_rate) < 0.6].all()
+
+
+def test_a_constant_rate_of_coarse_codes_is_no_limit(generator):
+    log = swing(generator)
+    rate = np.sign(np.sin(0.3 * log.time)) * 0.5
+    output = np.round((rate + SIGMA * generator.standard_normal(6000)) / (10.0 * SIGMA)) * 10.0 * SIGMA
+    assert 'saturation' not in found(replace(log, output=output, reference_rate=rate))
+
+
+def test_what_the_model_knows_is_no_finding(generator):
+    from gyro_calibration.effects import CATALOGUE
+    log = swing(generator)
+    output = np.clip(np.round(log.output / SIGMA) * SIGMA, -600 * SIGMA, 600 * SIGMA)
+    terms = (Term(CATALOGUE['quantization'], (SIGMA,)), Term(CATALOGUE['saturation'], (600 * SIGMA,)))
+    assert not found(replace(log, output=output), GyroModel(terms))
+    assert list(found(replace(log, output=output))) == ['quantization', 'saturation']
+
+
+@pytest.mark.parametrize('name', [name for name, factor in FACTORS.items() if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
+def test_a_wrong_unit_is_named_and_mended(name, generator):
+    log = swing(generator, scale=1.0)
+    hygiene = inspect(replace(log, output=log.output * FACTORS[name]))
+    assert [finding.effect for finding in hygiene.findings] == ['unit_error']
+    assert f'and {name} is' in hygiene.findings[0].evidence and hygiene.factor * FACTORS[name] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('factor, deviation, name', [
+    (0.017, 1e-4, 'pi/180'), (59.0, 0.1, '180/pi'), (-1.03, 1e-3, '-1'), (2.05, 1e-3, '2048/1000'), (2.1, 1e-3, '2'),
+    (1.0239, 1e-4, '1024/1000'), (1.0235, 1e-5, None), (1.0239, 5e-3, None), (1.03, 1e-4, None), (0.98, 1e-4, None), (3.0, 1e-3, None)])
+def test_a_factor_is_a_unit_only_where_it_is_known_to_be_one(factor, deviation, name):
+    assert unit_of_scale(factor, deviation) == name
+
+
+@pytest.mark.parametrize('offset, deviation, name', [
+    (0.01, 1e-4, 'one sample'), (-0.0051, 1e-4, 'half a sample'), (0.0075, 1e-4, None), (0.01, 2e-3, None), (0.02, 1e-4, None)])
+def test_an_offset_is_a_sample_only_where_it_is_known_to_be_one(offset, deviation, name):
+    assert unit_of_offset(offset, deviation, INTERVAL) == name
+
+
+def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
+    log = swing(generator, scale=1.024)
+    assert list(found(log)) == ['unit_error'] and found(log)['unit_error'].ambiguous_with == ('scale_factor_error',)
+    assert not found(log, GyroModel((Term(SCALE_FACTOR_ERROR, (0.024,)),)))
+
+
+@pytest.mark.parametrize('jitter', ['none', '1 ms', 'late'])
+def test_lost_samples_are_counted_through_jitter(jitter, generator):
+    log = swing(generator)
+    kept = generator.random(6000) > 0.002
+    kept[[0, -1]] = True
+    shift = {'none': 0.0, '1 ms': np.round(log.time + 4e-4, 3) - log.time, 'late': generator.exponential(3e-4, 6000)}[jitter]
+    thinned = Log(output=log.output[kept], time=(log.time + shift)[kept], reference_rate=log.reference_rate[kept])
+    assert value(found(thinned)['dropped_samples']) == np.count_nonzero(~kept)
+
+
+def test_the_pace_of_the_clock_and_its_jitter_are_remarks(generator):
+    log = swing(generator)
+    warped = inspect(replace(log, time=log.time * (1.0 + 1e-5 * log.time)))
+    assert not warped.findings and 'interval of the samples changes by +800 ppm' in ' '.join(warped.remarks)
+    assert not inspect(log).remarks
+
+
+@pytest.mark.parametrize('step', [0.088 * DEGREE, 0.01 * DEGREE])
+def test_the_step_of_an_encoder_is_found_in_print_and_out_of_it(step, generator):
+    heading = np.cumsum(swing(generator).reference_rate) * INTERVAL
+    read = np.round(heading / step) * step
+    assert encoder_step(read) == pytest.approx(step, rel=1e-9) and encoder_step(printed(read, 3)) == pytest.approx(step, rel=1e-3)
+
+
+def test_a_calculated_motion_has_no_encoder():
+    """Stretches of constant rate have headings on a lattice, and rests have one value."""
+    time = np.arange(6000) * INTERVAL
+    rate = np.repeat([0.0, 0.5, 0.0, -0.25, 0.0, 0.3], 1000)
+    assert encoder_step(np.cumsum(rate) * INTERVAL) == 0.0 and encoder_step(np.sin(time)) == 0.0
+
+
+@pytest.mark.parametrize('every', [1, 2, 5, 7])
+def test_a_held_reference_tells_its_interval(every, generator):
+    log = swing(generator)
+    held = log.reference_rate[np.arange(6000) // every * every]
+    interval = update_interval(log.time, held, 0.0)
+    assert interval is None if every == 1 else interval == pytest.approx(every * INTERVAL, rel=1e-6)
+    assert bool(inspect(replace(log, reference_rate=held)).remarks) == (every > 1)
+
+
+@pytest.mark.parametrize('count', [400, 2000, 50_000])
+def test_values_without_steps_have_no_codes(count, generator):
+    values = np.sin(np.arange(count) * 0.003) + generator.normal(0.0, 1e-3, count)
+    assert codes_of(values).step == 0.0
+    assert codes_of(np.round(values / 1e-4) * 1e-4).step == pytest.approx(1e-4, rel=1e-9)
+
+
+GOOD = swing(np.random.default_rng(1))
+NAN = np.where(np.arange(6000) < 5950, np.nan, 1.0)
+OTHER_UNITS = GyroModel((Term(SCALE_FACTOR_ERROR, (1.0 / DEGREE - 1.0,)),))
+REFUSED = {
+    'counts alone': (replace(GOOD, output=None, counts=GOOD.output), None, 'no gyro output in rad/s; with'),
+    'no reference': (replace(GOOD, reference_rate=None), None, 'no reference, and the gyro is not at rest'),
+    'few': (Log(GOOD.output[:90], time=GOOD.time[:90], reference_rate=GOOD.reference_rate[:90]), None, '90 of 90 samples'),
+    'short': (Log(GOOD.output[:900], time=GOOD.time[:900], reference_rate=GOOD.reference_rate[:900]), None, 'lasts 9.0 s'),
+    'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None, 'in 100 % of the samples: it is dead'),
+    'same': (replace(GOOD, reference_rate=GOOD.output), None, '1 times the reference plus'),
+    'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3), None, '1.3 times the reference plus 5.73 deg/s'),
+    'summed up': (Log(GOOD.output, time=GOOD.time, reference_heading=np.cumsum(GOOD.output) * INTERVAL), None, '1 times the reference'),
+    'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None, 'the gyro has a value in 50 of 6000'),
+    'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None, 'the reference has a value in 50 of 6000'),
+    'few rows': (Log(GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None, '5 rows'),
+    'model in deg/s': (GOOD, OTHER_UNITS, 'of other units'),
+    'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)), 'of other units, or of another gyro'),
+    'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None),
+                     GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk'),
+}
+
+
+@pytest.mark.parametrize('log, model, reason', REFUSED.values(), ids=REFUSED)
+def test_what_allows_no_diagnosis_is_refused_in_one_sentence(log, model, reason):
+    with pytest.raises(DataRefused) as refused:
+        refuse(log, model)
+    assert reason in str(refused.value) and '\n' not in str(refused.value) and re.search('[:;]', str(refused.value))
+
+
+def test_what_allows_one_passes_the_door():
+    own = GyroModel((Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), rate_range=(-1.0, 1.0), noise=WHITE)
+    half = np.where(np.arange(6000) % 1000 < 300, np.nan, 1.0)
+    refuse(GOOD)
+    refuse(GOOD, own)
+    refuse(replace(GOOD, output=GOOD.output * half, reference_rate=GOOD.reference_rate * half[::-1]), own)
+    refuse(replace(GOOD, output=GOOD.output / DEGREE), own)
+    refuse(Log(GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
+
+
+def test_a_gyro_at_rest_needs_no_reference():
+    still = replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None)
+    for log in (still, replace(GOOD, reference_rate=None, moving=np.zeros(6000)), replace(still, reference_rate=np.zeros(6000))):
+        refuse(log)
+        assert rests(log)
+    assert not rests(GOOD)
+
+
+RECORDINGS = {
+    'mems_encoder_turntable/yaw_slow.csv.gz': ['unit_error', 'dropped_samples', 'reference_quantization'],
+    'mems_encoder_turntable/pitch_slow.csv.gz': ['dropped_samples', 'reference_quantization'],
+    'mems_static/mpu6050_host_clock.csv.gz': [],
+    'mems_motion_capture/fast.csv.gz': [],
+    'fog_rate_table/table.csv': [],
+}
+
+
+@pytest.mark.parametrize('name', RECORDINGS)
+def test_measured_records_show_what_is_known_of_them(name, data):
+    log = read_log(data / name)
+    refuse(log)
+    hygiene = inspect(log)
+    assert [finding.effect for finding in hygiene.findings] == RECORDINGS[name]
+    if 'turntable' in name:
+        assert hygiene.heading_step == pytest.approx(360.0 / 4096 * DEGREE * 351 / 360, rel=0.03)
+        lost = {finding.effect: finding for finding in hygiene.findings}['dropped_samples']
+        assert value(lost) == number_stamps(log.time).lost.sum() > 15
