@@ -52,6 +52,11 @@ class Field:
     shapes: tuple[Shape, ...]
     noises: Noises
 
+    def angles(self) -> tuple[Array, Array]:
+        """Return pi k / n of each coefficient, and the interval of its log, s."""
+        parts = [angles(each.points) for each in self.replays]
+        return np.concatenate(parts), np.concatenate([np.full(len(part), each.step) for part, each in zip(parts, self.replays)])
+
     def divided(self, noise: int) -> Array:
         """Return what whitens coefficients that are divided by the first noise already, shape (m,)."""
         count = np.diff(np.append(self.starts, len(self.deviation)))
@@ -81,7 +86,7 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
     # Some coefficients of a band are enough to know its mean variance.
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int)) for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
-    angle, step = np.concatenate([part[0] for part in parts]), np.concatenate([np.full(len(part[0]), part[1]) for part in parts])
+    angle, step = np.concatenate([part for part, _ in parts]), np.concatenate([np.full(len(part), step) for part, step in parts])
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
     relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / deviation[chosen] ** 2, first_of)
                          for shape in shapes]) / [len(part) for part in few]

@@ -39,6 +39,7 @@ class Replay:
     filling : white noise of variance 1 for the points of the grid that are lost, shape (place[-1] + 1,)
     rounded : the reference is the difference of a heading, whose error is white times (2 - 2 cos)
     has : names of the channels that the log has
+    added : what the simulation adds to the rate, rad/s, shape (n,); it is taken out of `channels.output`
 
     """
 
@@ -51,6 +52,7 @@ class Replay:
     filling: Array
     rounded: bool
     has: frozenset[str]
+    added: Array
 
     @property
     def step(self) -> float:
@@ -121,7 +123,8 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     channels = replace(channels_of(log), rate=smooth, time=time, heading=_heading(time, log, smooth))
     output = _at_intervals(log.output) if rounded else log.output
     filling = generator.standard_normal(place[-1] + 1)
-    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log))
+    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log),
+                   np.zeros(len(time)))
     return plain if model is None else _simulated(plain, model)
 
 
@@ -140,7 +143,8 @@ def _simulated(plain: Replay, model: GyroModel) -> Replay:
     channels = plain.channels
     rate = model.distorted('rate', channels.rate, channels.time)
     added = model.output_in(channels.moving(rate, rate)) - rate
-    return replace(plain, channels=channels.moving(rate, channels.output - added), reference=plain.reference + (rate - channels.rate))
+    return replace(plain, channels=channels.moving(rate, channels.output - added), reference=plain.reference + (rate - channels.rate),
+                   added=added)
 
 
 def numbered(time: Array, kept: Mask) -> tuple[Array, float]:

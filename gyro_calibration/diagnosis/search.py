@@ -9,7 +9,7 @@ whether another explains it better, or none is needed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
 from gyro_calibration.diagnosis.candidates import Candidate, by_cause, candidates, columns_of, effect, fitted_shapes, pulse, with_shape
-from gyro_calibration.diagnosis.evidence import beside, drawn, evidence, judge, log_sum, sample, sums
+from gyro_calibration.diagnosis.evidence import Places, beside, drawn, evidence, judge, log_sum, sample, sums
 from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, work
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
@@ -32,6 +32,8 @@ MOST_NOISES = 60
 RULED_OUT = 3.2
 #: What a shape costs, for a free one fits a little noise.
 PRICE_OF_SHAPE = 1.5
+#: Causes that have no first shapes, but are scanned for.
+SCANNED = frozenset({'interference_tone', 'reference_slip'})
 #: A tone has at least so many periods in a log; slower ones are wander.
 LEAST_PERIODS = 20
 #: Within which times a reference may slip, s.
@@ -95,6 +97,8 @@ def averaged(found: Array) -> Array:
 
 def bank(whole: Field, found: Sequence[Candidate], named: Sequence[Named] = ()) -> Bank:
     """Make the columns of candidates."""
+    if not found:
+        return Bank((), (), np.empty((0, len(whole.deviation))))
     replays = [seen(each, named) for each in whole.replays]
     parts = [columns_of(each, replays) / whole.deviation for each in found]
     ends = np.cumsum([len(part) for part in parts])
@@ -113,6 +117,7 @@ class Search:
     bank : all candidates, where nothing changes the rate
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
+    scanned : causes that are scanned for over all frequencies, or all moments
 
     """
 
@@ -120,6 +125,7 @@ class Search:
     bank: Bank
     chance: Chance
     rate: float
+    scanned: frozenset[str] = SCANNED
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -176,6 +182,13 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float
     return Search(whole, stock, chances(done, stock, generator), rate / len(by_cause(found)))
 
 
+def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str], rate: float) -> Search:
+    """Return a search for some causes in other parts of the same logs, at a rate of false alarms a cause."""
+    found = [each for each in search.candidates if each.cause in causes]
+    whole = _of_likely_noises(field(replays), found)
+    return replace(search, field=whole, bank=bank(whole, found), rate=rate, scanned=SCANNED & frozenset(causes))
+
+
 def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
     """Leave out noises that are out of the question, both where nothing is in the logs and where much may be."""
     middle = [places[len(places) // 2] for places in by_cause([each for each in found if is_named(each)]).values()]
@@ -212,12 +225,13 @@ def slips(done: Work) -> list[tuple[Candidate, float]]:
     return [max(found, key=lambda one: one[1])] if found else []
 
 
-def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Array, width: float) -> tuple[Candidate, float]:
+def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places, width: float) -> tuple[Candidate, float]:
     """Return the jumps of one width, a second apart or more, each with evidence beyond what so many moments make likely."""
     time = np.arange(each.points) * each.step
     kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
     value = 0.5 * correlate(white, kernel, 'same')[moments] ** 2 / (kernel @ kernel) - np.log(len(moments) * len(WIDTHS)) - PRICE_OF_COLUMN
-    chosen, total = [], 0.0
+    chosen: list[float] = []
+    total = 0.0
     for place in np.argsort(-value)[:200]:
         if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
             break
@@ -302,7 +316,8 @@ def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] 
     done = work(search.field, named)
     stock = search.bank if not any(is_of_the_rate(each.candidate.cause) for each in named) else bank(search.field, search.candidates, named)
     found = screen(done, stock)
-    scanned = [*tones(done), *slips(done)]
+    scans = {'interference_tone': tones, 'reference_slip': slips}
+    scanned = [each for cause in search.scanned for each in scans[cause](done)]
     first = [(search.candidates[max(own, key=lambda place: found[place])], float(averaged(found[own])), float(found[own].max()))
              for own in by_cause(search.candidates).values()]
     first += [(candidate, value, value) for candidate, value in scanned]
@@ -362,9 +377,17 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
     return named
 
 
-def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list[tuple[str, float]]:
-    """Return the causes that may stand in the place of a named one, with what they lack in likelihood."""
+def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list[tuple[Named, float]]:
+    """Return the causes that may stand in the place of a named one, itself among them, with what they lack in likelihood."""
     others = tuple(each for each in named if each is not known)
     _, steps = strongest(search, others)
-    mine = max(step.score for step in steps if step.named[-1].candidate.cause == known.candidate.cause)
-    return [(step.named[-1].candidate.cause, mine - step.score) for step in steps if mine - step.score < RULED_OUT]
+    mine = max((step.score for step in steps if step.named[-1].candidate.cause == known.candidate.cause), default=np.inf)
+    return [(step.named[-1], mine - step.score) for step in steps
+            if mine - step.score < RULED_OUT and is_named(step.named[-1].candidate)]
+
+
+def evidence_of(search: Search, named: tuple[Named, ...], place: int) -> float:
+    """Return the evidence of one of the causes beside the others."""
+    others = tuple(each for number, each in enumerate(named) if number != place)
+    price = PRICE_OF_SHAPE * len(fitted_shapes(named[place].candidate)) + PRICE_OF_COLUMN * max(len(named[place].values) - 1, 0)
+    return work(search.field, named).score - work(search.field, others).score - price

@@ -1,0 +1,248 @@
+"""The diagnosis: its steps in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from gyro_calibration.diagnosis.candidates import fitted_shapes
+from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
+from gyro_calibration.diagnosis.curves import curves, heading_curve, noise_curve
+from gyro_calibration.diagnosis.door import refuse
+from gyro_calibration.diagnosis.experiment import separating
+from gyro_calibration.diagnosis.extension import extended
+from gyro_calibration.diagnosis.field import Named, work
+from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figures
+from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.gain import gain
+from gyro_calibration.diagnosis.hygiene import Hygiene, inspect
+from gyro_calibration.diagnosis.naming import named_finding, unexplained
+from gyro_calibration.diagnosis.outcome import Outcome
+from gyro_calibration.diagnosis.probes import along, is_named
+from gyro_calibration.diagnosis.replay import Replay, replay
+from gyro_calibration.diagnosis.search import Search, alternatives, begin, evidence_of, polished, searched
+from gyro_calibration.log import Log
+from gyro_calibration.model import GyroModel
+from gyro_calibration.noise import Noise
+
+#: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of bias and of scale factor error.
+_OF_SEARCH, _OF_NOISE, _OF_BIAS = 0.6, 0.05, 0.05
+#: A cause that differs between logs beyond this chance does not repeat.
+_REPEATS = 1e-3
+#: Causes named from a temperature must repeat.
+_MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
+
+Say = Callable[[str], object]
+
+
+def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None, rate: float = 0.01,
+             names: Sequence[str] = (), origin: Mapping[str, object] | None = None, say: Say = lambda step: None) -> Diagnosis:
+    """
+    Say what a simulation gets wrong, and why.
+
+    Parameters
+    ----------
+    logs : of one gyro, with time, and a reference unless it rests
+    generator : source of what is drawn: residuals of noise alone, and blocks for intervals
+    model : of the simulation; an ideal gyro with the bias and scale factor error that fit best where it is None
+    rate : of false alarms a diagnosis
+    names : of the logs, for people
+    origin : what the extended model says of where it comes from
+    say : is told each step as it begins
+
+    Raises
+    ------
+    DataRefused : the logs allow no diagnosis
+
+    """
+    say('hygiene')
+    for log in logs:
+        refuse(log, model)
+    hygiene = [inspect(log, model) for log in logs]
+    say('replay')
+    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, model) for log, clean in zip(logs, hygiene)]
+    say('search')
+    search = begin(replays, generator, _OF_SEARCH * rate)
+    named, withdrawn = _repeating(search, searched(search))
+    say('sets')
+    named, rivals = _simplest(search, named)
+    found = Outcome(work(search.field, named), search.field.replays)
+    say('noise')
+    figures = noise_figures(found.work, Noise() if model is None else model.noise)
+    say('gain')
+    causes = {each.candidate.cause for members in rivals for each in members if is_named(each.candidate)}
+    won = gain(search, causes, generator) if causes else None
+    return _told(search, found, figures, rivals, withdrawn, hygiene, won, model, rate, names, origin or {}, generator)
+
+
+def _mended(log: Log, clean: Hygiene) -> Log:
+    assert log.output is not None
+    return log if clean.factor == 1.0 else replace(log, output=log.output * clean.factor)
+
+
+def _repeating(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
+    """Withdraw causes named from a temperature that differ between the logs, and names along variables where there is more."""
+    beyond = {along(each.candidate) for each in named if not is_named(each.candidate)}
+    kept = tuple(each for each in named if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in beyond)
+    withdrawn = []
+    for known in kept:
+        candidate = known.candidate
+        if len(search.field.replays) > 1 and is_named(candidate) and CAUSES[candidate.cause].along in _MUST_REPEAT:
+            alone = [replace(candidate, run=run) for run in range(len(search.field.replays) - 1)]
+            columns = len(known.values) * len(alone)
+            more = 2.0 * (work(search.field, kept, alone).score - work(search.field, kept).score)
+            if columns and chi2.sf(max(more, 0.0), columns) < _REPEATS:
+                withdrawn.append(candidate.cause)
+    kept = tuple(each for each in kept if each.candidate.cause not in withdrawn)
+    return (polished(search, kept) if kept != named else kept), withdrawn
+
+
+def _simplest(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
+    """Put the simplest member of each set in its place, and return all members of each."""
+    rivals: list[list[Named]] = []
+    for place, known in enumerate(named):
+        members = [] if not is_named(known.candidate) else [each for each, _ in alternatives(search, named, known)]
+        members = members or [known]
+        chosen = min(members, key=_size)
+        if _size(chosen) < _size(known):
+            named = polished(search, (*named[:place], chosen, *named[place + 1:]))
+        rivals.append(members)
+    return named, rivals
+
+
+def _size(known: Named) -> int:
+    """Return how many values a cause has."""
+    candidate = known.candidate
+    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else max(len(known.values), 1))
+
+
+def _told(search: Search, found: Outcome, figures: NoiseFigures, rivals: Sequence[Sequence[Named]], withdrawn: Sequence[str],
+          hygiene: Sequence[Hygiene], won: Gain | None, model: GyroModel | None, rate: float, names: Sequence[str],
+          origin: Mapping[str, object], generator: np.random.Generator) -> Diagnosis:
+    """Put all that was found into words and records."""
+    plain = Outcome(work(search.field, []), found.replays)
+    strength = {place: evidence_of(search, found.named, place) for place in range(len(found.named))}
+    findings = [named_finding(search, found, place, search.chance.p_value(known.candidate.cause, strength[place]), rivals[place],
+                              _separated(search, found, place, rivals[place], generator))
+                for place, known in enumerate(found.named) if is_named(known.candidate)]
+    findings += _once([each for clean in hygiene for each in clean.findings])
+    if model is not None:
+        findings += [*_of_model(found, model, figures.noise, rate), *_of_noise(figures, model.noise, rate)]
+    findings.sort(key=lambda each: each.p_value)
+    deviation = _bias_deviation(found, figures.noise)
+    before = extended(model or GyroModel(), plain, figures.noise, deviation, origin) if model is None else model
+    offered = won is None or not won.worse
+    after = extended(model or GyroModel(), found, figures.noise, deviation, _said_of_sets(origin, findings)) if offered else before
+    return Diagnosis(
+        tuple(findings), tuple(unexplained(search, found, strength)), figures.noise, Noise() if model is None else model.noise, won, before,
+        after, _cannot_show(search), curves(plain, found if offered else plain), heading_curve(plain, found if offered else plain),
+        noise_curve(found, figures.noise, Noise() if model is None else model.noise),
+        tuple(_remarks(hygiene, names, withdrawn, findings, offered)), rate, tuple(names))
+
+
+def _separated(search: Search, found: Outcome, place: int, members: Sequence[Named], generator: np.random.Generator) -> str:
+    """Return the experiment that parts the members of a set."""
+    known = found.named[place]
+    others = [each for each in members if each.candidate.cause != known.candidate.cause]
+    return separating(search.field, found.named, known, others, generator).sentence if others else ''
+
+
+def _once(findings: Sequence[Finding]) -> list[Finding]:
+    """Return each cause once, by the log that shows it best."""
+    best: dict[str, Finding] = {}
+    for each in findings:
+        if each.effect not in best or each.p_value < best[each.effect].p_value:
+            best[each.effect] = each
+    return list(best.values())
+
+
+def _bias_deviation(found: Outcome, noise: Noise) -> float:
+    """Return the standard deviation of the mean bias of the logs, rad/s."""
+    each = [noise.heading_variance(replay.duration) / replay.duration ** 2 for replay in found.replays]
+    return float(np.sqrt(np.mean(each) / len(each)))
+
+
+def _of_model(found: Outcome, model: GyroModel, noise: Noise, rate: float) -> list[Finding]:
+    """Return bias and scale factor error as findings, where they differ from the model's beyond chance."""
+    scale, bias = found.scale_factor_error, float(np.mean(found.biases))
+    own = [_own_deviation(model, name) for name in ('bias', 'scale_factor_error')]
+    doubts = np.hypot([_bias_deviation(found, noise), scale.deviation], own)
+    told = [('bias', bias, doubts[0], ()), ('scale_factor_error', scale.value, doubts[1], ('reference_scale',))]
+    return [_against(name, value, float(deviation), twins) for name, value, deviation, twins in told
+            if deviation > 0.0 and 2.0 * norm.sf(abs(value) / deviation) < _OF_BIAS * rate]
+
+
+def _own_deviation(model: GyroModel, name: str) -> float:
+    """Return the standard deviation that a model states for a value of its own, 0 where it states none."""
+    if model.covariance is None:
+        return 0.0
+    owners = [term.effect.name for term in model.terms for _ in term.fitted]
+    return float(np.sqrt(model.covariance[owners.index(name), owners.index(name)])) if name in owners else 0.0
+
+
+def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) -> Finding:
+    cause = CAUSES[name]
+    unit = next(iter(cause.units.values()))
+    return Finding(name, cause.sentence, {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
+                   float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins, cause.separate_by if twins else '',
+                   f'beside the model, it is {abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
+
+
+def _of_noise(figures: NoiseFigures, expected: Noise, rate: float) -> list[Finding]:
+    """Return the noise figures that are not those of the model."""
+    found = []
+    for name in NAMES:
+        if figures.chance.get(name, 1.0) < _OF_NOISE * rate:
+            cause, value = CAUSES[name], getattr(figures.noise, name)
+            found.append(Finding(name, cause.sentence, {name: Estimate(value, figures.interval[name], next(iter(cause.units.values())))},
+                                 figures.chance[name], None, evidence=f'the model says {getattr(expected, name):.3g}, the log {value:.3g}',
+                                 along=cause.along))
+    return found
+
+
+def _said_of_sets(origin: Mapping[str, object], findings: Sequence[Finding]) -> dict[str, object]:
+    """Return the origin with a note on each set of which the simplest member is used."""
+    notes = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead' for each in findings if each.ambiguous_with]
+    return {**origin, **({'ambiguous': notes} if notes else {})}
+
+
+def _cannot_show(search: Search) -> dict[str, str]:
+    """Say of each cause that was not searched for why these logs cannot show it."""
+    replays = search.field.replays
+    has = frozenset.intersection(*(each.has for each in replays)) | {'time', 'output'}
+    has |= {'reference', *REFERENCES} if any(np.any(each.reference != 0.0) for each in replays) else frozenset()
+    told = {}
+    for name, cause in CAUSES.items():
+        missing = sorted(cause.needs - has)
+        if missing:
+            told[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
+    for name, reason in _constant(replays).items():
+        told.update({cause.name: reason for cause in CAUSES.values() if cause.along == name and cause.name not in told})
+    return told
+
+
+def _constant(replays: Sequence[Replay]) -> dict[str, str]:
+    """Return the variables that stay the same in all logs, with what is said of them."""
+    quiet = {}
+    for name, reason in (('temperature', 'the temperature hardly changes'), ('supply', 'the supply voltage does not change'),
+                         ('specific_force', 'the specific force does not change')):
+        values = [getattr(each.channels, name) for each in replays if name in each.has]
+        if values and max(float(np.ptp(value)) for value in values) < (0.2 if name == 'temperature' else 1e-9):
+            quiet[name] = reason
+    if 'temperature' in quiet:
+        quiet['temperature_rate'] = quiet['temperature']
+    return quiet
+
+
+def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], withdrawn: Sequence[str], findings: Sequence[Finding],
+             offered: bool) -> Iterator[str]:
+    for place, clean in enumerate(hygiene):
+        where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
+        yield from (where + remark for remark in clean.remarks)
+    for name in withdrawn:
+        yield f'What looked like {name.replace("_", " ")} differs from log to log, and is not named.'
+    if not offered:
+        yield 'On the parts held out, the extended model was worse than the one before; it is not offered.'

@@ -1,0 +1,110 @@
+"""From what was searched and estimated to findings that people can read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.stats import norm
+
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.factors import unit_of_offset
+from gyro_calibration.diagnosis.field import Named
+from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
+from gyro_calibration.diagnosis.outcome import Outcome, Value, joined
+from gyro_calibration.diagnosis.probes import along, is_named
+from gyro_calibration.diagnosis.search import Search
+from gyro_calibration.effects import CATALOGUE
+
+#: Power with which an effect of the minimum detectable size is found.
+_POWER = 0.95
+_DEVIATIONS = 1.96
+#: Names of what has no other.
+_SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(8)))}
+
+
+def named_finding(search: Search, found: Outcome, place: int, p_value: float, rivals: Sequence[Named], separate_by: str) -> Finding:
+    """Return what is said of a named cause."""
+    candidate = found.named[place].candidate
+    cause = CAUSES[candidate.cause]
+    parameters = _parameters(found, place)
+    twins = tuple(dict.fromkeys(each.candidate.cause for each in rivals if each.candidate.cause != candidate.cause))
+    unit = _unit(candidate.cause, parameters, found)
+    size = next(iter(parameters.values()))
+    half = 0.5 * (size.interval[1] - size.interval[0]) / _DEVIATIONS
+    return Finding(candidate.cause, cause.sentence, parameters, p_value, _detectable(search, half), (*twins, *unit),
+                   separate_by or (cause.separate_by if twins or unit else ''), _evidence(size, half, candidate.run, len(found.replays)),
+                   cause.along)
+
+
+def _evidence(size: Estimate, half: float, run: int | None, logs: int) -> str:
+    where = '' if run is None or logs == 1 else f'in log {run + 1}, '
+    return f'{where}the estimate is {abs(size.estimate) / half:.3g} standard deviations from nothing' if half > 0.0 else ''
+
+
+def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tuple[str, ...]:
+    """Return 'unit_error' where a delay is one that comes of a confusion."""
+    if name != 'time_offset':
+        return ()
+    offset = parameters[name]
+    deviation = (offset.interval[1] - offset.interval[0]) / (2.0 * _DEVIATIONS)
+    return ('unit_error',) if unit_of_offset(offset.estimate, deviation, found.replays[0].interval) else ()
+
+
+def _detectable(search: Search, deviation: float) -> float | None:
+    """Return what would be found with the power that is asked for, at the level of one cause."""
+    return float(norm.isf(0.5 * search.rate) + norm.isf(1.0 - _POWER)) * deviation if deviation > 0.0 else None
+
+
+def _parameters(found: Outcome, place: int) -> dict[str, Estimate]:
+    """Return the parameters of a cause, the one that is named like it first."""
+    candidate = found.named[place].candidate
+    coefficients, shapes = found.coefficients(place), found.shapes(place)
+    name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
+    names = _SHAPES.get(name, ()) if effect is None else tuple(parameter.name for parameter in effect.shapes + effect.coefficients)
+    unit = effect.coefficients[0].unit if effect is not None and effect.coefficients else CAUSES[name].units.get(name, '1')
+    parameters = {}
+    if len(coefficients) == 2 and name != 'reference_slip':
+        parameters = _as_phase(found, place, name, coefficients, unit)
+    elif coefficients:
+        parameters = {name: _estimate(coefficients[0], unit)}
+    for number, value in shapes.items():
+        parameters[names[number] if parameters else name] = _estimate(value, 's' if effect is None else effect.parameters[number].unit)
+    if name == 'reference_slip':
+        parameters.update({names[1 + number]: Estimate(at, (at, at), 's') for number, at in enumerate(candidate.shapes[1:])})
+    return parameters
+
+
+def _estimate(value: Value, unit: str) -> Estimate:
+    half = _DEVIATIONS * value.deviation
+    return Estimate(value.value, (value.value - half, value.value + half), unit)
+
+
+def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Value], unit: str) -> dict[str, Estimate]:
+    """Return amplitude and phase of ``sine sin + cosine cos``, with the intervals that their covariance gives."""
+    sine, cosine = (value.value for value in coefficients)
+    amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    ranks = [found.place(place, number) for number in range(2)]
+    covariance = found.covariance[np.ix_(ranks, ranks)]
+    turn = np.array([[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]])
+    deviation = np.sqrt(np.diag(turn @ covariance @ turn.T))
+    return {name: _estimate(Value(amplitude, float(deviation[0])), unit),
+            'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
+
+
+def unexplained(search: Search, found: Outcome, evidence: Mapping[int, float]) -> list[Unexplained]:
+    """Return the structures without a name, with their share of the variance of what the simulation leaves."""
+    left = [residual - bias for residual, bias in zip(found.residuals, found.biases)]
+    rest = float(np.var(joined([part[each.kept] for part, each in zip(left, found.replays)])))
+    said = {}
+    for place, known in enumerate(found.named):
+        if is_named(known.candidate):
+            continue
+        values = [one.value for one in found.coefficients(place)]
+        parts = [np.tensordot(values, np.array(known.candidate.columns(each)), 1)[each.kept] for run, each in enumerate(found.replays)
+                 if known.candidate.run in (None, run)]
+        size = float(np.var(joined(parts))) * sum(map(len, parts)) / sum(int(each.kept.sum()) for each in found.replays)
+        share = size / (size + rest)
+        p_value = search.chance.p_value(known.candidate.cause, evidence[place])
+        said[along(known.candidate)] = Unexplained(along(known.candidate), share, p_value)
+    return list(said.values())

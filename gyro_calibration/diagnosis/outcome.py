@@ -1,0 +1,124 @@
+"""
+What a search found, in values: those of the gyro's effects, of bias and scale, and what they leave.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gyro_calibration.diagnosis.candidates import fitted_shapes
+from gyro_calibration.diagnosis.field import Named, Work, is_of_the_rate, seen
+from gyro_calibration.diagnosis.probes import is_named
+from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.log import Array
+
+
+@dataclass(frozen=True)
+class Value:
+    """A fitted value and its standard deviation."""
+
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    A field with its causes, as values.
+
+    Attributes
+    ----------
+    work : the causes in the field
+    replays : the logs as they were laid out
+
+    """
+
+    work: Work
+    replays: tuple[Replay, ...]
+
+    @property
+    def named(self) -> tuple[Named, ...]:
+        """Return the causes."""
+        return self.work.named
+
+    @cached_property
+    def _estimates(self) -> tuple[dict[tuple[int, int], int], Array, Array]:
+        values, covariance = self.work.estimates
+        return {owner: rank for rank, owner in enumerate(self.work.owner)}, values, covariance
+
+    def place(self, cause: int, number: int) -> int | None:
+        """Return the place of a value among the estimates: of a column (from 0 on) or, as -1 less its place, of a shape."""
+        return self._estimates[0].get((cause, number))
+
+    @property
+    def covariance(self) -> Array:
+        """Return that of all estimates."""
+        return self._estimates[2]
+
+    def _value(self, cause: int, number: int, known: float | None = None) -> Value:
+        place = self.place(cause, number)
+        if place is None:
+            return Value(0.0 if known is None else known, 0.0)
+        values, covariance = self._estimates[1:]
+        return Value(float(values[place]) if known is None else known, float(np.sqrt(max(covariance[place, place], 0.0))))
+
+    @property
+    def scale_factor_error(self) -> Value:
+        """Return what the scale factor differs by from the simulation's, 1."""
+        return self._value(-1, 0)
+
+    def coefficients(self, cause: int) -> list[Value]:
+        """Return the values of the columns of a cause."""
+        candidate = self.named[cause].candidate
+        if candidate.amplitude is not None:
+            return []
+        return [self._value(cause, number) for number in range(len(self.named[cause].values))]
+
+    def shapes(self, cause: int) -> dict[int, Value]:
+        """Return the fitted shapes of a cause, by their places."""
+        candidate = self.named[cause].candidate
+        return {place: self._value(cause, -1 - place, candidate.shapes[place]) for place in fitted_shapes(candidate)}
+
+    @cached_property
+    def explained(self) -> list[Array]:
+        """Return what the causes and the scale add to the output of each log, less its bias, rad/s, shape (n,)."""
+        return [self.explains(each, run) for run, each in enumerate(self.replays)]
+
+    def explains(self, each: Replay, run: int, gyro_only: bool = False) -> Array:
+        """Return what the causes and the scale add to the output of a log."""
+        new = seen(each, self.named)
+        total = (new.channels.rate - each.channels.rate) + self.scale_factor_error.value * new.channels.rate
+        for place, known in enumerate(self.named):
+            candidate = known.candidate
+            if is_of_the_rate(candidate.cause) or (candidate.run not in (None, run)):
+                continue
+            if gyro_only and (not is_named(candidate) or candidate.cause.startswith('reference')):
+                continue
+            values = [candidate.amplitude] if candidate.amplitude is not None else [one.value for one in self.coefficients(place)]
+            total = total + sum(value * column for value, column in zip(values, candidate.columns(new)))
+        return total
+
+    @cached_property
+    def residuals(self) -> list[Array]:
+        """Return what is left of each log, its bias too, rad/s, shape (n,)."""
+        return [each.channels.output - each.reference - added for each, added in zip(self.replays, self.explained)]
+
+    @cached_property
+    def biases(self) -> list[float]:
+        """Return the bias of each log beside the simulation's, rad/s."""
+        return [float(left[each.kept].mean()) for each, left in zip(self.replays, self.residuals)]
+
+
+def rms(values: Array) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
+
+
+def joined(parts: Sequence[Array]) -> Array:
+    """Return the values of all logs in one array."""
+    return np.concatenate(list(parts))
