@@ -4,7 +4,7 @@ Diagnosis: what a simulation of a gyro gets wrong, why, and what is gained when 
 Reading order, each imports only from those before it: `finding` (what is found, as records), `causes` (that can be named), `compared`
 (output and reference), `codes` (of a digital output), `stuck` (samples), `wild` (samples), `factors` (of units), `door` (where logs are
 refused), `hygiene` (of a record), `spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what has
-no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes), `units` (of people), `words` (for people),
-`markup` (of pages), `charts` (in pages), `report` (the page).
+no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes), `units` (of people), `menu` (of experiments),
+`experiment` (that parts causes), `words` (for people), `markup` (of pages), `charts` (in pages), `report` (the page).
 
 """
