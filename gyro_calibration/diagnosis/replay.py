@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from gyro_calibration.diagnosis.spectrum import transform
@@ -46,7 +47,7 @@ class Replay:
     channels: Channels
     reference: Array
     kept: Mask
-    place: Array
+    place: NDArray[np.intp]
     interval: float
     every: int
     filling: Array
@@ -76,14 +77,11 @@ class Replay:
         A bridge has no noise of its own. Where that would matter, white noise of a standard deviation fills it.
 
         """
-        known = values[self.kept]
-        whole = known
-        if len(known) < self.place[-1] + 1:
-            whole = np.interp(np.arange(self.place[-1] + 1), self.place, known)
-            if filling:
-                lost = np.ones(len(whole), dtype=bool)
-                lost[self.place] = False
-                whole[lost] += filling * self.filling[lost]
+        whole = _bridged(values[self.kept], self.place)
+        if filling and len(whole) > len(self.place):
+            lost = np.ones(len(whole), dtype=bool)
+            lost[self.place] = False
+            whole[lost] += filling * self.filling[lost]
         return whole[:self.points * self.every].reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
 
     def noisy(self, values: Array) -> Array:
@@ -147,7 +145,30 @@ def _simulated(plain: Replay, model: GyroModel) -> Replay:
                    added=added)
 
 
-def numbered(time: Array, kept: Mask) -> tuple[Array, float]:
+def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
+    """
+    Return samples on the whole grid, straight lines across what is lost.
+
+    A line begins and ends in the mean of as many samples as it bridges: the noise of a single one would be carried across the gap.
+
+    """
+    steps = np.diff(place)
+    before = np.flatnonzero(steps > 1)
+    whole = np.empty(place[-1] + 1)
+    whole[place] = known
+    if not len(before):
+        return whole
+    length = steps[before] - 1
+    total = np.concatenate([[0.0], np.cumsum(known)])
+    first, last = np.maximum(before + 1 - length, 0), np.minimum(before + 1 + length, len(known))
+    left, right = ((total[end] - total[begin]) / (end - begin) for begin, end in ((first, before + 1), (before + 1, last)))
+    number = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
+    share = (number + 1.0) / np.repeat(length + 1, length)
+    whole[np.repeat(place[before], length) + 1 + number] = np.repeat(left, length) * (1.0 - share) + np.repeat(right, length) * share
+    return whole
+
+
+def numbered(time: Array, kept: Mask) -> tuple[NDArray[np.intp], float]:
     """Number the kept samples on an even grid, and return its interval, s."""
     interval = float(np.median(np.diff(time)))
     steps = np.maximum(np.rint(np.diff(time) / interval), 1.0)
