@@ -10,9 +10,9 @@ Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Ot
 command line), where the name says so: ``gyro_dps``.
 
 Reading order: `log`, `stamps`, `effects`, `history`, `noise`, `model`, `model_file`, `motion`, `simulation`, `compensation`, `heading`,
-`log_compensation`, `likelihood`, `self_calibration`; then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`, `selection`,
-`encoder`, `turn`, `diagnosis`, `reproduction`; then `protocols`, `serial_port`, `emulator`; then `driver_node`, `compensation_node`; then
-`verbs`, `command_line`.
+`log_compensation`, `likelihood`, `self_calibration`, `check`; then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`,
+`selection`, `encoder`, `turn`, `diagnosis`, `reproduction`; then `protocols`, `serial_port`, `emulator`; then `driver_node`,
+`compensation_node`; then `verbs`, `command_line`.
 
 """
 

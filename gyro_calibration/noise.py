@@ -35,6 +35,22 @@ class Noise:
         """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
         return self.angle_random_walk ** 2 / interval
 
+    def allan_variance(self, duration: float) -> float:
+        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of the difference of neighbours."""
+        return (self.angle_random_walk ** 2 / duration + (ALLAN_FLOOR * self.bias_instability) ** 2
+                + self.rate_random_walk ** 2 * duration / 3.0)
+
+    def wander(self, age: float, duration: float) -> float:
+        """
+        Return the variance of how far a mean over `duration` s is from one `age` s before, (rad/s)², but for the white noise.
+
+        Flicker of spectrum B² / (2 pi f), on both sides of zero, has the generalized covariance -B² / pi log|t|. Of means over T that are a
+        time t apart that gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
+
+        """
+        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (math.log(max(age / duration, 1.0)) + 1.5)
+        return flicker + self.rate_random_walk ** 2 * max(age, duration)
+
     def heading_variance(self, duration: Number) -> Number:
         """
         Return the variance, rad², of a heading that was integrated for `duration` s from a bias known at its start.

@@ -50,6 +50,22 @@ def test_a_random_walk_grows_with_the_square_root_of_time(size):
     assert_variance(Noise(rate_random_walk=1e-5), size, wanted)
 
 
+@pytest.mark.parametrize('noise', [Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)], ids=['flicker', 'walk'])
+@pytest.mark.parametrize('apart', [3, 20])
+def test_means_wander_as_foretold(noise, apart):
+    generator, duration, size = np.random.default_rng(5), 2.0, 200
+    squares = []
+    for _ in range(12):
+        means = simulate_noise(noise, 2 ** 16 // size * size, INTERVAL, generator).reshape(-1, size).mean(axis=1)[20:]
+        squares.append(np.mean((means[apart:] - means[:-apart]) ** 2))
+    deviation = np.std(squares) / math.sqrt(len(squares))
+    assert np.mean(squares) == pytest.approx(noise.wander(apart * duration, duration), abs=4.0 * deviation, rel=0.12)
+
+
+def test_the_allan_variance_is_the_sum_of_its_parts():
+    assert Noise(1.0, 2.0, 3.0).allan_variance(5.0) == pytest.approx(1.0 / 5.0 + (ALLAN_FLOOR * 2.0) ** 2 + 9.0 * 5.0 / 3.0)
+
+
 def test_the_three_add_up_and_none_is_silence():
     generator = np.random.default_rng(1)
     assert not simulate_noise(Noise(), 100, INTERVAL, generator).any()
