@@ -125,8 +125,13 @@ def several():
                      'reverse the motion faster than once in two seconds', 'The output lags the encoder.'),
              Finding('cubic_nonlinearity', CATALOGUE['cubic_nonlinearity'].cause, {'cubic_nonlinearity': cubic}, 3e-4, 5e-4, along='rate'),
              Finding('warm_up', 'The bias settles after power-on.', warm, 2e-5),
-             Finding('dropped_samples', 'Samples are missing.', {}, 1e-12, evidence='123 samples are missing in 40 gaps.'))
-    return replace(extended(), findings=found, unexplained=(Unexplained('frequency', 0.004, 0.002),), logs=('a.csv', 'b.csv'))
+             Finding('dropped_samples', 'Samples are missing.', {'dropped_samples': Estimate(123.0, (123.0, 123.0), '1')}, 1e-12,
+                     evidence='123 samples are missing in 40 gaps.'))
+    frequency = np.geomspace(0.01, 50.0, 40)
+    amplitude = 1e-4 / np.sqrt(frequency)
+    spectrum = Curve('frequency', 'Hz', frequency, np.where(np.arange(40) == 30, 2e-3, 2.0 * amplitude), 2.0 * amplitude, amplitude)
+    return replace(extended(), findings=found, curves=[*extended().curves, spectrum],
+                   unexplained=(Unexplained('frequency', 0.004, 0.002),), logs=('a.csv', 'b.csv'))
 
 
 def hostile():
@@ -457,6 +462,28 @@ def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
         browser.point('#thermal > svg', part)
         temperatures.append(float(browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
     assert temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51 and temperatures[2] == 41.0
+
+
+def test_a_finger_reads_values_too(browser, whole_path):
+    browser.show(whole_path, *SCREENS['phone'])
+    browser('Emulation.setTouchEmulationEnabled', enabled=True)
+    place = browser.tell('(() => { const picture = document.querySelector("figure.chart > svg"); picture.scrollIntoView({block: "center"});'
+                         'const box = picture.getBoundingClientRect(); return {x: box.x + box.width / 2, y: box.y + box.height / 2}; })()')
+    browser('Input.dispatchTouchEvent', type='touchStart', touchPoints=[place])
+    browser('Input.dispatchTouchEvent', type='touchEnd', touchPoints=[])
+    browser('Emulation.setTouchEmulationEnabled', enabled=False)
+    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith('time 41')
+
+
+def test_without_its_script_the_page_says_the_same_but_does_not_ask_to_point(browser, whole_path):
+    browser('Emulation.setScriptExecutionDisabled', value=True)
+    try:
+        browser.show(whole_path, *SCREENS['phone'])
+    finally:
+        browser('Emulation.setScriptExecutionDisabled', value=False)
+    assert browser.tell('document.querySelector("h1").innerText').startswith('Simulation and measurement differ')
+    assert browser.tell('document.querySelectorAll("figure.chart tbody tr").length') > 100
+    assert browser.tell('getComputedStyle(document.querySelector(".hint")).display') == 'none'
 
 
 def test_arrow_keys_read_values_too(browser, whole_path):

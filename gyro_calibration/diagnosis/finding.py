@@ -130,7 +130,8 @@ class Curve:
     unit : of `at`, SI
     at : middle of each bin
     before, after : mean of the residual there, against the model that was given and against the extended one, rad/s
-    deviation : standard deviation of these means by the noise alone, rad/s
+    deviation : standard deviation of these means by the noise alone, rad/s; along the frequency, where amplitudes stand in place of means,
+        the usual one
     simulated : mean error, output less true rate, that the simulation with the given model has there, rad/s; measured is that and `before`
 
     """

@@ -36,6 +36,8 @@ from gyro_calibration.model_file import model_text
 _PARTS = 90
 #: Residuals below this, rad/s, are read in deg/h.
 _SLOW = 2e-3 * DEGREE
+#: The curve that holds amplitudes in place of means.
+SPECTRUM = 'frequency'
 _VERDICTS = {'adequate': 'Adequate: nothing was found', 'extended': 'Extended: all that was found has a name',
              'unexplained': 'Unexplained: something is left without a name'}
 
@@ -171,7 +173,7 @@ def _rate_unit(values: Array) -> tuple[str, float]:
 
 def _predicted(curve: Curve, place: int) -> Chart | None:
     """Return what the simulation said that the gyro errs by, and what it did."""
-    if curve.simulated is None:
+    if curve.simulated is None or curve.along == SPECTRUM:
         return None
     measured = curve.simulated + curve.before
     unit, factor = _rate_unit(measured)
@@ -186,6 +188,8 @@ def _predicted(curve: Curve, place: int) -> Chart | None:
 
 
 def _residual(curve: Curve, place: int) -> Chart:
+    if curve.along == SPECTRUM:
+        return _spectrum(curve, place)
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     across, scale = _across(curve)
     named = [('residual', curve.before)] if _same(curve) else [('before', curve.before), ('after', curve.after)]
@@ -193,6 +197,15 @@ def _residual(curve: Curve, place: int) -> Chart:
     along, when = spoken(curve.along), '' if _same(curve) else ', before and after the extension'
     return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}{when}, with bands of '
                  '95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+
+
+def _spectrum(curve: Curve, place: int) -> Chart:
+    """Return the amplitudes of the residual over frequency beside those of noise."""
+    lines = [Line('residual' if _same(curve) else 'before', 'before', curve.before / DEGREE)]
+    lines += [] if _same(curve) else [Line('after', 'after', curve.after / DEGREE)]
+    lines.append(Line('usual', 'simulated', curve.deviation / DEGREE))
+    return Chart(f'residual-{place}', 'Residual along frequency', 'Largest amplitude of the residual in bands of frequency, and the usual '
+                 'one there; a line that stands out is a tone.', 'frequency', 'Hz', curve.at, 'amplitude', 'deg/s', lines, logarithmic=True)
 
 
 def _thinned(at: Array, *values: Array) -> list[Array]:

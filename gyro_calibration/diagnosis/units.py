@@ -13,9 +13,10 @@ _HOUR = 3600.0
 
 #: Unit of SI -> unit of people and the factor to it, where it is not simply degrees for radians.
 _UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0), 'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
-          'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'rad/s²': ('deg/s/h', _HOUR / DEGREE)}
+          'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'K/s': ('K/min', 60.0)}
 #: Parameters that people read in another unit than others of the same unit of SI.
-_PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE), 'k': ('s', 1.0), 'unit_error': ('', 1.0)}
+_PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE), 'rate_ramp': ('deg/s/h', _HOUR / DEGREE), 'k': ('s', 1.0),
+               'unit_error': ('', 1.0), 'outliers': ('', 1.0), 'stuck_samples': ('', 1.0), 'dropped_samples': ('', 1.0)}
 #: (unit, below this many, the finer unit, how many of it).
 _FINER = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
 _RADIANS = re.compile(r'(/?)rad([²³]?)')

@@ -83,8 +83,8 @@ def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
 
 
 def offered(diagnosis: Diagnosis) -> bool:
-    """Tell whether the model was extended."""
-    return not same_effects(diagnosis.before, diagnosis.model)
+    """Tell whether the model was extended; bias and scale factor error alone may differ by chance."""
+    return bool(diagnosis.findings) and not same_effects(diagnosis.before, diagnosis.model)
 
 
 def _won(diagnosis: Diagnosis) -> str:
@@ -92,7 +92,7 @@ def _won(diagnosis: Diagnosis) -> str:
     if not offered(diagnosis):
         return 'No extended model is offered, so that the model is left as it is.'
     if gain is None:
-        return 'An extended model is offered, but these data do not allow to measure what it wins.'
+        return 'An extended model is offered; what it wins was not measured.'
     if gain.heading is None:
         return f'The extended model {change(gain.rate, "rad/s", "the rate error")}, measured on {clean(gain.held_out)}.'
     what = f'the heading error over {gain.window:g} s'
