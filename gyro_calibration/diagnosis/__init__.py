@@ -5,6 +5,8 @@ Reading order, each imports only from those before it: `finding` (what is found,
 (output and reference), `codes` (of a digital output), `stuck` (samples), `wild` (samples), `factors` (of units), `door` (where logs are
 refused), `hygiene` (of a record), `spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what has
 no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes), `units` (of people), `menu` (of experiments),
-`experiment` (that parts causes), `words` (for people), `markup` (of pages), `charts` (in pages), `report` (the page).
+`experiment` (that parts causes), `outcome` (of a search, in values), `figures` (of noise), `extension` (of the model), `gain` (on what
+was held out), `curves` (for people to see), `naming` (of findings), `steps` (of a diagnosis, in order), `words` (for people), `markup`
+(of pages), `charts` (in pages), `report` (the page).
 
 """

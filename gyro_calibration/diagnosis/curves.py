@@ -45,12 +45,12 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
         yield 'heading', 'rad', lambda each: np.mod(each.channels.heading, 2.0 * np.pi)
     if 'temperature' in has:
         yield 'temperature', 'degC', lambda each: each.channels.temperature
-        yield 'temperature_rate', 'K/s', lambda each: (each.channels.temperature - each.channels.lagged('temperature', 10.0)) / 10.0
+        yield 'temperature_rate', 'K/s', lambda each: (each.channels.temperature - each.lagged('temperature', 10.0)) / 10.0
     if 'specific_force' in has:
         yield 'specific_force', 'm/s²', lambda each: each.channels.specific_force
-        yield 'vibration', '(m/s²)²', lambda each: each.channels.lagged('vibration', 1.0)
+        yield 'vibration', '(m/s²)²', lambda each: each.lagged('vibration', 1.0)
     if 'supply' in has:
-        yield 'supply', 'V', lambda each: each.channels.supply
+        yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
 
 
 def _white(residual: Array) -> float:

@@ -36,7 +36,7 @@ def extended(model: GyroModel, found: Outcome, noise: Noise, bias_deviation: flo
     for place, known in new:
         candidate = known.candidate
         effect = CATALOGUE[candidate.cause]
-        coefficients = [one.value for one in found.coefficients(place)] or ([candidate.amplitude] if effect.coefficients else [])
+        coefficients = [one.value for one in found.coefficients(place)] or [candidate.amplitude or 0.0][:len(effect.coefficients)]
         terms = _added(terms, Term(effect, (*candidate.shapes, *coefficients)))
     covariance = _covariance(terms, model, found, [place for place, _ in new], bias_deviation)
     rates, temperatures = _ranges(found)
@@ -52,7 +52,8 @@ def _added(terms: list[Term], new: Term) -> list[Term]:
         if term.effect.name == new.effect.name and term.values[:shapes] == new.values[:shapes] and new.effect.coefficients:
             values = [*term.values[:shapes], *(a + b for a, b in zip(term.values[shapes:], new.values[shapes:]))]
             return [*terms[:place], Term(term.effect, tuple(values)), *terms[place + 1:]]
-    return [*terms, new]
+    # A file names each effect once: of two, the one that was found first is the stronger.
+    return terms if any(term.effect.name == new.effect.name for term in terms) else [*terms, new]
 
 
 def _covariance(terms: Sequence[Term], model: GyroModel, found: Outcome, new: Sequence[int], bias_deviation: float) -> Array | None:

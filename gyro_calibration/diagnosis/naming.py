@@ -84,7 +84,7 @@ def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Valu
     """Return amplitude and phase of ``sine sin + cosine cos``, with the intervals that their covariance gives."""
     sine, cosine = (value.value for value in coefficients)
     amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
-    ranks = [found.place(place, number) for number in range(2)]
+    ranks = [rank for rank in (found.place(place, number) for number in range(2)) if rank is not None]
     covariance = found.covariance[np.ix_(ranks, ranks)]
     turn = np.array([[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]])
     deviation = np.sqrt(np.diag(turn @ covariance @ turn.T))

@@ -64,9 +64,9 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
     if 'temperature' in has:
         known['temperature'] = lambda each: each.channels.temperature
     if 'supply' in has:
-        known['supply'] = lambda each: each.channels.supply
+        known['supply'] = lambda each: np.asarray(each.channels.supply)
     if 'specific_force' in has:
-        known['specific_force'] = lambda each: each.channels.lagged('specific_force', 0.3)
+        known['specific_force'] = lambda each: each.lagged('specific_force', 0.3)
     for name, of in known.items():
         low = min(float(of(each).min()) for each in replays)
         high = max(float(of(each).max()) for each in replays)
@@ -119,8 +119,15 @@ def _product(first: Of, second: Of, square: bool) -> Callable[[Replay], Sequence
 
 def _of_rate(rate: Of) -> Iterator[Candidate]:
     for power in (0.25, 0.5, 0.75, 1.5):
-        yield _probe('rate', lambda each, power=power: (np.abs(rate(each)) ** power,))
-        yield _probe('rate', lambda each, power=power: (np.sign(rate(each)) * np.abs(rate(each)) ** power,))
+        yield _probe('rate', _root(rate, power, odd=False))
+        yield _probe('rate', _root(rate, power, odd=True))
+
+
+def _root(rate: Of, power: float, odd: bool) -> Callable[[Replay], Sequence[Array]]:
+    def columns(each: Replay) -> Sequence[Array]:
+        value = rate(each)
+        return (np.abs(value) ** power * (np.sign(value) if odd else 1.0),)
+    return columns
 
 
 def _of_heading(variables: dict[str, Of]) -> Iterator[Candidate]:

@@ -70,6 +70,11 @@ class Replay:
         """Return the length of the log, s."""
         return self.points * self.step
 
+    def lagged(self, channel: str, time_constant: float) -> Array:
+        """Return a channel through a first-order lag, shape (n,)."""
+        assert self.channels.lagged is not None
+        return np.asarray(self.channels.lagged(channel, time_constant))
+
     def on_grid(self, values: Array, filling: float = 0.0) -> Array:
         """
         Return samples, shape (n,), on the even grid: lost ones are bridged, and neighbours averaged where there are many.

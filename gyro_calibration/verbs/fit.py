@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gyro_calibration import __version__, picture
+from gyro_calibration import picture
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.dwells import Dwells, dwells, join, take
 from gyro_calibration.effects import STEADY, Effect, rate_temperature_polynomial
@@ -37,7 +35,7 @@ from gyro_calibration.verbs.fit_answer import (
     value_data,
     value_lines,
 )
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, origin_of, output_of, picture_file, read, verb
 
 METHODS = ('dwells', 'likelihood', 'rate')
 
@@ -105,10 +103,7 @@ def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
 def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return the model with what it comes from, and write it where that is wanted."""
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number, 'technology': given.technology}
-    files = [{'name': Path(path).name, 'sha256': hashlib.sha256(Path(path).read_bytes()).hexdigest()} for path in given.log]
-    model = replace(model, gyro={name: value for name, value in identity.items() if value},
-                    origin={'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-                            'program': f'gyro_calibration {__version__}'})
+    model = replace(model, gyro={name: value for name, value in identity.items() if value}, origin=origin_of(given.log))
     if given.out:
         write_model(given.out, model)
     return model

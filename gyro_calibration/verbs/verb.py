@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.util
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from gyro_calibration import __version__
 from gyro_calibration.log import DEGREE, Array, Log, read_log, read_log_blocks
 
 
@@ -78,6 +81,12 @@ def read(given: argparse.Namespace) -> Log:
 def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
     """Show on a terminal how far the work on some items is, if it takes longer than two seconds."""
     return tqdm(items, desc=what, delay=2.0, leave=False, disable=None)
+
+
+def origin_of(paths: Iterable[str]) -> dict[str, Any]:
+    """Return what a model file says of where it comes from: logs, date, program."""
+    files = [{'name': Path(path).name, 'sha256': hashlib.sha256(Path(path).read_bytes()).hexdigest()} for path in paths]
+    return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'), 'program': f'gyro_calibration {__version__}'}
 
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:

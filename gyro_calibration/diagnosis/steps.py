@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +39,7 @@ Say = Callable[[str], object]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None, rate: float = 0.01,
-             names: Sequence[str] = (), origin: Mapping[str, object] | None = None, say: Say = lambda step: None) -> Diagnosis:
+             names: Sequence[str] = (), say: Say = lambda step: None) -> Diagnosis:
     """
     Say what a simulation gets wrong, and why.
 
@@ -50,7 +50,6 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     model : of the simulation; an ideal gyro with the bias and scale factor error that fit best where it is None
     rate : of false alarms a diagnosis
     names : of the logs, for people
-    origin : what the extended model says of where it comes from
     say : is told each step as it begins
 
     Raises
@@ -75,7 +74,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     say('gain')
     causes = {each.candidate.cause for members in rivals for each in members if is_named(each.candidate)}
     won = gain(search, causes, generator) if causes else None
-    return _told(search, found, figures, rivals, withdrawn, hygiene, won, model, rate, names, origin or {}, generator)
+    return _told(search, found, figures, rivals, withdrawn, hygiene, won, model, rate, names, generator)
 
 
 def _mended(log: Log, clean: Hygiene) -> Log:
@@ -121,7 +120,7 @@ def _size(known: Named) -> int:
 
 def _told(search: Search, found: Outcome, figures: NoiseFigures, rivals: Sequence[Sequence[Named]], withdrawn: Sequence[str],
           hygiene: Sequence[Hygiene], won: Gain | None, model: GyroModel | None, rate: float, names: Sequence[str],
-          origin: Mapping[str, object], generator: np.random.Generator) -> Diagnosis:
+          generator: np.random.Generator) -> Diagnosis:
     """Put all that was found into words and records."""
     plain = Outcome(work(search.field, []), found.replays)
     strength = {place: evidence_of(search, found.named, place) for place in range(len(found.named))}
@@ -133,9 +132,9 @@ def _told(search: Search, found: Outcome, figures: NoiseFigures, rivals: Sequenc
         findings += [*_of_model(found, model, figures.noise, rate), *_of_noise(figures, model.noise, rate)]
     findings.sort(key=lambda each: each.p_value)
     deviation = _bias_deviation(found, figures.noise)
-    before = extended(model or GyroModel(), plain, figures.noise, deviation, origin) if model is None else model
+    before = extended(model or GyroModel(), plain, figures.noise, deviation, {}) if model is None else model
     offered = won is None or not won.worse
-    after = extended(model or GyroModel(), found, figures.noise, deviation, _said_of_sets(origin, findings)) if offered else before
+    after = extended(model or GyroModel(), found, figures.noise, deviation, _said_of_sets(findings)) if offered else before
     return Diagnosis(
         tuple(findings), tuple(unexplained(search, found, strength)), figures.noise, Noise() if model is None else model.noise, won, before,
         after, _cannot_show(search), curves(plain, found if offered else plain), heading_curve(plain, found if offered else plain),
@@ -203,10 +202,10 @@ def _of_noise(figures: NoiseFigures, expected: Noise, rate: float) -> list[Findi
     return found
 
 
-def _said_of_sets(origin: Mapping[str, object], findings: Sequence[Finding]) -> dict[str, object]:
-    """Return the origin with a note on each set of which the simplest member is used."""
+def _said_of_sets(findings: Sequence[Finding]) -> dict[str, object]:
+    """Return a note on each set of which the simplest member is used, for the origin of the model."""
     notes = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead' for each in findings if each.ambiguous_with]
-    return {**origin, **({'ambiguous': notes} if notes else {})}
+    return {'ambiguous': notes} if notes else {}
 
 
 def _cannot_show(search: Search) -> dict[str, str]:
