@@ -6,7 +6,8 @@ Reading order, each imports only from those before it: `finding` (what is found,
 refused), `hygiene` (of a record), `spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what has
 no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes), `units` (of people), `menu` (of experiments),
 `experiment` (that parts causes), `outcome` (of a search, in values), `figures` (of noise), `extension` (of the model), `gain` (on what
-was held out), `curves` (for people to see), `naming` (of findings), `steps` (of a diagnosis, in order), `words` (for people), `markup`
-(of pages), `charts` (in pages), `report` (the page).
+was held out), `curves` (for people to see), `naming` (of findings), `steps` (of a diagnosis, in order), `dwell_fit` (of what a model
+leaves of a rate table), `dwell_sets` (that dwells cannot part), `dwell_rest` (what has no name), `dwell_gain` (on sweeps left out),
+`table` (the diagnosis of a rate table), `words` (for people), `markup` (of pages), `charts` (in pages), `report` (the page).
 
 """

@@ -1,0 +1,264 @@
+"""
+What dwells say beside a model: its bias and scale factor fitted anew, and the causes that they support on top of it.
+
+Effects of a model that are not fitted anew are taken off the output first, so that what is left is that of a gyro without them. A
+polynomial that looks at the output stays as it is: fitted together with effects of the rate it would explain the dwells by themselves,
+for their output less their rate is what is to be explained.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
+from gyro_calibration.dwells import Dwells
+from gyro_calibration.effects import (
+    BIAS,
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CUBIC_NONLINEARITY,
+    SCALE_FACTOR_ERROR,
+    SINE_RESPONSE,
+    STEADY,
+    Channels,
+    Effect,
+)
+from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.scatter import Scatter
+from gyro_calibration.selection import TECHNOLOGIES, part_twins, supported_effects
+
+#: Fitted in any case.
+NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
+#: What dwells without time can show of a model.
+_SEEN = {'rate', 'output', 'temperature'}
+#: Parts of the false-alarm rate: of causes beside bias and scale factor, and of a bias and a scale factor that are not the model's.
+_CAUSES, _OF_NUISANCES = 0.65, 0.1
+#: Temperatures from which a curve may count without a slope, degC, beside the mean and the first.
+_USUAL = (25.0, 20.0)
+
+
+@dataclass(frozen=True)
+class Named:
+    """
+    Causes that dwells support on top of a model.
+
+    Attributes
+    ----------
+    fit : of these and of bias and scale factor, to dwells less what stays of the model
+    change : the same as changes of the model, each beside all of it; their evidence
+    causes : those that are named, of the effects of the fit
+    rate : of false alarms that the whole diagnosis may have
+
+    """
+
+    fit: Calibration
+    change: Calibration
+    causes: tuple[Effect, ...]
+    rate: float
+
+    def changed(self, effect: Effect) -> Effect:
+        """Return the effect of the change that stands for one of the fit: itself, or its twin."""
+        return _or_twin(effect, self.change)
+
+    def level_of(self, effect: Effect) -> float:
+        """Return the chance at which an effect is named."""
+        return _level(self.rate, effect in NUISANCES)
+
+    def chance_of(self, effect: Effect) -> float:
+        """Return how likely dwells without a cause would show as much of any of those that were tried."""
+        count = len(NUISANCES) if effect in NUISANCES else len(STEADY) - len(NUISANCES)
+        return min(1.0, self.change.chance_of(self.changed(effect)) * count)
+
+
+# a model beside dwells
+
+def surroundings(model: GyroModel, dwells: Dwells) -> Channels:
+    """Return what a model looks at, at its reference temperature where the table holds none."""
+    channels = channels_of(dwells)
+    return channels if dwells.temperature is not None else replace(channels, temperature=np.full(len(dwells), model.reference_temperature))
+
+
+def simulated(model: GyroModel, dwells: Dwells) -> Array:
+    """Return the output that a model has for the dwells, rad/s, shape (n,)."""
+    known = replace(model, terms=tuple(seen(model)))
+    return np.asarray(known.output_in(surroundings(model, dwells))) + np.zeros(len(dwells))
+
+
+def seen(model: GyroModel) -> list[Term]:
+    """Return the effects of a model that dwells can show: those of rate, output and temperature alone."""
+    return [term for term in model.terms if term.effect.looks_at <= _SEEN and term.effect.distortion is None]
+
+
+def beside(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
+    """Return the dwells with the output of a gyro without the effects of a model, but for those that are refitted."""
+    channels, names = surroundings(model, dwells), {effect.name for effect in refitted}
+    return replace(dwells, output=dwells.output - sum(term.error(channels) for term in seen(model) if term.effect.name not in names))
+
+
+def technology(model: GyroModel) -> str | None:
+    """Return what the instrument is, if the model says so and physics has an answer."""
+    said = model.gyro.get('technology')
+    return said if said in TECHNOLOGIES else None
+
+
+# naming
+
+def name_causes(dwells: Dwells, model: GyroModel | None, rate: float, without: frozenset[str] = frozenset()) -> Named:
+    """
+    Find the causes that dwells support on top of a model, or of an ideal gyro.
+
+    Parameters
+    ----------
+    dwells : of a rate table
+    model : that is put to the test, if one was given
+    rate : of false alarms that the whole diagnosis may have
+    without : the names of causes that are withdrawn
+
+    """
+    tested = model or GyroModel()
+    change, _ = supported_effects(beside(dwells, tested), technology(tested), rate=_CAUSES * rate)
+    change = _without(change, without)
+    change, needless = _counted_well(change, model, _level(rate))
+    guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless))
+    if model is None:
+        return Named(change, change, guilty, rate)
+    guilty += tuple(each for each in NUISANCES if each in change.effects and change.chance_of(each) < _level(rate, True))
+    fit = _refitted(dwells, model, change)
+    return Named(fit, change, tuple(_or_twin(each, fit) for each in guilty), rate)
+
+
+def _level(rate: float, nuisance: bool = False) -> float:
+    """Return the chance at which one cause is named."""
+    return _OF_NUISANCES * rate / len(NUISANCES) if nuisance else _CAUSES * rate / (len(STEADY) - len(NUISANCES))
+
+
+def _without(change: Calibration, names: frozenset[str]) -> Calibration:
+    """Fit anew without the causes that are withdrawn, and without what was there for their sake."""
+    kept = [each for each in change.effects if each.name not in names]
+    return change if len(kept) == len(change.effects) else fit_effects(change.dwells, kept, change.scatter)
+
+
+def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
+    """Fit the values that changed as a whole: the model's own and the change of them are one."""
+    own = {term.effect.name for term in model.terms}
+    effects = tuple(twin if (twin := _twin(each)) is not None and twin.name in own - {each.name} else each for each in change.effects)
+    fit, _ = part_twins(fit_effects(beside(dwells, model, effects), effects, change.scatter), technology(model))
+    return counted_from(fit, model.reference_temperature)
+
+
+def _twin(effect: Effect) -> Effect | None:
+    return {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}.get(effect)
+
+
+def _or_twin(effect: Effect, fit: Calibration) -> Effect:
+    """Return the effect, or its twin where that stands for it in a fit."""
+    twin = _twin(effect)
+    return effect if effect in fit.effects or twin is None else twin
+
+
+def _counted_well(fit: Calibration, model: GyroModel | None, level: float) -> tuple[Calibration, tuple[Effect, ...]]:
+    """Return a fit that counts temperature from where a curve needs no slope, if there is such a place, and the slope as needless."""
+    if fit.dwells.temperature is None:
+        return fit, ()
+    first = _USUAL if model is None else (model.reference_temperature, *_USUAL)
+    if BIAS_TEMPERATURE_QUADRATIC in fit.effects:
+        for place in (*first, float(fit.dwells.temperature.mean()), float(fit.dwells.temperature[0])):
+            counted = counted_from(fit, place)
+            if counted.chance_of(BIAS_TEMPERATURE) > level:
+                return (counted if model is None else counted_from(fit, first[0])), (BIAS_TEMPERATURE,)
+    return (fit if model is None else counted_from(fit, first[0])), ()
+
+
+def counted_from(fit: Calibration, temperature: float) -> Calibration:
+    """Return a fit whose effects of temperature count from another one; what they add up to is the same."""
+    terms = [_with_reference(term, temperature) for term in fit.terms]
+    places = [place for place, term in enumerate(terms) if not any(shape.default is None for shape in term.effect.shapes)]
+    channels = channels_of(fit.dwells)
+    total = sum(fit.terms[place].error(channels) for place in places) + np.zeros(len(fit.dwells))
+    columns = columns_of(fit.dwells, [terms[place] for place in places])
+    lengths = np.linalg.norm(columns, axis=0)
+    values = iter((np.linalg.lstsq(columns / lengths, total, rcond=None)[0] / lengths).tolist())
+    for place in places:
+        shapes = terms[place].values[:len(terms[place].effect.shapes)]
+        terms[place] = replace(terms[place], values=(*shapes, *(next(values) for _ in terms[place].fitted)))
+    return replace(fit, terms=tuple(terms))
+
+
+def _with_reference(term: Term, temperature: float) -> Term:
+    if not term.effect.shapes or term.effect.shapes[0].name != 'reference_temperature':
+        return term
+    return replace(term, values=(temperature, *term.values[1:]))
+
+
+# models
+
+def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
+    """Return the simulation that is put to the test: with the bias and scale factor that fit best, where they are no findings."""
+    effects = [each for each in NUISANCES if each in named.change.effects and each not in named.causes]
+    if not effects:
+        return model or GyroModel()
+    tested = model or GyroModel()
+    return assembled(dwells, model, fit_effects(beside(dwells, tested, effects), effects, _scatter(dwells, named)))
+
+
+def _scatter(dwells: Dwells, named: Named) -> Scatter | None:
+    """Return the scatter that was found, if it is that of these dwells."""
+    return named.fit.scatter if len(named.fit.scatter.kept) == len(dwells) else None
+
+
+def model_after(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
+    """Return the extended model."""
+    return assembled(dwells, model, named.fit)
+
+
+def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
+    """Return a model with the values of a fit in place of its own, or beside them."""
+    if model is None:
+        return fit.model
+    new = {term.effect.name: term for term in fit.terms}
+    stays = [term for term in model.terms if not _replaced(term.effect, model, fit)]
+    own = [term.effect.name for term in stays]
+    terms = (*(new.get(term.effect.name, term) for term in stays), *(term for name, term in new.items() if name not in own))
+    outputs = (min(model.rate_range[0], float(dwells.output.min())), max(model.rate_range[1], float(dwells.output.max())))
+    # A self-calibration behind the model was of its old bias and scale factor.
+    return replace(model, terms=terms, covariance=_covariance(model, fit, terms), rate_range=outputs, self_calibration=None)
+
+
+def _replaced(effect: Effect, model: GyroModel, fit: Calibration) -> bool:
+    """Tell whether the twin of an effect of the model stands in its place."""
+    twin = _twin(effect)
+    return twin in fit.effects and effect not in fit.effects and all(term.effect is not twin for term in model.terms)
+
+
+def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Array | None:
+    """Return the covariance of all fitted values: what the model and what the dwells say of theirs, as if independent."""
+    found = fit.model.covariance
+    stays = [term for term in terms if term.effect not in fit.effects and term.fitted]
+    if found is None or (stays and model.covariance is None):
+        return None
+    known = np.zeros((0, 0)) if model.covariance is None else model.covariance
+    both, places = block_diag(known, found), []
+    of_model, of_fit = _places(model.terms, 0), _places(fit.terms, len(known))
+    for term in terms:
+        places += of_fit.get(term.effect.name, []) or of_model[term.effect.name]
+    return both[np.ix_(places, places)]
+
+
+def _places(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
+    """Return where the fitted values of each term stand in a covariance."""
+    ends = np.cumsum([first, *(len(term.fitted) for term in terms)]).tolist()
+    return {term.effect.name: list(range(begin, end)) for term, begin, end in zip(terms, ends, ends[1:])}
+
+
+def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
+    """Fit other effects to the dwells of a fit, or return None where they cannot be parted."""
+    try:
+        return fit_effects(fit.dwells, effects, fit.scatter)
+    except DataRefused:
+        return None

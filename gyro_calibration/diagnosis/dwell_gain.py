@@ -1,0 +1,117 @@
+"""
+What an extension wins on sweeps that took no part in it, and what the errors of dwells look like before and after, for pictures.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from gyro_calibration.diagnosis.dwell_fit import simulated
+from gyro_calibration.diagnosis.finding import Change, Curve, Gain
+from gyro_calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.log import Array, DataRefused, Mask
+from gyro_calibration.model import GyroModel
+from gyro_calibration.scatter import FEWEST_SWEEPS, Scatter, parts_of, rms, summed
+
+#: The parts of a table are left out in so many groups at most, for each choice of causes takes its time.
+_MOST_GROUPS = 8
+#: Draws of parts, for the interval of what is won.
+_DRAWS = 2000
+#: A heading error is that of so long a turn at the rate of a dwell, s.
+WINDOW = 60.0
+#: Bins of a curve at most, and dwells in each at least.
+_MOST_BINS, _DWELLS_A_BIN = 40, 4
+
+#: Dwells -> the simulation before, and the extended one, from these dwells alone.
+Extend = Callable[[Dwells], tuple[GyroModel, GyroModel]]
+
+
+def measure_gain(dwells: Dwells, extend: Extend, generator: np.random.Generator) -> Gain | None:
+    """
+    Return what an extension wins, or None where the parts of the table do not allow to make it without one of them.
+
+    Parameters
+    ----------
+    dwells : of a rate table, outlying ones too
+    extend : chooses the causes anew, and fits them
+    generator : source of the bootstrap
+
+    """
+    parts = parts_of(dwells)
+    groups = parts * min(_MOST_GROUPS, parts.max() + 1) // (parts.max() + 1)
+    before, after = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
+    for number in np.unique(groups):
+        hidden = groups == number
+        try:
+            models = extend(take(dwells, ~hidden))
+        except DataRefused:
+            continue
+        left_out = take(dwells, hidden)
+        before[hidden], after[hidden] = (left_out.output - simulated(model, left_out) for model in models)
+    known = np.isfinite(before) & np.isfinite(after)
+    if not known.any():
+        return None
+    rate = _change(before[known], after[known], np.unique(parts[known], return_inverse=True)[1], generator)
+    return Gain(_held_out(dwells, groups), rate, _times(rate, WINDOW), WINDOW)
+
+
+def _held_out(dwells: Dwells, groups: Numbers) -> str:
+    what = 'sweeps' if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 'consecutive dwells'
+    return f'{what} left out, each of {groups.max() + 1} groups in turn'
+
+
+def _change(before: Array, after: Array, parts: Numbers, generator: np.random.Generator) -> Change:
+    """Return root mean squares with the interval of their difference, by drawing whole parts."""
+    squares = np.column_stack([summed(np.column_stack([before ** 2, after ** 2]), parts), np.bincount(parts)])
+    drawn = squares[generator.integers(len(squares), size=(_DRAWS, len(squares)))].sum(axis=1)
+    low, high = np.quantile(np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2]), (0.025, 0.975))
+    return Change(rms(before), rms(after), (float(low), float(high)))
+
+
+def _times(change: Change, factor: float) -> Change:
+    low, high = change.interval
+    return Change(factor * change.before, factor * change.after, (factor * low, factor * high))
+
+
+# curves
+
+def curves(dwells: Dwells, scatter: Scatter, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
+    """Return the errors of dwells that are not outlying along rate, temperature and their order."""
+    used = take(dwells, scatter.kept)
+    ways, straight = np.sign(used.rate), np.ones(len(used))
+    found = [_curve('rate', 'rad/s', used.rate, straight, used, scatter, before, after),
+             _curve('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), straight, used, scatter, before, after)]
+    if used.temperature is not None and np.ptp(used.temperature) > 0.0:
+        found.append(_curve('temperature', 'degC', used.temperature, straight, used, scatter, before, after))
+        # A scale factor that changes with temperature averages out over turns both ways, unless errors count in the sense of the turn.
+        found.append(_curve('temperature_while_turning', 'degC', used.temperature, ways, used, scatter, before, after))
+    return tuple(found)
+
+
+def _curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells, scatter: Scatter, before: GyroModel,
+           after: GyroModel) -> Curve:
+    outputs = [simulated(model, dwells) for model in (before, after)]
+    errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]), sign * (outputs[0] - dwells.rate)]
+    bins = list(_bins(values, sign != 0.0))
+    at, *means = (np.array([float(each[chosen].mean()) for chosen in bins]) for each in (values, *errors))
+    deviation = np.array([_deviation(dwells, scatter, sign, chosen) for chosen in bins])
+    return Curve(along, unit, at, means[0], means[1], deviation, means[2])
+
+
+def _bins(values: Array, wanted: Mask) -> Iterator[Mask]:
+    """Give the members of bins of equal width that hold something."""
+    count = max(1, min(_MOST_BINS, len(np.unique(values)), len(values) // _DWELLS_A_BIN))
+    edges = np.linspace(values.min(), values.max(), count + 1)
+    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, count - 1)
+    yield from (chosen for number in range(count) if (chosen := (place == number) & wanted).any())
+
+
+def _deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> float:
+    """Return the standard deviation of the mean error of some dwells; what a sweep shares does not average out within it."""
+    part = take(dwells, chosen)
+    shared = summed(sign[chosen, None] * scatter.shared(part), np.unique(part.sweep, return_inverse=True)[1])
+    return math.sqrt(float(np.sum(scatter.deviation(part) ** 2) + np.sum(shared ** 2))) / len(part)

@@ -1,0 +1,151 @@
+"""
+What dwells cannot rule out in place of a cause, and which further dwells would.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gyro_calibration.calibration import Calibration, channels_of, columns_of
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.dwell_fit import tried
+from gyro_calibration.dwells import take
+from gyro_calibration.effects import (
+    BIAS,
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CUBIC_NONLINEARITY,
+    SATURATION,
+    SCALE_FACTOR_ERROR,
+    SINE_RESPONSE,
+    STEADY,
+    Effect,
+)
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.scatter import Whitener
+from gyro_calibration.selection import PARTED, separation, swapped_effects
+
+#: Of bias and scale factor, what dwells in one pose on one table never rule out.
+_ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
+#: Further dwells are aimed at this, for two fits vary by one standard deviation.
+_AIM = PARTED + 1.0
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """
+    Causes that may stand in the place of one.
+
+    Attributes
+    ----------
+    names : of them, the likeliest first
+    separate_by : the experiment that would part them; '' where there is nothing to part
+
+    """
+
+    names: tuple[str, ...] = ()
+    separate_by: str = ''
+
+
+def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
+    """Return what dwells cannot rule out in place of one effect of a fit."""
+    if effect in _ALWAYS:
+        return Alternatives((_ALWAYS[effect],), CAUSES[effect.name].separate_by)
+    steady = [(sigmas, other) for other in _others(fit, effect) if (sigmas := sigmas_of(fit, other)) < PARTED]
+    found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
+    found += [(sigmas, name) for name, columns in _beyond(fit, effect) if (sigmas := _sigmas(fit, effect, columns)) < PARTED]
+    if not found:
+        return Alternatives()
+    said = [_experiment(fit, steady[0][1])] if steady else []
+    said += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
+    return Alternatives(tuple(name for _, name in sorted(found)), '; '.join(said))
+
+
+def sigmas_of(fit: Calibration, other: Calibration) -> float:
+    """Return by how many standard deviations a fit is better than another one of the same dwells."""
+    return math.sqrt(max(other.misfit - fit.misfit, 0.0))
+
+
+def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
+    """Give fits with another steady effect in place of one."""
+    if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects:
+        return  # the curve would be without its slope
+    for other in STEADY.values():
+        swapped = None if other in fit.effects else tried(fit, swapped_effects(fit.effects, effect, other))
+        if swapped is not None:
+            yield swapped
+
+
+def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
+    """Give causes that are no effects of rate and temperature, with the columns that dwells have of them: each is tried alone."""
+    rate, order = fit.dwells.rate, np.arange(len(fit.dwells)) / len(fit.dwells)
+    if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
+        yield 'rate_ramp', [order]
+        yield 'warm_up', [np.exp(-order / time_constant) for time_constant in (0.05, 0.1, 0.2, 0.5)]
+    if effect in (CUBIC_NONLINEARITY, SINE_RESPONSE):
+        limits = np.abs(rate).max() * np.linspace(0.5, 0.98, 25)
+        assert SATURATION.distortion is not None
+        yield 'saturation', [SATURATION.distortion(rate, order, limit) - rate for limit in limits.tolist()]
+
+
+def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
+    """Return by how many standard deviations an effect is better than the best of some columns with a free factor."""
+    used = take(fit.dwells, fit.scatter.kept)
+    rest = [term for term in fit.terms if term.effect is not effect]
+    whitener = Whitener(used, fit.scatter)
+    error, known = whitener.whiten(_error(fit, effect)), whitener.whiten(columns_of(used, rest))
+    best = min(_misfit(np.column_stack([known, whitener.whiten(column[fit.scatter.kept])]), error) for column in columns)
+    return math.sqrt(max(best - fit.misfit, 0.0))
+
+
+def _error(fit: Calibration, effect: Effect) -> Array:
+    """Return the residual with what one effect explains, rad/s, of the dwells that are fitted."""
+    term = next(each for each in fit.terms if each.effect is effect)
+    return (fit.residual + term.error(channels_of(fit.dwells)))[fit.scatter.kept]
+
+
+def _misfit(columns: Array, error: Array) -> float:
+    lengths = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(lengths > 0.0, lengths, 1.0)
+    return float(np.sum((error - columns @ np.linalg.lstsq(columns, error, rcond=None)[0]) ** 2))
+
+
+# what would part them
+
+def _menu(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
+    """Give sweeps that may be added, the easiest first: in words, their rates, and their temperature."""
+    fastest = float(np.abs(fit.dwells.rate).max())
+    middle = fit.model.reference_temperature
+    slow = fastest * np.array([0.0, 0.02, 0.05, 0.1, 0.2])
+    yield 'two dwells each way at 2, 5, 10 and 20 % of the fastest rate, and rests', np.tile([*slow, *-slow], 2), middle
+    for factor in np.arange(1.0, 3.0, 0.05).tolist():
+        rate = factor * fastest
+        yield f'two dwells each way at {rate / DEGREE:.0f} deg/s', np.array([rate, rate, -rate, -rate]), middle
+    yield from _thermal(fit, fastest)
+
+
+def _thermal(fit: Calibration, fastest: float) -> Iterator[tuple[str, Array, float]]:
+    if fit.dwells.temperature is None:
+        return
+    low, high = float(fit.dwells.temperature.min()), float(fit.dwells.temperature.max())
+    rates = np.repeat(fastest * np.linspace(-1.0, 1.0, 9), 2)
+    for beyond in (0.0, 5.0, 10.0, 20.0, 30.0):
+        for temperature in (high + beyond, low - beyond):
+            yield f'a sweep of 18 dwells at {temperature:.0f} degC', rates, temperature
+
+
+def _experiment(fit: Calibration, other: Calibration) -> str:
+    """Return the easiest sweep that would part two fits, or the best one, in words."""
+    tried_sweeps = []
+    for words, rates, temperature in _menu(fit):
+        sigmas = separation(fit, other, rates, temperature)
+        tried_sweeps.append((sigmas, words))
+        if sigmas >= _AIM:
+            break
+    sigmas, words = max(tried_sweeps)
+    return f'add {words}: that parts them by {sigmas:.1f} standard deviations' + ('' if sigmas >= _AIM else ', and repeat it')

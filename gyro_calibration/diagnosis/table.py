@@ -1,0 +1,304 @@
+"""
+The diagnosis of a rate table, a log without time whose rows are dwells: what the simulation gets wrong, why, and what is won.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from gyro_calibration.calibration import Calibration, columns_of, fit_effects
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.door import refuse
+from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, model_after, model_before, name_causes, seen, tried
+from gyro_calibration.diagnosis.dwell_gain import WINDOW, curves, measure_gain
+from gyro_calibration.diagnosis.dwell_rest import RATE, SINGLE_RATES, Left, what_is_left
+from gyro_calibration.diagnosis.dwell_sets import alternatives
+from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.dwells import Dwells, from_table, listed, take
+from gyro_calibration.effects import CUBIC_NONLINEARITY, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STEADY, Effect
+from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.noise import Noise
+from gyro_calibration.scatter import SMALLEST_TEMPERATURE_SPREAD, Uncertainty
+from gyro_calibration.selection import supported_effects, swapped_effects
+
+#: Parts of the false-alarm rate: of structure without a name, and of outlying dwells; the rest is that of causes.
+_LEFT, _OUTLYING = 0.2, 0.05
+#: An effect of the smallest size that is said is found with this probability.
+_POWER = 0.95
+#: A name is withdrawn where more than this part of what it explains is left along the same variable.
+_WITHDRAWN = 0.1
+
+
+def diagnose_table(table: Log | Dwells, model: GyroModel | None, generator: np.random.Generator, rate: float = 0.01) -> Diagnosis:
+    """
+    Say what a simulation gets wrong of the dwells of a rate table.
+
+    Parameters
+    ----------
+    table : a log without time, or its dwells
+    model : that is put to the test; an ideal gyro with the bias and scale factor that fit best where it is None
+    generator : source of the bootstrap
+    rate : of false alarms, a table
+
+    Raises
+    ------
+    DataRefused : the dwells do not allow an answer
+
+    """
+    dwells = table if isinstance(table, Dwells) else from_table(table)
+    refuse(_as_log(dwells), model)
+    _refuse_one_rate(dwells)
+    record = inspect(_as_log(dwells), model)
+    dwells = replace(dwells, output=dwells.output * record.factor)
+    known = _conclude(dwells, model, rate)
+    gain = measure_gain(dwells, lambda part: _models(part, model, rate, known.withdrawn), generator) if known.named.causes else None
+    before = model_before(dwells, model, known.named)
+    offered = bool(known.named.causes) and not (gain is not None and gain.worse)
+    after = model_after(dwells, model, known.named) if offered else before
+    findings = (*record.findings, *_outliers(dwells, known.named.fit, _OUTLYING * rate), *_findings(known.named))
+    return Diagnosis(
+        findings, known.left.found, Noise(), Noise() if model is None else model.noise, gain, before, _noted(after, findings, before),
+        _cannot_show(dwells), curves(dwells, known.named.fit.scatter, before, after),
+        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)), false_alarm_rate=rate)
+
+
+def _as_log(dwells: Dwells) -> Log:
+    return Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
+
+
+def _refuse_one_rate(dwells: Dwells) -> None:
+    if not np.ptp(dwells.rate) > 0.0:
+        raise DataRefused('all dwells have one rate, so that nothing tells the scale factor from the bias; record several rates, both ways')
+
+
+# the steps
+
+@dataclass(frozen=True)
+class _Known:
+    """What dwells show: named causes, and what is left."""
+
+    named: Named
+    left: Left
+    withdrawn: frozenset[str] = frozenset()
+
+
+def _conclude(dwells: Dwells, model: GyroModel | None, rate: float) -> _Known:
+    """Name causes, and withdraw names along a variable where much has none."""
+    named = name_causes(dwells, model, rate)
+    left = what_is_left(named.fit, _LEFT * rate)
+    withdrawn = frozenset(effect.name for effect in named.causes if effect not in NUISANCES and _doubtful(named, left, effect))
+    if not withdrawn:
+        return _Known(named, left)
+    named = name_causes(dwells, model, rate, withdrawn)
+    return _Known(named, what_is_left(named.fit, _LEFT * rate), withdrawn)
+
+
+def _doubtful(named: Named, left: Left, effect: Effect) -> bool:
+    """Tell whether the structure that is left along its variable is not small beside what the effect explains."""
+    along, explained = CAUSES[effect.name].along, _strength(named.change, named.changed(effect))
+    return max((gain for name, gain in left.misfit.items() if along in name.split('_times_')), default=0.0) > _WITHDRAWN * explained
+
+
+def _models(dwells: Dwells, model: GyroModel | None, rate: float, withdrawn: frozenset[str]) -> tuple[GyroModel, GyroModel]:
+    """Return the simulation before and the extended one, of causes chosen anew from some dwells."""
+    named = name_causes(dwells, model, rate, withdrawn)
+    return model_before(dwells, model, named), model_after(dwells, model, named)
+
+
+def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
+    """Give outlying dwells, if the farthest is beyond chance beside what is fitted to the others."""
+    outlying = np.flatnonzero(~fit.scatter.kept)
+    if not len(outlying) or fit.freedom < 1:
+        return
+    far = np.abs(fit.residual[outlying]) / _total_deviation(fit)[outlying]
+    chance = min(1.0, len(dwells) * 2.0 * float(student.sf(far.max(), fit.freedom)))
+    if chance < level:
+        cause, count = CAUSES['outliers'], float(len(outlying))
+        places = listed([dwells.place[row] for row in outlying])
+        yield Finding('outliers', cause.sentence.replace('samples', 'dwells'), {'outliers': Estimate(count, (count, count), '1')}, chance,
+                      evidence=f'{len(outlying)} of {len(dwells)} dwells are up to {far.max():.0f} standard deviations off what the others '
+                      f'say: {places}', along=RATE)
+
+
+def _total_deviation(fit: Calibration) -> Array:
+    """Return the standard deviation of each dwell with what its sweep shares, rad/s, shape (n,)."""
+    shared = fit.scatter.shared(fit.dwells)
+    return np.asarray(np.sqrt(fit.scatter.deviation(fit.dwells) ** 2 + np.sum(shared ** 2, axis=1)))
+
+
+# findings
+
+def _findings(named: Named) -> list[Finding]:
+    """Return the named causes, the strongest first."""
+    strengths = {effect: _strength(named.change, named.changed(effect)) for effect in named.causes}
+    return [_finding(named, effect) for effect in sorted(named.causes, key=lambda each: -strengths[each])]
+
+
+def _strength(fit: Calibration, effect: Effect) -> float:
+    """Return by what the sum of squares falls with an effect."""
+    rest = _rest(fit, effect)
+    return math.inf if rest is None else rest.misfit - fit.misfit
+
+
+def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
+    """Fit all but one effect."""
+    return tried(fit, [each for each in fit.effects if each is not effect])
+
+
+def _finding(named: Named, effect: Effect) -> Finding:
+    cause, others = CAUSES[effect.name], alternatives(named.fit, effect)
+    along = 'temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE else cause.along
+    return Finding(effect.name, cause.sentence, _estimates(named.fit, effect), named.chance_of(effect), _smallest(named, effect),
+                   others.names, others.separate_by, _evidence(named.change, named.changed(effect)), along)
+
+
+def _estimates(fit: Calibration, effect: Effect) -> dict[str, Estimate]:
+    """Return the values of an effect; 1.96 standard deviations hold 95 %."""
+    term, deviations = _with_deviations(fit, effect)
+    return {effect.parameters[place].name: _estimate(term.values[place], deviation, effect.parameters[place].unit)
+            for place, deviation in zip(term.fitted, deviations)}
+
+
+def _estimate(value: float, deviation: float, unit: str) -> Estimate:
+    return Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)
+
+
+def _with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float]]:
+    """Return the term of an effect, and the standard deviations of its fitted values."""
+    owners = [each for each in fit.terms for _ in each.fitted]
+    term = next(each for each in fit.terms if each.effect is effect)
+    covariance = fit.model.covariance
+    deviations = np.full(len(owners), math.nan) if covariance is None else np.sqrt(np.diag(covariance))
+    return term, [float(deviation) for owner, deviation in zip(owners, deviations) if owner is term]
+
+
+def _smallest(named: Named, effect: Effect) -> float | None:
+    """Return the size from which an effect is found, in the unit of its first value."""
+    change, level = named.changed(effect), named.level_of(effect)
+    if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
+        return _found_from(named.change, change, level)
+    # A small sine response is found as what it begins with, -k² w³ / 6.
+    cubic = tried(named.change, swapped_effects(named.change.effects, change, CUBIC_NONLINEARITY))
+    if cubic is None:
+        return None
+    size = _found_from(cubic, CUBIC_NONLINEARITY, level)
+    return size if effect is CUBIC_NONLINEARITY else math.sqrt(6.0 * size)
+
+
+def _found_from(fit: Calibration, effect: Effect, level: float) -> float:
+    """Return what a value must be for its estimate to be beyond chance, of which few sweeps show much, with a probability of 95 %."""
+    used = take(fit.dwells, fit.scatter.kept)
+    place = [term.effect for term in fit.terms for _ in term.fitted].index(effect)
+    uncertain = Uncertainty.of(used, fit.scatter, columns_of(used, fit.terms), fit.residual[fit.scatter.kept])
+    deviation = math.sqrt(float(np.tensordot(uncertain.weights, uncertain.covariances, axes=1)[place, place]))
+
+    def excess(sigmas: float) -> float:
+        outside = uncertain.below(-sigmas * deviation)[place] + 1.0 - uncertain.below(sigmas * deviation)[place]
+        return float(outside) - level
+
+    return deviation * (float(brentq(excess, 0.1, 1e3)) + float(norm.ppf(_POWER)))
+
+
+def _evidence(fit: Calibration, effect: Effect) -> str:
+    rest = _rest(fit, effect)
+    if rest is None:
+        return ''
+    sigmas = math.sqrt(max(rest.misfit - fit.misfit, 0.0))
+    return (f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} deg/s, with it to '
+            f'{fit.left_out_rms / DEGREE:.3g} deg/s; it stands out by {sigmas:.1f} standard deviations')
+
+
+# what a person should know
+
+def _noted(model: GyroModel, findings: tuple[Finding, ...], before: GyroModel) -> GyroModel:
+    """Return the extended model with what it does not tell apart, for its file."""
+    notes = [f'{found.effect} is used; it may be {" or ".join(found.ambiguous_with)} instead' for found in findings if found.ambiguous_with]
+    return model if model is before or not notes else replace(model, origin={**model.origin, 'ambiguous': notes})
+
+
+def _remarks(dwells: Dwells, model: GyroModel | None, known: _Known, gain: Gain | None, offered: bool) -> Iterator[str]:
+    fit = known.named.fit
+    if known.withdrawn:
+        yield f'No name is given to {", ".join(sorted(known.withdrawn))}, for along the same variable much is left that has none.'
+    if known.named.causes and not offered:
+        yield 'The extension predicts left-out dwells worse than the simulation, so that it is not offered.'
+    if gain is not None:
+        yield f'Heading errors are those that the error of a dwell makes in {WINDOW:g} s at its rate.'
+    if any(each.along == SINGLE_RATES for each in known.left.found):
+        yield 'What repeats at single rates may be of the table, or of the place within a sweep where all sweeps have the same order.'
+    yield _scatter_said(fit)
+    if model is not None:
+        yield from _of_model(dwells, model, fit)
+
+
+def _scatter_said(fit: Calibration) -> str:
+    scatter = fit.scatter
+    return (f'Dwells scatter by {scatter.dwell / DEGREE:.2g} deg/s and {100.0 * scatter.dwell_scale:.2g} % of the rate, sweeps by '
+            f'{scatter.sweep_bias / DEGREE:.2g} deg/s in bias and {100.0 * scatter.sweep_scale:.2g} % in scale factor.')
+
+
+def _of_model(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterator[str]:
+    """Say what of a model dwells cannot test, and whether named effects would do what its polynomial does."""
+    known = seen(model)
+    unseen = [term.effect.name for term in model.terms if term not in known]
+    if unseen:
+        yield f'Dwells without time do not show {", ".join(unseen)}; they are left as the model has them.'
+    if any(term.effect.looks_at & {'temperature'} for term in known) and dwells.temperature is None:
+        yield f'The table holds no temperature; the model is simulated at {model.reference_temperature:g} degC.'
+    if any('output' in term.effect.looks_at for term in known):
+        yield from _beside_polynomial(dwells, known)
+
+
+def _beside_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
+    named, _ = supported_effects(dwells)
+    try:
+        polynomial = fit_effects(dwells, [term.effect for term in known if 'output' in term.effect.looks_at], named.scatter)
+    except DataRefused:
+        return
+    effects = ', '.join(effect.name for effect in named.effects)
+    yield (f'{effects} alone, {_values(named)} values, predict left-out sweeps to {named.left_out_rms / DEGREE:.3g} deg/s; a polynomial '
+           f'of the orders that the model has, {_values(polynomial)} values, to {polynomial.left_out_rms / DEGREE:.3g} deg/s.')
+
+
+def _values(fit: Calibration) -> int:
+    return sum(len(term.fitted) for term in fit.terms)
+
+
+# what cannot be shown
+
+_AVERAGED = 'a dwell is a mean at a steady rate; record samples with their time'
+_NO_TIME = 'a table without time does not tell what changes with it; record a log in time'
+_REASONS = {
+    **dict.fromkeys(('bandwidth', 'time_offset', 'clock_rate', 'reference_slip'),
+                    'at steady rates nothing changes that could come late; record fast reversals in time'),
+    **dict.fromkeys(('bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis', 'warm_up', 'rate_ramp', 'bias_step'), _NO_TIME),
+    **dict.fromkeys(('interference_tone', 'quantization', 'dead_zone', 'saturation', 'stuck_samples', 'dropped_samples',
+                     'angle_random_walk', 'bias_instability', 'rate_random_walk'), _AVERAGED),
+    **dict.fromkeys(('heading_sensitivity', 'reference_once_per_rev', 'reference_quantization'),
+                    'the table holds no heading, and whole turns average over all; record reference_heading_deg in time'),
+    **dict.fromkeys(('acceleration_sensitivity', 'vibration_rectification'),
+                    'the table holds no specific force; record acceleration_mps2 in several poses'),
+    'supply_sensitivity': 'the table holds no supply voltage; record supply_v',
+    'reference_scale': 'only a second reference tells the scale of the first from that of the gyro'}
+
+
+def _cannot_show(dwells: Dwells) -> dict[str, str]:
+    """Return the causes that the table cannot show, with the reasons."""
+    found = {name: _REASONS[name] for name in CAUSES if name in _REASONS}
+    thermal = [name for name, effect in STEADY.items() if 'temperature' in effect.looks_at]
+    if dwells.temperature is None:
+        return {**found, **dict.fromkeys(thermal, 'the table holds no temperature; record temperature_degc')}
+    if np.ptp(dwells.temperature) < SMALLEST_TEMPERATURE_SPREAD:
+        return {**found, **dict.fromkeys(thermal, f'the temperature varies by {np.ptp(dwells.temperature):.2g} K only; repeat the rates '
+                                         'at another temperature')}
+    return found
