@@ -24,6 +24,8 @@ from .noise import NoiseFigures, draw_figures, make
 from .outside import OUTSIDE
 from .size import DETECTABLE, Metric, solve_noise, solve_size
 
+#: Recordings -> name of an effect -> what of it is not to be random.
+Given = Callable[[list[Session]], Mapping[str, Shapes]]
 ALL: Mapping[str, Form] = {**FORMS, **OUTSIDE}
 #: Share of an effect outside the catalogue that no effect in it may explain, and how often its shapes are drawn for that.
 MOST_ALIKE = 0.25
@@ -171,8 +173,7 @@ class HiddenLog:
 def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, *, noise: str = 'mixed',
          reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0, runs: int = 1, encoder_step: float = 0.0,
          figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None,
-         shapes: Callable[[list[Session]], Mapping[str, Shapes]] | None = None, against_a_model: bool = False,
-         signs: Mapping[str, float] | None = None) -> list[HiddenLog]:
+         given: Given | None = None, against_a_model: bool = False) -> list[HiddenLog]:
     """
     Hide effects in recordings of a random gyro under random conditions.
 
@@ -182,15 +183,15 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     multiple : of the minimum detectable effect, one for all or by name
     generator : source of all that is random
     noise : white, walk, flicker, gauss_markov or mixed (random walk, Gauss-Markov process, and flicker in every other)
-    reference : rate or heading
+    reference : rate, heading or both
     duration, sample_rate : of each recording, s and Hz
     runs : recordings of the one gyro, each after a power-on of its own
     encoder_step : of a reference heading, rad; 0 is a heading without steps
     figures : the noise instead of a random one
     conditions : words for `session`: motion, temperature, supply, force, top_rate
-    shapes : recordings -> name of an effect -> its shapes, where they are not to be random
+    given : recordings -> name of an effect -> what of it is not to be random: its shapes, its 'sign', or its 'size' in SI, which then has
+        the multiple that it has
     against_a_model : a model is known that says bias and scale, so that they hide nothing
-    signs : of sizes, by name, where they are not to be random
 
     Returns
     -------
@@ -200,14 +201,14 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     sessions = [session(generator, duration, sample_rate, **(conditions or {})) for _ in range(runs)]
     expected = figures or draw_figures(noise, generator)
     gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step,
-                      shapes(sessions) if shapes else {}, ('bias', 'scale') if against_a_model else (), signs)
+                      given(sessions) if given else {}, ('bias', 'scale') if against_a_model else ())
     return [record(gyro, each, generator, expected=expected, reference=reference, encoder_step=encoder_step, run=run)
             for run, each in enumerate(sessions)]
 
 
 def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, sessions: list[Session],
-              expected: NoiseFigures, encoder_step: float = 0.0, shapes: Mapping[str, Shapes] | None = None,
-              known: tuple[str, ...] = (), signs: Mapping[str, float] | None = None) -> Gyro:
+              expected: NoiseFigures, encoder_step: float = 0.0, given: Mapping[str, Shapes] | None = None,
+              known: tuple[str, ...] = ()) -> Gyro:
     """Draw a gyro whose hidden effects have these multiples of what is just detectable in these recordings."""
     multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
     figures, causes = expected, []
@@ -222,7 +223,7 @@ def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], gener
     gyro = Gyro((), figures, scale, tuple(biases.tolist()), BIAS_SPREAD)
     metric = Metric(sessions, figures, encoder_step)
     sizing = _Sizing(sessions, gyro, metric, known)
-    causes += [_draw_cause(name, multiples[name], generator, sizing, (shapes or {}).get(name), (signs or {}).get(name))
+    causes += [_draw_cause(name, multiples[name], generator, sizing, (given or {}).get(name, {}))
                for name in names if ALL[name].stage != 'noise']
     return replace(gyro, causes=_apart(causes, sizing))
 
@@ -249,15 +250,16 @@ class _Sizing:
         return self.metric.norm(self.errors(name, size, shapes), (*self.known, *of_the_same))
 
 
-def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing, shapes: Shapes | None,
-                sign: float | None) -> Cause:
+def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing, given: Shapes) -> Cause:
     form, sessions = ALL[name], sizing.sessions
     if name in COUNTED or name in STEPPED or name == 'unit_error':
         return _draw_uncommon(name, multiple, generator, sizing)
     if name in OUTSIDE:
         return _draw_outside(name, multiple, generator, sizing)
-    shapes = form.shapes(sessions, generator) if shapes is None else shapes
-    sign = sign or (float(generator.choice([-1.0, 1.0])) if form.signed else 1.0)
+    shapes = {key: value for key, value in given.items() if key not in ('size', 'sign')} or form.shapes(sessions, generator)
+    sign = given.get('sign', float(generator.choice([-1.0, 1.0])) if form.signed else 1.0)
+    if 'size' in given:
+        return Cause(name, given['size'], shapes, form.unit, math.nan, sizing.norm(name, given['size'], shapes) / DETECTABLE)
     if form.linear:
         least = DETECTABLE / sizing.norm(name, 1.0, shapes)
         return Cause(name, sign * multiple * least, shapes, form.unit, least, multiple)
@@ -403,7 +405,8 @@ def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: 
     step = gyro.value('reference_quantization') or encoder_step
     if step:
         return {'reference_heading_rad': np.round(heading / step) * step}
-    return {'reference_rate_rad_s': rate} if kind == 'rate' else {'reference_heading_rad': heading}
+    both = {'reference_rate_rad_s': rate, 'reference_heading_rad': heading}
+    return {name: column for name, column in both.items() if kind == 'both' or kind in name}
 
 
 def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
@@ -445,11 +448,15 @@ def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Gen
     return {name: column[kept] for name, column in columns.items()}, good, kept
 
 
-def _turning_rows(each: Session, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Choose rows while it turns, not in the first or last seconds."""
+def _turning_rows(each: Session, count: int, generator: np.random.Generator, apart: int = 25) -> list[int]:
+    """Choose rows while it turns, not in the first or last seconds, and not close to one another."""
     margin = round(2.0 / each.interval)
-    rows = margin + np.flatnonzero(np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max())
-    return generator.choice(rows, count, replace=False)
+    rows = generator.permutation(margin + np.flatnonzero(np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max()))
+    chosen: list[int] = []
+    for row in rows:
+        if len(chosen) < count and all(abs(row - other) > apart for other in chosen):
+            chosen.append(int(row))
+    return chosen
 
 
 def _expected(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:

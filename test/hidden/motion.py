@@ -167,8 +167,8 @@ def _ramp(generator: np.random.Generator, top: float) -> np.ndarray:
 
 
 def _slow_sweep(generator: np.random.Generator, top: float) -> np.ndarray:
-    high = 0.05 * top * generator.uniform(0.5, 2.0)
-    return np.linspace(-high, high, _length(generator, 10.0, 20.0)) * generator.choice([-1.0, 1.0])
+    high = top * np.exp(generator.uniform(np.log(0.002), np.log(0.1)))
+    return np.linspace(-high, high, _length(generator, 10.0, 25.0)) * generator.choice([-1.0, 1.0])
 
 
 def _reversals(generator: np.random.Generator, top: float) -> np.ndarray:
@@ -296,8 +296,8 @@ SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _
 def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tilt between poses, slowly, and vibrate while a motor runs, which it does at rest and in motion."""
     edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(8, 15)))
-    poses = generator.uniform(-np.pi / 3.0, np.pi / 3.0, len(edges) + 1)
-    angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 4.0), time[1] - time[0], 4.0)
+    poses = generator.uniform(-0.7 * np.pi, 0.7 * np.pi, len(edges) + 1)
+    angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 8.0), time[1] - time[0], 8.0)
     starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
     levels = generator.choice([0.0, 1.0], len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
     return GRAVITY * np.cos(angle), _vibration(generator, time, levels[np.searchsorted(starts, time)])

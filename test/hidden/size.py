@@ -93,20 +93,39 @@ def solve_size(norm: Callable[[float], float], wanted: float, first: float, most
     most : the largest size
 
     """
-    low = high = min(first, most)
-    value = norm(high)
-    while value < wanted:
+    guess = min(first, most)
+    quick = _by_powers(norm, wanted, guess, most)
+    return quick if quick is not None else _by_brackets(norm, wanted, guess, most)
+
+
+def _by_powers(norm: Callable[[float], float], wanted: float, size: float, most: float) -> float | None:
+    """Go along a power of the size, which is the first for most effects; None where the norm is not as smooth as that."""
+    value, power = norm(size), 1.0
+    for _ in range(6):
+        if abs(value / wanted - 1.0) < 3e-3:
+            return size
+        if not value:
+            return None
+        further = min(most, size * (wanted / value) ** (1.0 / power))
+        if further == size:
+            return size
+        farther = norm(further)
+        power = float(np.clip(math.log((farther + 1e-300) / value) / math.log(further / size), 0.5, 4.0))
+        size, value = further, farther
+    return None
+
+
+def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float, most: float) -> float:
+    low = high = guess
+    while norm(high) < wanted:
         if high >= most:
             return most
-        low, high = high, min(most, high * min(10.0, max(2.0, 1.2 * wanted / max(value, 1e-9))))
-        value = norm(high)
+        low, high = high, min(most, 3.0 * high)
     while norm(low) > wanted:
-        low, high = low * max(0.1, min(0.5, 0.8 * wanted / value)), low
-        value = norm(low)
-    if low == high:
-        return low
-    return math.exp(brentq(lambda logarithm: math.log((norm(math.exp(logarithm)) + 1e-9) / wanted), math.log(low), math.log(high),
-                           xtol=3e-3, rtol=1e-6))
+        low, high = 0.3 * low, low
+    # a little wider, as an end may by chance be the answer
+    low, high = math.log(low) - 1e-3, math.log(high) + 1e-3
+    return math.exp(brentq(lambda size: math.log(norm(math.exp(size)) / wanted + 1e-9), low, high, xtol=3e-3, rtol=1e-6))
 
 
 def solve_noise(changed: Callable[[float], NoiseFigures], expected: NoiseFigures, wanted: float, sessions: list[Session],

@@ -5,13 +5,13 @@ Twins: conditions under which two causes cannot be told apart, and those under w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from .effects import Shapes
-from .log import HiddenLog, hide, record
+from .log import Given, HiddenLog, hide, record
 from .motion import Session, session
 from .noise import NoiseFigures
 
@@ -25,22 +25,20 @@ class Twins:
     ----------
     alike : words for `session`, so that they cannot be parted
     apart : words for `session`, so that they can; None where no recording with this reference can
-    shapes : recordings -> shapes of effects, where only these are alike
+    given : recordings -> shapes and signs of effects, where only these are alike
     multiple : of the minimum detectable effect, at which they are alike there and parted here
     figures : of a gyro whose noise makes it so; any where it is None
     longer : the parting recording is so many times as long
-    signs : of sizes, by name, where the twin has that sign alone
     against_a_model : they show only beside a model that knows bias and scale
 
     """
 
     alike: Mapping[str, object]
     apart: Mapping[str, object] | None
-    shapes: Callable[[list[Session]], Mapping[str, Shapes]] | None = None
+    given: Given | None = None
     multiple: float = 4.0
     figures: NoiseFigures | None = None
     longer: float = 1.0
-    signs: Mapping[str, float] | None = None
     against_a_model: bool = False
 
 
@@ -60,6 +58,14 @@ def _quickly(sessions: list[Session]) -> Mapping[str, Shapes]:
     return {'thermal_lag': {'time_constant': 0.01 * float(sessions[0].time[-1])}}
 
 
+def _as_a_sine(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'cubic_nonlinearity': {'sign': -1.0}}
+
+
+def _late(sessions: list[Session]) -> Mapping[str, Shapes]:
+    return {'time_offset': {'sign': 1.0}}
+
+
 TWINS: Mapping[tuple[str, str], Twins] = {
     ('bias_temperature', 'rate_ramp'): Twins({'temperature': 'ramp'}, {}),
     ('bias_temperature', 'warm_up'): Twins({'temperature': 'cold_start'}, {}, _as_the_cold_start),
@@ -69,10 +75,9 @@ TWINS: Mapping[tuple[str, str], Twins] = {
     ('scale_factor_asymmetry', 'vibration_rectification'): Twins({'motion': 'two_way', 'force': 'turning'}, {}),
     ('quadratic_nonlinearity', 'acceleration_sensitivity'): Twins({'force': 'off_axis'}, {}),
     ('cubic_nonlinearity', 'sine_response'): Twins(
-        {'motion': 'slow'}, {'top_rate': 3.0}, figures=NoiseFigures(2e-5), signs={'cubic_nonlinearity': -1.0}),
+        {'motion': 'slow'}, {'top_rate': 3.0}, _as_a_sine, figures=NoiseFigures(2e-5)),
     ('time_offset', 'bandwidth'): Twins(
-        {'motion': 'smooth', 'top_rate': 2.0}, {'top_rate': 3.0}, multiple=20.0, figures=NoiseFigures(5e-4),
-        signs={'time_offset': 1.0}),
+        {'motion': 'smooth', 'top_rate': 2.0}, {'top_rate': 3.0}, _late, multiple=20.0, figures=NoiseFigures(5e-4)),
     ('bias_temperature_rate', 'thermal_lag'): Twins({'temperature': 'smooth'}, {'temperature': 'triangles'}, _quickly),
     ('bias_temperature_rate', 'thermal_hysteresis'): Twins({'temperature': 'triangles'}, {}),
     ('bias_step', 'thermal_hysteresis'): Twins({'temperature': 'triangle'}, {}, _at_the_turn),
@@ -100,8 +105,7 @@ def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *, 
     """
     twins = TWINS[pair]
     return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration, sample_rate=sample_rate,
-                figures=twins.figures, conditions=twins.alike, shapes=twins.shapes, against_a_model=twins.against_a_model,
-                signs=twins.signs)[0]
+                figures=twins.figures, conditions=twins.alike, given=twins.given, against_a_model=twins.against_a_model)[0]
 
 
 def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) -> HiddenLog:
