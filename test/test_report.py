@@ -263,6 +263,15 @@ def test_a_set_is_named_with_the_experiment_that_parts_it():
     assert 'To part them: heat and cool the gyro within one log.' in text
 
 
+def test_among_several_causes_a_set_is_in_brackets():
+    assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
+
+
+def test_a_diagnosis_of_another_kind_says_how_it_was_computed_and_leaves_out_what_it_did_not_measure():
+    text = Page(report(replace(adequate(), method='the dwells of a table were fitted', noise=Noise(), simulated=Noise()))).text
+    assert 'The dwells of a table were fitted.' in text and 'replayed' not in text and 'angle random walk' not in text.split('The model')[0]
+
+
 def test_sizes_are_in_the_units_of_people():
     text = ' '.join(lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text

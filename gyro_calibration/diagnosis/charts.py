@@ -182,9 +182,13 @@ def _grid(chart: Chart, across: _Axis, up: _Axis) -> Iterator[Markup]:
         y = float(up.place(np.array(value)))
         yield element('line', x1=_LEFT, x2=_RIGHT, y1=y, y2=y, class_='zero' if value == 0.0 else 'grid')
         yield element('text', label, x=_LEFT - 5.0, y=y + 4.0, text_anchor='end')
-    yield element('text', f'{chart.across} [{chart.across_unit}]', x=0.5 * (_LEFT + _RIGHT), y=_HEIGHT - 6.0, text_anchor='middle',
+    yield element('text', _labelled(chart.across, chart.across_unit), x=0.5 * (_LEFT + _RIGHT), y=_HEIGHT - 6.0, text_anchor='middle',
                   class_='label')
-    yield element('text', f'{chart.up} [{chart.up_unit}]', x=4.0, y=13.0, class_='label')
+    yield element('text', _labelled(chart.up, chart.up_unit), x=4.0, y=13.0, class_='label')
+
+
+def _labelled(name: str, unit: str) -> str:
+    return f'{name} [{unit}]' if unit else name
 
 
 def _line(line: Line, at: Array, up: _Axis, shown: Mask) -> Markup:
@@ -239,7 +243,7 @@ def _table(chart: Chart) -> Markup:
 
 
 def _head(name: str, unit: str) -> Markup:
-    return element('th', f'{name} [{unit}]', scope='col', data_name=name, data_unit=unit)
+    return element('th', _labelled(name, unit), scope='col', data_name=name, data_unit=unit)
 
 
 def _value(line: Line, row: int) -> str:

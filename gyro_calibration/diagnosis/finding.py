@@ -202,6 +202,7 @@ class Diagnosis:
     remarks : what a person should know, one sentence each (what was filled, held back, chosen)
     false_alarm_rate : of the whole diagnosis, a log
     logs : names of the files
+    method : how it was computed, for people; where it is empty, as a log in time is
 
     """
 
@@ -220,6 +221,7 @@ class Diagnosis:
     false_alarm_rate: float = 0.01
     logs: tuple[str, ...] = ()
     trace: Trace | None = None
+    method: str = ''
 
     @property
     def verdict(self) -> str:

@@ -31,6 +31,7 @@ from gyro_calibration.diagnosis.words import (
 )
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model_file import model_text
+from gyro_calibration.noise import Noise
 
 #: Of a curve, so many points are drawn at most, four to a part: its ends and its extremes stay.
 _PARTS = 90
@@ -90,7 +91,8 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     yield _section('Causes', [_cause(place, found, diagnosis) for place, found in enumerate(diagnosis.findings, 1)])
     yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])] if diagnosis.unexplained else [])
     yield _section('What is won', _gain(diagnosis))
-    yield _section('Noise', _noise(diagnosis))
+    measured = diagnosis.noise_curve is not None or diagnosis.noise != Noise()
+    yield _section('Noise', _noise(diagnosis) if measured else [])
     rest = others if guilty else []
     yield _section('Along the other variables', [_pairs(draw(_residual(curve, place)) for place, curve in rest)] if rest else [])
     yield _section('What these data cannot show', [_reasons(diagnosis)] if diagnosis.cannot_show else [])
@@ -325,6 +327,7 @@ def _model(diagnosis: Diagnosis) -> Iterator[Markup]:
 
 def _method(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
-    yield element('p', ' '.join(_METHOD).format(logs=logs, share=f'{100.0 * diagnosis.false_alarm_rate:.2g} %'))
+    share = f'{100.0 * diagnosis.false_alarm_rate:.2g} %'
+    yield element('p', sentence(diagnosis.method) or ' '.join(_METHOD).format(logs=logs, share=share))
     yield _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None
     yield element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')

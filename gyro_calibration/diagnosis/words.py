@@ -55,18 +55,19 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
 def _named(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
         more = [f'{len(findings) - _NAMED} more'] if len(findings) > _NAMED else []
-        return f'{len(findings)} causes: ' + listed([alternatives(each) for each in findings[:_NAMED]] + more)
+        return f'{len(findings)} causes: ' + listed([_beside_others(each) for each in findings[:_NAMED]] + more)
     (found,) = findings
     size = next(iter(sizes(found).values()), None)
     if not found.ambiguous_with:
         return spoken(found.effect) + ('' if size is None else f': {size}')
     taken = '' if size is None else f'; taken as {spoken(found.effect)} it is {size}'
-    return f'{alternatives(found)}, which these data cannot tell apart{taken}'
+    names = listed([spoken(name) for name in (found.effect, *found.ambiguous_with)], 'or')
+    return f'{names}, which these data cannot tell apart{taken}'
 
 
-def alternatives(found: Finding) -> str:
-    """Return the names of a cause and of those that the data cannot rule out instead."""
-    return listed([spoken(name) for name in (found.effect, *found.ambiguous_with)], 'or')
+def _beside_others(found: Finding) -> str:
+    others = listed([spoken(name) for name in found.ambiguous_with], 'or')
+    return spoken(found.effect) + (f' (or {others})' if others else '')
 
 
 def sizes(found: Finding) -> dict[str, Quantity]:
