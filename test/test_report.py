@@ -272,6 +272,12 @@ def test_a_diagnosis_of_another_kind_says_how_it_was_computed_and_leaves_out_wha
     assert 'The dwells of a table were fitted.' in text and 'replayed' not in text and 'angle random walk' not in text.split('The model')[0]
 
 
+def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
+    whole = extended()
+    text = report(replace(whole, model=whole.before, gain=None, findings=(), unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
+    assert 'data-name="after"' in report(whole) and 'data-name="after"' not in text and 'as extended' not in text
+
+
 def test_sizes_are_in_the_units_of_people():
     text = ' '.join(lines(several()))
     assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text

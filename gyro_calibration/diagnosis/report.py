@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from string import Template
 
@@ -56,8 +57,17 @@ def report(diagnosis: Diagnosis) -> str:
     """Return the page, HTML in UTF-8."""
     template = Template(Path(__file__).with_name('report.html').read_text(encoding='utf-8'))
     title = ', '.join(map(clean, diagnosis.logs)) or 'gyro'
+    diagnosis = diagnosis if offered(diagnosis) else _as_it_was(diagnosis)
     body = joined(_header(diagnosis), element('main', *_sections(diagnosis)))
     return template.substitute(title=element('title', f'Diagnosis of {title}'), body=body)
+
+
+def _as_it_was(diagnosis: Diagnosis) -> Diagnosis:
+    """Return the diagnosis with nothing drawn as after an extension, for there is none."""
+    heading, trace = diagnosis.heading, diagnosis.trace
+    return replace(diagnosis, curves=[replace(curve, after=curve.before) for curve in diagnosis.curves],
+                   heading=None if heading is None else replace(heading, after=heading.before),
+                   trace=None if trace is None else replace(trace, extended=trace.simulated))
 
 
 def _header(diagnosis: Diagnosis) -> Markup:
@@ -90,7 +100,7 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     yield _section('Simulation and measurement', _misfit(diagnosis, guilty or others))
     yield _section('Causes', [_cause(place, found, diagnosis) for place, found in enumerate(diagnosis.findings, 1)])
     yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])] if diagnosis.unexplained else [])
-    yield _section('What is won', _gain(diagnosis))
+    yield _section('What is won' if diagnosis.gain is not None else 'Heading', _gain(diagnosis))
     measured = diagnosis.noise_curve is not None or diagnosis.noise != Noise()
     yield _section('Noise', _noise(diagnosis) if measured else [])
     rest = others if guilty else []
@@ -156,9 +166,20 @@ def _trace(trace: Trace) -> Iterator[Chart]:
     lines = [Line('measured', 'measured', factor * measured), Line('simulated', 'simulated', factor * simulated)]
     yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time', 's', time, 'output', unit, lines)
     unit, factor = _rate_unit(measured - simulated)
-    lines = [Line('before', 'before', factor * (measured - simulated)), Line('after', 'after', factor * (measured - extended))]
-    yield Chart('difference', 'Measured less simulated', 'What the simulation leaves over time, before and after the extension.',
-                'time', 's', time, 'residual', unit, lines)
+    lines = _before_and_after(factor * (measured - simulated), factor * (measured - extended))
+    yield Chart('difference', 'Measured less simulated', f'What the simulation leaves over time{_when(lines)}.', 'time', 's', time,
+                'residual', unit, lines)
+
+
+def _before_and_after(before: Array, after: Array, deviation: Array | None = None) -> list[Line]:
+    """Return a line for each, or a single one where nothing was changed."""
+    if np.array_equal(before, after, equal_nan=True):
+        return [Line('residual', 'before', before, deviation)]
+    return [Line('before', 'before', before, deviation), Line('after', 'after', after, deviation)]
+
+
+def _when(lines: Sequence[Line]) -> str:
+    return ', before and after the extension' if lines[0].name == 'before' else ''
 
 
 def _across(curve: Curve) -> tuple[str, float]:
@@ -194,18 +215,15 @@ def _residual(curve: Curve, place: int) -> Chart:
         return _spectrum(curve, place)
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     across, scale = _across(curve)
-    named = [('residual', curve.before)] if _same(curve) else [('before', curve.before), ('after', curve.after)]
-    lines = [Line(name, 'after' if name == 'after' else 'before', factor * values, factor * curve.deviation) for name, values in named]
-    along, when = spoken(curve.along), '' if _same(curve) else ', before and after the extension'
-    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}{when}, with bands of '
-                 '95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+    lines = _before_and_after(factor * curve.before, factor * curve.after, factor * curve.deviation)
+    along = spoken(curve.along)
+    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}{_when(lines)}, '
+                 'with bands of 95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
 
 
 def _spectrum(curve: Curve, place: int) -> Chart:
     """Return the amplitudes of the residual over frequency beside those of noise."""
-    lines = [Line('residual' if _same(curve) else 'before', 'before', curve.before / DEGREE)]
-    lines += [] if _same(curve) else [Line('after', 'after', curve.after / DEGREE)]
-    lines.append(Line('usual', 'simulated', curve.deviation / DEGREE))
+    lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE), Line('usual', 'simulated', curve.deviation / DEGREE)]
     return Chart(f'residual-{place}', 'Residual along frequency', 'Largest amplitude of the residual in bands of frequency, and the usual '
                  'one there; a line that stands out is a tone.', 'frequency', 'Hz', curve.at, 'amplitude', 'deg/s', lines, logarithmic=True)
 
@@ -289,9 +307,9 @@ def _gain_table(gain: Gain) -> Markup:
 def _heading(curve: HeadingCurve) -> Chart:
     time, before, after = _thinned(curve.time, curve.before, curve.after)
     unit, factor = span(float(np.ptp(time)) if len(time) else 0.0)
-    lines = [Line('before', 'before', before / DEGREE), Line('after', 'after', after / DEGREE)]
-    return Chart('heading', 'Heading error over the log', 'Error of the heading if the simulation is believed, before and after the '
-                 'extension.', 'time', unit, factor * time, 'heading error', 'deg', lines)
+    lines = _before_and_after(before / DEGREE, after / DEGREE)
+    return Chart('heading', 'Heading error over the log', f'Error of the heading if the simulation is believed{_when(lines)}.', 'time',
+                 unit, factor * time, 'heading error', 'deg', lines)
 
 
 def _noise(diagnosis: Diagnosis) -> Iterator[Markup | None]:
