@@ -272,6 +272,9 @@ def _motions(seen: Reach) -> Iterator[Conditions]:
     slow = 0.1 * top
     yield _plan(seen, 'slow_sweep', f'sweep slowly through zero, between -{_degrees(slow)} and {_degrees(slow)}, for 4 min',
                 rate=[(30.0, slow), *[(60.0, -slow), (60.0, slow)] * 2][:5], settled=True)
+    fastest = max(2.0, 2.0 * math.pi * top / ACCELERATION)
+    yield _plan(seen, 'swings', f'swing evenly to and fro for 2 min at up to {_degrees(top)}, the quickest swings in {fastest:.1f} s',
+                rate=_swings(top, fastest), settled=True)
     gentle = max(0.5, 2.0 * top / GENTLY)
     yield _plan(seen, 'gentle_reversals', f'swing to and fro with reversals within {gentle:.1f} s for 2 min at up to {_degrees(top)}',
                 rate=_reversals(top, gentle, 120.0), settled=True)
@@ -287,6 +290,13 @@ def _motions(seen: Reach) -> Iterator[Conditions]:
     ends = 60.0 * math.ceil(4.0 * seen.duration / 60.0)
     yield _plan(seen, 'reversals_at_both_ends', f'record {ends / 60.0:.0f} min with quick reversals at up to {_degrees(top)} at both ends',
                 rate=[*_reversals(top, ramp, 60.0), (1.0, 0.0), (ends - 121.0, 0.0), *_reversals(top, ramp, 60.0)])
+
+
+def _swings(top: float, fastest: float) -> Pieces:
+    """Swing as a sine does, more and more quickly, for 2 min."""
+    time = np.arange(1.0, 120.0 / 0.05) * 0.05
+    frequency = np.linspace(0.2 / fastest, 1.0 / fastest, len(time))
+    return [(0.05, value) for value in (top * np.sin(2.0 * math.pi * np.cumsum(frequency) * 0.05)).tolist()]
 
 
 def _reversals(top: float, ramp: float, duration: float) -> Pieces:
@@ -325,13 +335,13 @@ def _surroundings(seen: Reach) -> Iterator[Conditions]:
         yield _plan(seen, 'supply_step', f'step the supply between {low:.2f} and {high:.2f} V each minute for 6 min, at one temperature '
                     'and at rest', supply=_held([low, high] * 3, 59.5, 0.5), settled=True, beyond=steady)
     if seen.force is not None:
+        # Slowly, for a quick change of pose is a vibration.
+        yield _plan(seen, 'poses', 'turn it over slowly and let it rest for half a minute each with its axis up, level, down and level',
+                    pose=_held([GRAVITY, 0.0, -GRAVITY, 0.0], 30.0, 40.0), settled=True)
         level = seen.vibration[0] if seen.vibration[0] > 0.01 * VIBRATION else VIBRATION
         yield _plan(seen, 'motor', f'run the motor and stop it each half minute for 5 min, at rest, shaking with '
                     f'{math.sqrt(level):.2g} m/s²', motor=_held([0.0, level] * 5, 29.5, 0.5), settled=True)
 
-        # Slowly, for a quick change of pose is a vibration.
-        yield _plan(seen, 'poses', 'turn it over slowly and let it rest for half a minute each with its axis up, level, down and level',
-                    pose=_held([GRAVITY, 0.0, -GRAVITY, 0.0], 30.0, 40.0), settled=True)
 
 def _cycles(seen: Reach) -> Iterator[Conditions]:
     if seen.span >= LEAST_SPAN:
