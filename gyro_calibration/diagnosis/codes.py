@@ -185,5 +185,6 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
     if not beyond.size:
         return fine and runs >= _SEPARATE
     middle = float(np.median(beyond))
-    near = middle > -3.0 * max(seen.white, seen.scatter)
-    return middle > 0.5 * step + 2.0 * seen.white / np.sqrt(len(beyond)) or (fine and (runs >= _SEPARATE or near))
+    # What is expected errs by the wander of the bias and by all that is no straight line, which is alike in all these samples.
+    doubt = max(seen.white, seen.scatter)
+    return middle > 0.5 * step + 2.0 * doubt or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt))
