@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
-from gyro_calibration.dwells import Dwells
+from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -30,7 +30,7 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import Scatter
+from gyro_calibration.scatter import Scatter, Uncertainty
 from gyro_calibration.selection import TECHNOLOGIES, part_twins, supported_effects
 
 #: Fitted in any case.
@@ -51,8 +51,9 @@ class Named:
     Attributes
     ----------
     fit : of these and of bias and scale factor, to dwells less what stays of the model
-    change : the same as changes of the model, each beside all of it; their evidence
+    change : the same as changes of the model, each beside all of it; their evidence, but for bias and scale factor
     causes : those that are named, of the effects of the fit
+    model : that is put to the test
     rate : of false alarms that the whole diagnosis may have
 
     """
@@ -60,6 +61,7 @@ class Named:
     fit: Calibration
     change: Calibration
     causes: tuple[Effect, ...]
+    model: GyroModel
     rate: float
 
     def changed(self, effect: Effect) -> Effect:
@@ -72,8 +74,9 @@ class Named:
 
     def chance_of(self, effect: Effect) -> float:
         """Return how likely dwells without a cause would show as much of any of those that were tried."""
-        count = len(NUISANCES) if effect in NUISANCES else len(STEADY) - len(NUISANCES)
-        return min(1.0, self.change.chance_of(self.changed(effect)) * count)
+        if effect in NUISANCES:
+            return min(1.0, _chance_of_change(self.fit, self.model, effect) * len(NUISANCES))
+        return min(1.0, self.change.chance_of(self.changed(effect)) * (len(STEADY) - len(NUISANCES)))
 
 
 # a model beside dwells
@@ -127,10 +130,10 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float, without: f
     change, needless = _counted_well(change, model, _level(rate))
     guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless))
     if model is None:
-        return Named(change, change, guilty, rate)
-    guilty += tuple(each for each in NUISANCES if each in change.effects and change.chance_of(each) < _level(rate, True))
+        return Named(change, change, guilty, tested, rate)
     fit = _refitted(dwells, model, change)
-    return Named(fit, change, tuple(_or_twin(each, fit) for each in guilty), rate)
+    moved = [each for each in NUISANCES if each in fit.effects and _chance_of_change(fit, model, each) < _level(rate, True)]
+    return Named(fit, change, (*(_or_twin(each, fit) for each in guilty), *moved), tested, rate)
 
 
 def _level(rate: float, nuisance: bool = False) -> float:
@@ -154,6 +157,23 @@ def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibrat
 
 def _twin(effect: Effect) -> Effect | None:
     return {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}.get(effect)
+
+
+def change_of(fit: Calibration, model: GyroModel, effect: Effect) -> float:
+    """Return by how much the value of bias or scale factor differs from that of the model, which is 0 where it has none."""
+    found, own = ([term.values[-1] for term in each.terms if term.effect is effect] for each in (fit, model))
+    return float(sum(found) - sum(own))
+
+
+def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
+    """Return how likely dwells would show as much of a change of bias or scale factor where there is none."""
+    if not fit.freedom:
+        return 1.0
+    used = take(fit.dwells, fit.scatter.kept)
+    place = [term.effect for term in fit.terms for _ in term.fitted].index(effect)
+    uncertain = Uncertainty.of(used, fit.scatter, columns_of(used, fit.terms), fit.residual[fit.scatter.kept])
+    below = float(uncertain.below(-change_of(fit, model, effect))[place])
+    return 2.0 * min(below, 1.0 - below)
 
 
 def _or_twin(effect: Effect, fit: Calibration) -> Effect:

@@ -17,12 +17,13 @@ from scipy.stats import t as student
 from gyro_calibration.calibration import Calibration, columns_of, fit_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.door import refuse
-from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, model_after, model_before, name_causes, seen, tried
+from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, change_of, model_after, model_before, name_causes, seen, tried
 from gyro_calibration.diagnosis.dwell_gain import WINDOW, curves, measure_gain
 from gyro_calibration.diagnosis.dwell_rest import RATE, SINGLE_RATES, Left, what_is_left
 from gyro_calibration.diagnosis.dwell_sets import alternatives
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
 from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.dwells import Dwells, from_table, listed, take
 from gyro_calibration.effects import CUBIC_NONLINEARITY, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STEADY, Effect
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
@@ -105,7 +106,7 @@ def _conclude(dwells: Dwells, model: GyroModel | None, rate: float) -> _Known:
 
 def _doubtful(named: Named, left: Left, effect: Effect) -> bool:
     """Tell whether the structure that is left along its variable is not small beside what the effect explains."""
-    along, explained = CAUSES[effect.name].along, _strength(named.change, named.changed(effect))
+    along, explained = CAUSES[effect.name].along, _strength_of(named, effect)
     return max((gain for name, gain in left.misfit.items() if along in name.split('_times_')), default=0.0) > _WITHDRAWN * explained
 
 
@@ -140,8 +141,15 @@ def _total_deviation(fit: Calibration) -> Array:
 
 def _findings(named: Named) -> list[Finding]:
     """Return the named causes, the strongest first."""
-    strengths = {effect: _strength(named.change, named.changed(effect)) for effect in named.causes}
+    strengths = {effect: _strength_of(named, effect) for effect in named.causes}
     return [_finding(named, effect) for effect in sorted(named.causes, key=lambda each: -strengths[each])]
+
+
+def _strength_of(named: Named, effect: Effect) -> float:
+    """Return by what the sum of squares falls with a cause."""
+    if effect not in NUISANCES:
+        return _strength(named.change, named.changed(effect))
+    return (change_of(named.fit, named.model, effect) / _with_deviations(named.fit, effect)[1][0]) ** 2
 
 
 def _strength(fit: Calibration, effect: Effect) -> float:
@@ -159,7 +167,7 @@ def _finding(named: Named, effect: Effect) -> Finding:
     cause, others = CAUSES[effect.name], alternatives(named.fit, effect)
     along = 'temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE else cause.along
     return Finding(effect.name, cause.sentence, _estimates(named.fit, effect), named.chance_of(effect), _smallest(named, effect),
-                   others.names, others.separate_by, _evidence(named.change, named.changed(effect)), along)
+                   others.names, others.separate_by, _evidence(named, effect), along)
 
 
 def _estimates(fit: Calibration, effect: Effect) -> dict[str, Estimate]:
@@ -185,6 +193,8 @@ def _with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float
 def _smallest(named: Named, effect: Effect) -> float | None:
     """Return the size from which an effect is found, in the unit of its first value."""
     change, level = named.changed(effect), named.level_of(effect)
+    if effect in NUISANCES:
+        return _found_from(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
         return _found_from(named.change, change, level)
     # A small sine response is found as what it begins with, -k² w³ / 6.
@@ -209,13 +219,17 @@ def _found_from(fit: Calibration, effect: Effect, level: float) -> float:
     return deviation * (float(brentq(excess, 0.1, 1e3)) + float(norm.ppf(_POWER)))
 
 
-def _evidence(fit: Calibration, effect: Effect) -> str:
-    rest = _rest(fit, effect)
+def _evidence(named: Named, effect: Effect) -> str:
+    sigmas = f'it stands out by {math.sqrt(max(_strength_of(named, effect), 0.0)):.1f} standard deviations'
+    if effect in NUISANCES:
+        parameter = effect.parameters[-1]
+        change = amount(change_of(named.fit, named.model, effect), parameter.unit, parameter.name)
+        return f'it differs from that of the model by {change}; {sigmas}'
+    rest = _rest(named.change, named.changed(effect))
     if rest is None:
         return ''
-    sigmas = math.sqrt(max(rest.misfit - fit.misfit, 0.0))
     return (f'without it, left-out sweeps are predicted to {rest.left_out_rms / DEGREE:.3g} deg/s, with it to '
-            f'{fit.left_out_rms / DEGREE:.3g} deg/s; it stands out by {sigmas:.1f} standard deviations')
+            f'{named.change.left_out_rms / DEGREE:.3g} deg/s; {sigmas}')
 
 
 # what a person should know

@@ -1,0 +1,235 @@
+"""
+The diagnosis of rate tables: what is hidden is found, what is not there is not, and what cannot be told is said with what would tell it.
+
+"""
+
+import json
+import re
+import runpy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from gyro_calibration.calibration import fit_effects
+from gyro_calibration.diagnosis import table as diagnosis
+from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.dwells import join
+from gyro_calibration.effects import CATALOGUE, STEADY, rate_temperature_polynomial
+from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.model import GyroModel, Term, same_effects
+from gyro_calibration.model_file import read_model, write_model
+from gyro_calibration.scatter import rms
+
+BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
+RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py')) for name in ('recovery', 'rate_table'))
+Table, TRUTH, LINEAR, SCATTERS = (RECOVERY[name] for name in ('Table', 'TRUTH', 'LINEAR', 'SCATTERS'))
+#: A test fails by chance as rarely as this.
+RARE = 1e-4
+#: Sixteen sweeps tell how much they wander; eight hardly do.
+WANDERING = Table(sweeps=16, rates=11, sweep_bias=0.005 * DEGREE, sweep_scale=1e-4)
+NUISANCES = ('bias', 'scale_factor_error')
+#: Of each effect, a size that nothing could overlook, to learn from which size on it is found.
+LARGE = {'bias': 0.05, 'scale_factor_error': 0.05, 'scale_factor_asymmetry': 0.02, 'quadratic_nonlinearity': 0.02,
+         'cubic_nonlinearity': 0.02, 'sine_response': 0.5, 'bias_temperature': 1e-3, 'bias_temperature_quadratic': 1e-4,
+         'scale_factor_temperature': 3e-3}
+
+
+@pytest.fixture
+def without_gain(monkeypatch):
+    """Leave out what takes most of the time, where it does not matter."""
+    monkeypatch.setattr(diagnosis, 'measure_gain', lambda *given: None)
+
+
+def gyro(name, size):
+    """Return a gyro with bias and scale factor, and an effect of some size on top; those of temperature count from 25 degC."""
+    terms = {term.effect.name: term for term in LINEAR}
+    known = terms[name].values[-1] if name in terms else 0.0
+    values = {'sine_response': (size, 1.0)}.get(name) or (*[25.0] * len(STEADY[name].shapes), known + size)
+    return GyroModel(tuple({**terms, name: Term(STEADY[name], values)}.values()))
+
+
+def diagnosed(table, truth, generator, model=None):
+    """Return the diagnosis of a simulated table."""
+    return diagnose_table(table.measure(truth, generator), model, generator)
+
+
+def members(finding):
+    return {finding.effect, *finding.ambiguous_with}
+
+
+def names(found):
+    return [finding.effect for finding in found.findings]
+
+
+# hidden effects
+
+@pytest.mark.parametrize('name', STEADY)
+def test_an_effect_at_twice_and_five_times_the_smallest_size_is_found(without_gain, name):
+    generator = np.random.default_rng(1)
+    model = GyroModel(LINEAR) if name in NUISANCES else None
+    large = diagnosed(WANDERING, gyro(name, LARGE[name]), generator, model)
+    smallest = next(each.minimum_detectable for each in large.findings if each.effect == name)
+    for times in (2.0, 5.0):
+        found = diagnosed(WANDERING, gyro(name, times * smallest), generator, model)
+        assert found.findings and name in members(found.findings[0]), (times, names(found))
+        assert len(members(found.findings[0])) <= 3
+
+
+@pytest.mark.parametrize('scatter', ['alike for all dwells', 'grows with the rate', 'differs by dwell, told', '4 sweeps',
+                                     'from sweep to sweep', 'much from sweep to sweep, one way'])
+def test_where_nothing_is_hidden_hardly_anything_is_found(scatter):
+    generator, runs = np.random.default_rng(2), 3
+    found = [diagnosed(SCATTERS[scatter], GyroModel(LINEAR), generator) for _ in range(runs)]
+    assert sum(each.verdict != 'adequate' or bool(each.findings) for each in found) <= binom.ppf(1 - RARE, runs, 0.01)
+
+
+def test_a_true_model_is_adequate_and_stays_as_it_is():
+    model = replace(gyro('cubic_nonlinearity', -0.005), covariance=None)
+    found = diagnosed(WANDERING, model, np.random.default_rng(3), model)
+    assert found.verdict == 'adequate' and found.gain is None and same_effects(found.before, found.model)
+
+
+# sets, and what parts them
+
+def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(without_gain):
+    generator, truth = np.random.default_rng(4), gyro('sine_response', 0.25)
+    table = Table().measure(truth, generator)
+    (found,) = diagnose_table(table, None, generator).findings
+    assert members(found) >= {'sine_response', 'cubic_nonlinearity'}
+    (rate,) = (float(number) * DEGREE for number in re.findall(r'each way at (\d+) deg/s', found.separate_by))
+    # Five standard deviations are aimed at, four needed: made twice, they leave nothing to chance.
+    more = Table(sweeps=2, rates=4).measure(truth, generator)
+    fast = np.tile([rate, -rate], 4)
+    noise = more.output - truth.output(more.rate, more.temperature)
+    more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
+    (found,) = diagnose_table(join([table, more]), None, generator).findings
+    assert members(found) == {'sine_response'}
+
+
+def test_asymmetry_and_a_parabola_are_a_set_where_it_is_small(without_gain):
+    generator = np.random.default_rng(5)
+    large = diagnosed(Table(), gyro('scale_factor_asymmetry', 0.02), generator)
+    assert names(large) == ['scale_factor_asymmetry'] and not large.findings[0].ambiguous_with
+    small = diagnosed(Table(), gyro('scale_factor_asymmetry', 1.5 * large.findings[0].minimum_detectable), generator)
+    assert members(small.findings[0]) == {'scale_factor_asymmetry', 'quadratic_nonlinearity'} and small.findings[0].separate_by
+
+
+def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_again(without_gain):
+    generator, truth = np.random.default_rng(6), gyro('bias_temperature', 1e-4)
+    up = Table().measure(truth, generator)
+    (found,) = diagnose_table(up, None, generator).findings
+    assert members(found) >= {'bias_temperature', 'rate_ramp'} and 'cool' in found.separate_by
+    down = replace(Table(), temperatures=Table().temperatures[::-1]).measure(truth, generator)
+    (found,) = diagnose_table(join([up, down]), None, generator).findings
+    assert members(found) == {'bias_temperature'}
+
+
+def test_a_scale_factor_may_always_be_that_of_the_reference(without_gain):
+    found = diagnosed(Table(), gyro('scale_factor_error', 0.01), np.random.default_rng(7), GyroModel(LINEAR))
+    assert members(found.findings[0]) == {'scale_factor_error', 'reference_scale'}
+
+
+# models that are put to the test
+
+def test_a_value_that_the_model_has_wrong_is_put_right(without_gain):
+    generator, truth = np.random.default_rng(8), gyro('sine_response', 0.3)
+    found = diagnosed(WANDERING, truth, generator, gyro('sine_response', 0.25))
+    assert names(found) == ['sine_response']
+    low, high = found.findings[0].parameters['k'].interval
+    assert low < 0.3 < high and found.before.terms[-1].values == (0.25, 1.0)
+    assert found.model.terms[-1].values[0] == found.findings[0].parameters['k'].estimate and len(found.model.terms) == 3
+
+
+def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
+    table = replace(Table(), fastest=300.0 * DEGREE)
+    found = diagnosed(table, gyro('cubic_nonlinearity', -0.01), np.random.default_rng(9), gyro('sine_response', 0.25))
+    assert names(found) == ['cubic_nonlinearity']
+    assert [term.effect.name for term in found.model.terms] == [*NUISANCES, 'cubic_nonlinearity']
+
+
+def test_effects_are_named_on_top_of_a_polynomial(without_gain):
+    generator = np.random.default_rng(10)
+    polynomial = fit_effects(WANDERING.measure(GyroModel(LINEAR), generator), [rate_temperature_polynomial(3, 2)]).model
+    truth = GyroModel((*LINEAR, Term(STEADY['scale_factor_temperature'], (polynomial.reference_temperature, 5e-4))))
+    found = diagnosed(WANDERING, truth, generator, polynomial)
+    assert names(found) == ['scale_factor_temperature'] and found.model.terms[0] == polynomial.terms[0]
+    low, high = found.findings[0].parameters['scale_factor_temperature'].interval
+    assert low < 5e-4 < high and len(found.model.covariance) == sum(len(term.fitted) for term in found.model.terms)
+
+
+def test_what_dwells_cannot_test_of_a_model_is_left_and_said(without_gain):
+    model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
+    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(11), model)
+    assert any('time_offset' in remark for remark in found.remarks) and model.terms[-1] in found.model.terms
+
+
+# what has no name, and what is no effect
+
+@pytest.mark.parametrize('waves', [6.0, 40.0])
+def test_what_is_not_in_the_catalogue_gets_no_name(waves):
+    generator = np.random.default_rng(12)
+    table = Table().measure(GyroModel(LINEAR), generator)
+    table = replace(table, output=table.output + 0.06 * DEGREE * np.sin(waves * table.rate + 1.0))
+    found = diagnose_table(table, None, generator)
+    assert found.verdict == 'unexplained' and not found.findings
+    assert found.unexplained[0].along in ('rate', 'single_rates') and found.unexplained[0].share_of_variance > 0.3
+
+
+def test_wild_dwells_and_wrong_units_are_said_and_not_fitted():
+    generator = np.random.default_rng(13)
+    table = Table().measure(GyroModel(LINEAR), generator)
+    wild = table.output + np.where(np.arange(len(table)) == 50, 1.0 * DEGREE, 0.0)
+    found = diagnose_table(replace(table, output=wild * DEGREE), None, generator)
+    assert names(found) == ['unit_error', 'outliers'] and 'row 51' in found.findings[1].evidence
+    assert found.before.terms[1].values[0] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_tables_without_temperature_say_what_they_cannot_show():
+    generator = np.random.default_rng(14)
+    found = diagnose_table(replace(Table().measure(GyroModel(LINEAR), generator), temperature=None), None, generator)
+    assert 'temperature_degc' in found.cannot_show['bias_temperature'] and 'time' in found.cannot_show['thermal_lag']
+    assert set(found.cannot_show) | set(STEADY) | {'outliers', 'unit_error'} == set(diagnosis.CAUSES)
+
+
+def test_a_table_of_one_rate_is_refused():
+    table = Table().measure(GyroModel(LINEAR), np.random.default_rng(15))
+    with pytest.raises(DataRefused, match='one rate'):
+        diagnose_table(replace(table, rate=np.zeros(len(table)), output=table.output - table.rate), None, np.random.default_rng(1))
+
+
+# what is won
+
+def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
+    generator, truth = np.random.default_rng(16), gyro('cubic_nonlinearity', -0.01)
+    found = diagnosed(Table(), truth, generator)
+    assert found.verdict == 'extended' and found.gain.rate.interval[0] > 0.0
+    assert found.gain.rate.after < 1.2 * Table().dwell
+    assert found.gain.heading.before == pytest.approx(60.0 * found.gain.rate.before)
+    write_model(tmp_path / 'model.yaml', found.model)
+    written = read_model(tmp_path / 'model.yaml')
+    assert same_effects(written, found.model) and 'sine_response' in written.origin['ambiguous'][0]
+    json.dumps(found.figures(), allow_nan=False)
+    rate = next(curve for curve in found.curves if curve.along == 'rate')
+    assert rms(rate.after / rate.deviation) < 2.0 < rms(rate.before / rate.deviation)
+
+
+# a measured table
+
+def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data):
+    found = diagnose_table(RATE_TABLE['table'](data), None, np.random.default_rng(17))
+    assert [members(finding) for finding in found.findings] == [{'sine_response', 'cubic_nonlinearity'}, {'scale_factor_temperature'}]
+    assert found.gain.rate.before == pytest.approx(0.67 * DEGREE, rel=0.03) and found.gain.rate.after < 0.051 * DEGREE
+    assert '186 deg/s' in found.findings[0].separate_by
+    # Single rates have errors of their own, a fifth of what is left, which neither effect nor polynomial explains.
+    assert [each.along for each in found.unexplained] == ['single_rates'] and 0.15 < found.unexplained[0].share_of_variance < 0.25
+
+
+def test_of_the_recorded_table_a_polynomial_leaves_single_rates_alone(data):
+    dwells = RATE_TABLE['table'](data)
+    found = diagnose_table(dwells, fit_effects(dwells, [rate_temperature_polynomial(3, 2)]).model, np.random.default_rng(18))
+    assert not found.findings and [each.along for each in found.unexplained] == ['single_rates']
+    assert any('4 values, predict left-out sweeps to 0.0454 deg/s' in remark and '12 values, to 0.0511' in remark
+               for remark in found.remarks)
