@@ -318,16 +318,19 @@ def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] 
     found = screen(done, stock)
     scans = {'interference_tone': tones, 'reference_slip': slips}
     scanned = [each for cause in search.scanned for each in scans[cause](done)]
+    # What has nothing but shapes is there or not: another of its kind is the first one, not well refined.
+    taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
     first = [(search.candidates[max(own, key=lambda place: found[place])], float(averaged(found[own])), float(found[own].max()))
-             for own in by_cause(search.candidates).values()]
+             for cause, own in by_cause(search.candidates).items() if cause not in taken]
     first += [(candidate, value, value) for candidate, value in scanned]
     if not any(search.excess(candidate.cause, value) > 0.0 for candidate, value, _ in first):
         return None, []
     top = max(most for _, _, most in first)
     steps = [refined(search, named, candidate) for candidate, value, most in first
              if most > 0.8 * top - 8.0 and (is_named(candidate) or search.excess(candidate.cause, value) > 0.0)]
-    steps.sort(key=lambda step: -step.score)
-    return steps[0], steps
+    # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
+    steps = sorted((step for step in steps if step.score > done.score), key=lambda step: -step.score)
+    return (steps[0] if steps else None), steps
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
