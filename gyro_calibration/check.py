@@ -29,6 +29,8 @@ TOLERANCE = 1.25
 QUIET = 3.0
 #: Parts may vary by so many times the variance that noise explains; with 9 degrees of freedom chance does so once in a million stretches.
 _STEADY = 6.0
+#: How often a calibration is said in vain to differ from the one before.
+CHANCE = 1e-3
 #: So many stretches in a row decide where nobody promised that the gyro rests, for a robot that goes straight may shake for a while.
 _IN_A_ROW = 3
 
@@ -74,6 +76,7 @@ class Check:
 
     Attributes
     ----------
+    standing : a mean below this, rad/s, is rest; one above may be a steady turn, and counts where it comes again and again
     noise_alarm, bias_alarm : one sentence each, '' while all is well
     last : the last stretch at rest, or None
     examined : number of stretches at rest
@@ -88,10 +91,10 @@ class Check:
         ----------
         noise : what the model claims; without an angle random walk nothing is checked
         false_alarms : at most so many in an hour at rest, 1/h; 0 checks nothing
-        standing : a mean below this, rad/s, is rest; one above may be a steady turn, and counts where it comes again and again
+        standing : rad/s, see above
 
         """
-        self._noise, self._standing = noise, standing
+        self._noise, self.standing = noise, standing
         # Four ways to alarm: noise or bias, upwards or downwards.
         self._level = 0.25 * false_alarms * STRETCH / 3600.0
         self._gathered = _Gathered()
@@ -166,7 +169,7 @@ class Check:
             self.noise_alarm = _noise_sentence(rest)
         if rest.bias_fits:
             self.bias_alarm = ''
-        elif rest.promised or abs(rest.bias) < self._standing or self._in_a_row('bias_fits') and self._stays():
+        elif rest.promised or abs(rest.bias) < self.standing or self._in_a_row('bias_fits') and self._stays():
             self.bias_alarm = _bias_sentence(rest)
 
     def _in_a_row(self, fits: str) -> bool:
@@ -249,12 +252,13 @@ def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
     return bool(means.var(ddof=1) <= _STEADY * explained)
 
 
-def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float, level: float) -> str:
+def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float, level: float = CHANCE) -> str:
     """
     Say whether a calibration differs from the one before by more than both of them and the noise explain; '' where not.
 
     Parameters
     ----------
+    before : an infinite variance is of a value that was not known
     noise : of the model; how far the bias wanders
     age : time between the two, s
     level : chance to say so in vain
@@ -268,7 +272,7 @@ def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: 
     said = [text for text, size in zip((f'the scale factor error by {100 * differences[0]:.3f} %',
                                         f'the bias by {differences[1] / DEGREE:.4f} deg/s'), sigmas)
             if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
-    return f'more than the model explains, it changed {" and ".join(said)}' if said else ''
+    return f'that is more than the model explains: it changed {" and ".join(said)}; if it does so again, diagnose a log' if said else ''
 
 
 def _noise_sentence(rest: Rest) -> str:

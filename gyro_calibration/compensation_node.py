@@ -24,6 +24,7 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64, Header
 from std_srvs.srv import Trigger
 
+from gyro_calibration.check import Check, changed
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.effects import Channels
 from gyro_calibration.heading import HeadingIntegrator, Threshold, ThresholdFilter
@@ -51,6 +52,7 @@ PARAMETERS = (
     Parameter('threshold', 0.3 * DEGREE, 'Below this rate the robot stands; 0 switches the filter off.', 'rad/s', (0.0, 0.1), True),
     Parameter('threshold_window', 0.2, 'The mean over it counts; 0 looks at single samples.', 's', (0.0, 5.0), True),
     Parameter('rest_test', True, 'Where the noise is known, a window that varies by more is motion, whatever its mean.', dynamic=True),
+    Parameter('check_false_alarms', 0.001, 'Of the check of noise and bias, in an hour at rest; 0 switches it off.', '1/h', (0.0, 1.0)),
     Parameter('maximum_gap', 1.0, 'Over a longer gap in the stamps nothing is integrated.', 's', (0.01, 60.0)),
     Parameter('temperature_timeout', 10.0, 'An older temperature is not used.', 's', (0.1, 3600.0)),
     Parameter('sample_timeout', 5.0, 'A calibration is given up when no sample comes for so long.', 's', (0.1, 60.0)),
@@ -66,6 +68,9 @@ PARAMETERS = (
 # core a topic. Every quality fits a subscription that asks for the least, and a publisher that offers the most.
 _UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
 _UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
+
+
+_YEAR = 365.25 * 86400.0
 
 
 @dataclass
@@ -123,6 +128,7 @@ class CompensationNode(Node):
         self._model = self._stored_model()
         self._filter = ThresholdFilter(self._threshold())
         self._heading = HeadingIntegrator(self._settings.maximum_gap)
+        self._check = Check(self._model.noise, self._settings.check_false_alarms, self._settings.threshold)
         self._use(self._model)
         self._temperature: tuple[float, float] | None = None
         self._epoch: int | None = None
@@ -195,6 +201,7 @@ class CompensationNode(Node):
         self._model, self._covariance = model, covariance(model)
         self._offset = round(1e9 * model.true_time(0.0))
         self._heading.use(model.noise, self._covariance)
+        self._check.recalibrated()
 
     def _apply(self, calibration: SelfCalibration) -> str:
         """Use a calibration from the next sample on, keep it, and return what went wrong with keeping it."""
@@ -254,6 +261,8 @@ class CompensationNode(Node):
         rate = float(result.rate)
         self._sensitivity = rate_sensitivity(self._model, output, rate, result.temperature, around)
         self._advance(time, rate)
+        if self._check.works and self._check.add(time, output, rate):
+            self._examine()
         self._collect(time, float(result.modelled), temperature)
         self._publish(message.header)
 
@@ -285,10 +294,32 @@ class CompensationNode(Node):
         self._rate = self._filter.filter(time, rate)
         self._note(self._heading.add(time, rate, self._rate, self._sensitivity))
 
+    def _examine(self) -> None:
+        """Compare a stretch of samples with what the model claims; during a calibration at rest, rest is promised."""
+        promised = self._run is not None and self._run.motion is None
+        self._check.examine(self._bias_variance(), self._age(), promised)
+
+    def _bias_variance(self) -> float:
+        """Return the variance of the bias by the calibration, (rad/s)², as the last sample shows it; nan where it is not known."""
+        known = self._model.covariance is not None or self._model.self_calibration is not None
+        return float(quadratic_form(self._covariance, self._sensitivity)) if known and self._last_time > -math.inf else math.nan
+
+    def _age(self) -> float:
+        """Return how long ago the bias was calibrated, s; a year where nobody wrote it down."""
+        calibration = self._model.self_calibration
+        written = calibration.time if calibration else str(self._model.origin.get('date', ''))
+        try:
+            when = datetime.fromisoformat(written)
+        except ValueError:
+            return _YEAR
+        when = when if when.tzinfo else when.replace(tzinfo=timezone.utc)
+        return max((datetime.now(timezone.utc) - when).total_seconds(), 0.0)
+
     def _note(self, restarted: str) -> None:
         """Report that integration began anew, if it did; a calibration cannot go on over that."""
         if not restarted:
             return
+        self._check.restart()
         self._counts['restarts'] += 1
         self._events = f'{restarted}: integration began anew'
         if self._run and self._run.times:
@@ -347,6 +378,7 @@ class CompensationNode(Node):
         if self._problem:
             return self._answer(response, False, f'refused: {self._problem}')
         run = self._run = Run(motion, duration, Future(), self._now())
+        self._check.restart()
         if motion is not None and current(self, PARAMETERS).drive_profile:
             self._drive_timer.reset()
         self._show_state()
@@ -375,14 +407,24 @@ class CompensationNode(Node):
         else:
             fit = self_calibrate(times, rates, run.motion, limits=self._limits(), noise=self._model.noise)
             calibration = record(fit, 'likelihood', when, temperature)
+        different = changed(self._claimed(), calibration, self._model.noise, self._age())
         trouble = self._apply(calibration)
-        return f'{calibration}, from {len(times)} samples' + (f'; {trouble}' if trouble else '')
+        return '; '.join(filter(None, [f'{calibration}, from {len(times)} samples', different, trouble]))
+
+    def _claimed(self) -> SelfCalibration:
+        """Return the calibration in use; without one the model claims a bias of zero, as well as it knows that."""
+        variance = self._bias_variance()
+        return self._model.self_calibration or SelfCalibration(covariance=None if math.isnan(variance) else (
+            (math.inf, 0.0), (0.0, variance)))
 
     def _rested(self, times: np.ndarray, rates: np.ndarray, when: str, temperature: float | None) -> SelfCalibration:
         """Return the last calibration with the bias of a run at rest (Ojeda et al., eq. 16)."""
         bias, deviation = calibrate_bias(times, rates, self._limits(), self._model.noise)
         last = self._model.self_calibration or SelfCalibration()
-        variances = last.covariance and ((last.covariance[0][0], 0.0), (0.0, deviation ** 2))
+        # Without a self-calibration the scale is the model's, which knows how well.
+        of_scale = 0.0 if self._model.self_calibration is None and self._model.covariance is not None else \
+            last.covariance and last.covariance[0][0]
+        variances = None if of_scale is None else ((of_scale, 0.0), (0.0, deviation ** 2))
         return SelfCalibration(last.scale_factor_error, bias, variances, when, temperature, 'rest')
 
     def _answer(self, response: Trigger.Response, success: bool, message: str) -> Trigger.Response:
@@ -437,6 +479,7 @@ class CompensationNode(Node):
         threshold = self._threshold()
         if threshold != self._filter.settings:
             self._filter = ThresholdFilter(threshold)
+            self._check.standing = threshold.rate
 
     def _show_state(self) -> None:
         """Publish the latched state of the calibration."""
@@ -471,7 +514,16 @@ class CompensationNode(Node):
             values['temperature_degc'] = f'{self._temperature[1]:.2f}'
         if self._model.self_calibration:
             values.update(self._model.self_calibration.figures())
-        self._diagnostics.publish(diagnostic(self, level, 'heading', message, values))
+        self._diagnostics.publish(diagnostic(self, level, 'heading', message, values | self._checked()))
+
+    def _checked(self) -> dict[str, object]:
+        """Return what the last rest showed."""
+        rest = self._check.last
+        if rest is None:
+            return {'rests_checked': 0}
+        return {'rests_checked': self._check.examined, 'rest_noise_ratio': f'{rest.noise_ratio:.3f}',
+                'rest_rate_deg_s': f'{rest.bias / DEGREE:.5f}', 'rest_rate_sigmas': f'{rest.sigmas:.2f}',
+                'noise_alarm': self._check.noise_alarm, 'bias_alarm': self._check.bias_alarm}
 
     def _trouble(self, grown: set[str]) -> tuple[bytes, str]:
         silent = self._now() - self._last_heard
@@ -490,8 +542,7 @@ class CompensationNode(Node):
             found.append(f'no temperature comes; the model is used at its reference temperature of {reference:g} degC')
         found += [f'the model looks at the {channel.replace("_", " ")}, which no message brings; that effect is left out'
                   for channel in ('supply', 'specific_force') if self._model.looks_at(channel) and channel not in self._brought]
-        if self._hint:
-            found.append(self._hint)
+        found += [text for text in (self._hint, self._check.bias_alarm, self._check.noise_alarm) if text]
         return (DiagnosticStatus.WARN, found[0]) if found else (DiagnosticStatus.OK, 'heading goes on')
 
     def destroy_node(self) -> None:

@@ -199,6 +199,7 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     ----------
     time : s, shape (n,)
     rate : compensated by the model, rad/s, shape (n,)
+    noise : of the gyro, if it is known; the mean is not taken to be better known than that allows
 
     Raises
     ------
@@ -211,7 +212,9 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None, noise
     within = math.sqrt(np.mean([block.var(ddof=1) for block in np.array_split(rate, 10)]) / (len(rate) / 10))
     _refuse_change(np.abs(blocks - np.median(blocks)), np.full(10, within))
     _refuse_change(*_steps(blocks, within))
-    bias, deviation = float(rate.mean()), math.sqrt(blocks.var(ddof=1) / 10.0 + _wander(noise))
+    # Ten blocks may scatter by half of what they should by chance.
+    of_model = noise.angle_random_walk ** 2 / float(time[-1] - time[0]) if noise is not None else 0.0
+    bias, deviation = float(rate.mean()), math.sqrt(max(blocks.var(ddof=1) / 10.0, of_model) + _wander(noise))
     if abs(bias) > limits.bias:
         raise DataRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond {limits.bias / DEGREE:g} deg/s: '
                                  'the gyro turns, or is broken')
