@@ -106,6 +106,7 @@ class Work:
     residual : whitened, without what the causes of fixed amplitude make, shape (m,)
     columns : whitened and independent: scale factor error, those of the causes, what their shapes change, shape (q, m)
     owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus one less place of its shape)
+    widths : of each cause, how many columns with free values it has
     sample, by, judged : see `evidence`
 
     """
@@ -115,6 +116,7 @@ class Work:
     residual: Array
     columns: Array
     owner: tuple[tuple[int, int], ...]
+    widths: tuple[int, ...]
     sample: Sample
     by: Beside
     judged: Judged
@@ -181,12 +183,14 @@ def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) 
 
     """
     replays = [seen(each, named) for each in whole.replays]
+    widths = []
     residual = np.concatenate([
         each.noisy(each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
         for each, new in zip(whole.replays, replays)])
     columns, owner = [np.concatenate([each.coefficients(each.channels.rate) for each in replays])[None]], [(-1, 0)]
     for place, known in enumerate(named):
         own = columns_of(known.candidate, replays if not is_of_the_rate(known.candidate.cause) else whole.replays)
+        widths.append(len(own) if known.candidate.amplitude is None else 0)
         if known.candidate.amplitude is None:
             columns.append(own)
             owner += [(place, number) for number in range(len(own))]
@@ -199,7 +203,7 @@ def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) 
         own = columns_of(candidate, replays)
         columns.append(own)
         owner += [(-2, 0)] * len(own)
-    return _worked(replace(whole, replays=tuple(replays)), tuple(named), residual, np.concatenate(columns), tuple(owner))
+    return _worked(replace(whole, replays=tuple(replays)), tuple(named), residual, np.concatenate(columns), tuple(owner), tuple(widths))
 
 
 def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[int, Array]]:
@@ -218,13 +222,14 @@ def free_shapes(candidate: Candidate) -> list[int]:
     return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
 
 
-def _worked(whole: Field, named: tuple[Named, ...], residual: Array, columns: Array, owner: tuple[tuple[int, int], ...]) -> Work:
+def _worked(whole: Field, named: tuple[Named, ...], residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
+            widths: tuple[int, ...]) -> Work:
     kept = _independent(columns / whole.deviation)
     white, of = residual / whole.deviation, columns[kept] / whole.deviation
     nothing = np.empty((0, len(white)))
     given = sample(white[None], of, nothing, whole.starts)
     by = beside(sums(of, nothing, (), whole.starts), (), whole.noises)
-    return Work(whole, named, white, of, tuple(owner[place] for place in kept), given, by, judge(given, whole.noises, by))
+    return Work(whole, named, white, of, tuple(owner[place] for place in kept), widths, given, by, judge(given, whole.noises, by))
 
 
 def _independent(columns: Array) -> list[int]:

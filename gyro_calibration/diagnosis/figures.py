@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from gyro_calibration.diagnosis.field import Work
+from gyro_calibration.diagnosis.spectrum import differentiated
 from gyro_calibration.log import Array
 from gyro_calibration.noise import Noise
 
@@ -76,7 +77,7 @@ def _bands(done: Work) -> _Bands:
     wave = 2.0 - 2.0 * np.cos(angle)
     parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
     if field.first.reference:
-        parts.append(wave / step)
+        parts.append(differentiated(angle) / step)
     means = np.column_stack([np.add.reduceat(part, field.starts) / count for part in parts])
     return _Bands(np.add.reduceat(left ** 2, field.starts), count, means)
 

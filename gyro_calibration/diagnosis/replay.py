@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 from gyro_calibration.diagnosis.spectrum import transform
@@ -19,7 +20,7 @@ from gyro_calibration.log import Array, Log, Mask
 from gyro_calibration.model import GyroModel
 
 #: More points of the grid than this are averaged in neighbours, for a million samples are more than are needed to part causes.
-MOST_POINTS = 100_000
+MOST_POINTS = 50_000
 #: A heading is smoothed over so long, s, to find the rate that nonlinear effects look at.
 SMOOTHING = 0.15
 
@@ -38,7 +39,7 @@ class Replay:
     interval : of the grid, s
     every : so many points of the grid are averaged into one
     filling : white noise of variance 1 for the points of the grid that are lost, shape (place[-1] + 1,)
-    rounded : the reference is the difference of a heading, whose error is white times (2 - 2 cos)
+    rounded : the reference is the derivative of a heading that comes in steps
     has : names of the channels that the log has
     added : what the simulation adds to the rate, rad/s, shape (n,); it is taken out of `channels.output`
 
@@ -104,7 +105,8 @@ class Replay:
         return replace(self, channels=replace(self.channels, rate=rate))
 
 
-def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, model: GyroModel | None = None) -> Replay:
+def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, step: float = 0.0,
+           model: GyroModel | None = None) -> Replay:
     """
     Lay a log out.
 
@@ -114,31 +116,32 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     trusted : samples to use, shape (n,)
     generator : source of the noise that fills what is lost
     update : interval at which the reference is renewed, s, where it is held in between
+    step : of a reference heading, rad; 0 where it has none
     model : the simulation that the output is compared with; that of an ideal gyro where it is None
 
     """
     assert log.time is not None and log.output is not None
     time = log.time - log.time[0]
-    reference, smooth, rounded = _reference(log, time, update)
+    reference, smooth = _reference(log, time, update, step)
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
     place, interval = numbered(time, kept)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
     channels = replace(channels_of(log), rate=smooth, time=time, heading=_heading(time, log, smooth))
-    output = _at_intervals(log.output) if rounded else log.output
+    rounded = step > 0.0 and log.reference_rate is None
     filling = generator.standard_normal(place[-1] + 1)
-    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log),
+    plain = Replay(replace(channels, output=log.output), reference, kept, place, interval, every, filling, rounded, _known(log),
                    np.zeros(len(time)))
     return plain if model is None else _simulated(plain, model)
 
 
-def _reference(log: Log, time: Array, update: float | None) -> tuple[Array, Array, bool]:
-    """Return the reference rate as it is compared, and as effects look at it, and whether it is that of a heading."""
+def _reference(log: Log, time: Array, update: float | None, step: float) -> tuple[Array, Array]:
+    """Return the reference rate as it is compared, and as effects look at it."""
     if log.reference_rate is not None:
         rate = _between_updates(time, log.reference_rate, update)
-        return rate, rate, False
+        return rate, rate
     if log.reference_heading is not None:
-        return *_rates(time, _between_updates(time, log.reference_heading, update)), True
-    return np.zeros(len(time)), np.zeros(len(time)), False
+        return _rates(time, _between_updates(time, log.reference_heading, update), step)
+    return np.zeros(len(time)), np.zeros(len(time))
 
 
 def _simulated(plain: Replay, model: GyroModel) -> Replay:
@@ -193,21 +196,17 @@ def _between_updates(time: Array, values: Array, update: float | None) -> Array:
     return np.interp(time, time[renewed], values[renewed])
 
 
-def _rates(time: Array, heading: Array) -> tuple[Array, Array]:
-    """Return mean rates from each sample to the next (the last is repeated), as differences and smooth."""
-    interval = np.diff(time)
-    raw = np.diff(heading) / interval
-    length = max(5, 2 * round(0.5 * SMOOTHING / np.median(interval)) + 1)
+def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
+    """Return the rate of a heading by cubic splines, nan where that is lost, and the same from a smooth heading where it has steps."""
     known = np.isfinite(heading)
     filled = np.interp(time, time[known], heading[known])
-    smooth = savgol_filter(filled, length, 2)
-    even = np.diff(smooth) / interval
-    return np.append(raw, np.nan), np.append(even, even[-1])
-
-
-def _at_intervals(values: Array) -> Array:
-    """Return the mean of each sample and the next."""
-    return np.append(0.5 * (values[1:] + values[:-1]), values[-1])
+    rate = CubicSpline(time, filled)(time, 1)
+    near = known & np.append(known[1:], True) & np.append(True, known[:-1])
+    raw = np.where(near, rate, np.nan)
+    if not step:
+        return raw, rate
+    length = max(5, 2 * round(0.5 * SMOOTHING / np.median(np.diff(time))) + 1)
+    return raw, CubicSpline(time, savgol_filter(filled, length, 3))(time, 1)
 
 
 def _heading(time: Array, log: Log, rate: Array) -> Array:

@@ -46,6 +46,8 @@ UNLIKELY = 12.0
 PRICE_OF_COLUMN = 1.2
 #: By so much a structure without a name must be better than every cause.
 MARGIN = 4.0
+#: So many causes at most are refined before one is taken.
+MOST_RIVALS = 9
 #: So many causes at most are named.
 MOST_CAUSES = 6
 
@@ -69,6 +71,8 @@ class Chance:
 
     def p_value(self, cause: str, found: float) -> float:
         """Return how often chance reaches an evidence."""
+        if cause not in self.start:
+            return min(1.0, float(np.exp(-found)))
         return min(1.0, self.share * float(np.exp(-(found - self.start[cause]) / self.scale[cause])))
 
 
@@ -168,6 +172,9 @@ def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
 def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
     start, scale, share = {}, {}, 0.15
     for cause, own in places.items():
+        if not np.isfinite(found[:, own]).any():
+            start[cause], scale[cause] = 0.0, 1.0  # it has no place in these data
+            continue
         most = np.sort(averaged(found[:, own]))[int((1.0 - share) * len(found)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return Chance(start, scale, share)
@@ -256,7 +263,7 @@ def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Ste
     """Add a cause with the best of its shapes near those given."""
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
         done = work(search.field, [*named, Named(candidate)])
-        width = sum(place == len(named) and value >= 0 for place, value in done.owner)
+        width = done.widths[-1]
         return Step((*named, Named(candidate)), done.score - (0.0 if is_named(candidate) else MARGIN) - PRICE_OF_COLUMN * max(width - 1, 0))
     begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
     place = fitted_shapes(candidate)[0]
@@ -326,8 +333,9 @@ def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] 
     if not any(search.excess(candidate.cause, value) > 0.0 for candidate, value, _ in first):
         return None, []
     top = max(most for _, _, most in first)
-    steps = [refined(search, named, candidate) for candidate, value, most in first
+    worth = [(most, candidate) for candidate, value, most in first
              if most > 0.8 * top - 8.0 and (is_named(candidate) or search.excess(candidate.cause, value) > 0.0)]
+    steps = [refined(search, named, candidate) for _, candidate in sorted(worth, key=lambda each: -each[0])[:MOST_RIVALS]]
     # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
     steps = sorted((step for step in steps if step.score > done.score), key=lambda step: -step.score)
     return (steps[0] if steps else None), steps
@@ -346,8 +354,8 @@ def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
 def _updated(done: Work, place: int, values: Array) -> Named:
     known = done.named[place]
     own = dict(zip(done.owner, values))
-    free = tuple(float(own[place, number]) for number in range(len(values)) if (place, number) in own)
-    found = free if known.candidate.amplitude is None else (known.candidate.amplitude,)
+    free = tuple(float(own.get((place, number), 0.0)) for number in range(done.widths[place]))
+    found = free or (known.candidate.amplitude or 0.0,)
     candidate = known.candidate
     for shape in fitted_shapes(candidate):
         change = own.get((place, -1 - shape), 0.0)

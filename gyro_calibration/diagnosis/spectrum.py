@@ -2,8 +2,8 @@
 The noise of a residual in its cosine transform, where whitening is a division.
 
 White noise and a random walk of the rate with any start have cosines as their exact eigenvectors; those of a Gauss-Markov process are
-nearly so. The coefficient of order 0 is the bias and is left out. The rounding of an encoder, differenced to a rate, is white noise times
-``2 - 2 cos``.
+nearly so. The coefficient of order 0 is the bias and is left out. The rounding of an encoder is white noise of the heading; its rate by
+cubic splines is that times ``(3 sin / (2 + cos))²``.
 
 """
 
@@ -51,13 +51,18 @@ class Shape:
 
         """
         wave = 2.0 - 2.0 * np.cos(angle)
-        total = 1.0 + self.reference * wave
+        total = 1.0 + self.reference * differentiated(angle)
         if self.walk:
             total = total + self.walk * interval ** 2 / wave
         if self.strength:
             kept = np.exp(-interval / self.correlation_time)
             total = total + self.strength * interval * (1.0 - kept ** 2) / ((1.0 - kept) ** 2 + kept * wave)
         return total
+
+
+def differentiated(angle: Array) -> Array:
+    """Return what the derivative of a cubic spline through samples does to the variance of white noise in them, for an interval of 1."""
+    return (3.0 * np.sin(angle) / (2.0 + np.cos(angle))) ** 2
 
 
 def transform(values: Array) -> Array:

@@ -62,7 +62,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         refuse(log, model)
     hygiene = [inspect(log, model) for log in logs]
     say('replay')
-    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, model) for log, clean in zip(logs, hygiene)]
+    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, model)
+               for log, clean in zip(logs, hygiene)]
     say('search')
     search = begin(replays, generator, _OF_SEARCH * rate)
     named, withdrawn = _repeating(search, searched(search))
@@ -84,7 +85,7 @@ def _mended(log: Log, clean: Hygiene) -> Log:
 
 def _repeating(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
     """Withdraw causes named from a temperature that differ between the logs, and names along variables where there is more."""
-    beyond = {along(each.candidate) for each in named if not is_named(each.candidate)}
+    beyond = {name for each in named if not is_named(each.candidate) for name in along(each.candidate).split(' and ')}
     kept = tuple(each for each in named if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in beyond)
     withdrawn = []
     for known in kept:
@@ -135,9 +136,11 @@ def _told(search: Search, found: Outcome, figures: NoiseFigures, rivals: Sequenc
     before = extended(model or GyroModel(), plain, figures.noise, deviation, {}) if model is None else model
     offered = won is None or not won.worse
     after = extended(model or GyroModel(), found, figures.noise, deviation, _said_of_sets(findings)) if offered else before
+    # What has no name is in no model, and so not in what the extended one predicts.
+    shown = Outcome(work(search.field, [each for each in found.named if is_named(each.candidate)] if offered else []), found.replays)
     return Diagnosis(
         tuple(findings), tuple(unexplained(search, found, strength)), figures.noise, Noise() if model is None else model.noise, won, before,
-        after, _cannot_show(search), curves(plain, found if offered else plain), heading_curve(plain, found if offered else plain),
+        after, _cannot_show(search), curves(plain, shown), heading_curve(plain, shown),
         noise_curve(found, figures.noise, Noise() if model is None else model.noise),
         tuple(_remarks(hygiene, names, withdrawn, findings, offered)), rate, tuple(names))
 
