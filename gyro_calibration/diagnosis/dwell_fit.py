@@ -30,7 +30,7 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import Scatter, Uncertainty
+from gyro_calibration.scatter import Scatter, Uncertainty, Whitener
 from gyro_calibration.selection import TECHNOLOGIES, part_twins, supported_effects
 
 #: Fitted in any case.
@@ -76,7 +76,7 @@ class Named:
         """Return how likely dwells without a cause would show as much of any of those that were tried."""
         if effect in NUISANCES:
             return min(1.0, _chance_of_change(self.fit, self.model, effect) * len(NUISANCES))
-        return min(1.0, self.change.chance_of(self.changed(effect)) * (len(STEADY) - len(NUISANCES)))
+        return min(1.0, _chance(self.change, self.model, self.changed(effect)) * (len(STEADY) - len(NUISANCES)))
 
 
 # a model beside dwells
@@ -128,7 +128,9 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float, without: f
     change, _ = supported_effects(beside(dwells, tested), technology(tested), rate=_CAUSES * rate)
     change = _without(change, without)
     change, needless = _counted_well(change, model, _level(rate))
-    guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless))
+    guilty = tuple(each for each in change.effects
+                   if each not in (*NUISANCES, *needless) and _chance(change, tested, each) < _level(rate))
+    change = _without(change, frozenset(each.name for each in change.effects if each not in (*NUISANCES, *needless, *guilty)))
     if model is None:
         return Named(change, change, guilty, tested, rate)
     fit = _refitted(dwells, model, change)
@@ -167,13 +169,54 @@ def change_of(fit: Calibration, model: GyroModel, effect: Effect) -> float:
 
 def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
     """Return how likely dwells would show as much of a change of bias or scale factor where there is none."""
+    column = columns_of(_used(fit), [term for term in fit.terms if term.effect is effect])[:, 0]
+    return _chance(fit, model, effect, column * change_of(fit, model, effect))
+
+
+def _chance(fit: Calibration, model: GyroModel, effect: Effect, added: Array | None = None) -> float:
+    """
+    Return how likely dwells and the errors that the model's values have would show as much of an effect where there is nothing of it.
+
+    Parameters
+    ----------
+    fit : of dwells beside the model
+    model : whose own covariance counts too, where it has one
+    added : what is too much for chance, rad/s, of each dwell that is fitted; all that the effect adds where it is None
+
+    """
     if not fit.freedom:
         return 1.0
-    used = take(fit.dwells, fit.scatter.kept)
-    place = [term.effect for term in fit.terms for _ in term.fitted].index(effect)
-    uncertain = Uncertainty.of(used, fit.scatter, columns_of(used, fit.terms), fit.residual[fit.scatter.kept])
-    below = float(uncertain.below(-change_of(fit, model, effect))[place])
+    used, others = _used(fit), [term for term in fit.terms if term.effect is not effect]
+    if added is None:
+        added = sum(term.error(channels_of(used)) for term in fit.terms if term.effect is effect) + np.zeros(len(used))
+    if not np.any(added):
+        return 1.0
+    columns = np.column_stack([*columns_of(used, others).T, added]) if others else added[:, None]
+    uncertain = Uncertainty.of(used, fit.scatter, columns, fit.residual[fit.scatter.kept])
+    below = float(uncertain.below(-_of_dwells(fit, model, columns))[-1])
     return 2.0 * min(below, 1.0 - below)
+
+
+def _used(fit: Calibration) -> Dwells:
+    return take(fit.dwells, fit.scatter.kept)
+
+
+def _of_dwells(fit: Calibration, model: GyroModel, columns: Array) -> float:
+    """Return how large the standard deviation of the last value by the dwells is, of that by dwells and model together."""
+    known = [term for term in seen(model) if term.fitted]
+    if model.covariance is None or not known:
+        return 1.0
+    places = _places(model.terms, 0)
+    chosen = [place for term in known for place in places[term.effect.name]]
+    whitener = Whitener(_used(fit), fit.scatter)
+    lengths = np.linalg.norm(columns, axis=0)
+    inverse = np.linalg.pinv(whitener.whiten(columns / lengths))[-1]
+    channels = surroundings(model, _used(fit))
+    rows = [row + np.zeros(len(inverse)) for term in known for row in term.sensitivity(channels)]
+    moved = inverse @ whitener.whiten(np.column_stack(rows))
+    by_model = float(moved @ model.covariance[np.ix_(chosen, chosen)] @ moved)
+    by_dwells = float(inverse @ inverse)
+    return float(np.sqrt(by_dwells / (by_dwells + by_model)))
 
 
 def _or_twin(effect: Effect, fit: Calibration) -> Effect:
