@@ -36,6 +36,12 @@ from gyro_calibration.selection import supported_effects, swapped_effects
 _LEFT, _OUTLYING = 0.2, 0.05
 #: An effect of the smallest size that is said is found with this probability.
 _POWER = 0.95
+_METHOD = (
+    'The rates and temperatures of the dwells were put through the simulation, and what the measured outputs differ by was compared with',
+    'the effects of rate and temperature. How dwells and sweeps scatter was found by restricted likelihood about a smooth surface; an effect',
+    'was taken where it predicts left-out sweeps better, and chance alone, averaged over what the scatter may be, shows as much in one of',
+    'many tables: of tables without any cause, {share:.2g} % give an alarm at most. Then curves over rate, temperature and the order of the',
+    'dwells were tried on what is left. What is won was measured on sweeps that took no part in choice or fit; intervals are of 95 %.')
 #: A name is withdrawn where more than this part of what it explains is left along the same variable.
 _WITHDRAWN = 0.1
 
@@ -70,7 +76,8 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, generator: np.r
     return Diagnosis(
         findings, known.left.found, Noise(), Noise() if model is None else model.noise, gain, before, _noted(after, findings, before),
         _cannot_show(dwells), curves(dwells, known.named.fit.scatter, before, after),
-        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)), false_alarm_rate=rate)
+        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)), false_alarm_rate=rate,
+        method=' '.join(_METHOD).format(share=100.0 * rate))
 
 
 def _as_log(dwells: Dwells) -> Log:
