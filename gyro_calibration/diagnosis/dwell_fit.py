@@ -203,20 +203,24 @@ def _used(fit: Calibration) -> Dwells:
 
 def _of_dwells(fit: Calibration, model: GyroModel, columns: Array) -> float:
     """Return how large the standard deviation of the last value by the dwells is, of that by dwells and model together."""
+    whitener = Whitener(_used(fit), fit.scatter)
+    inverse = np.linalg.pinv(whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
+    by_model = inverse @ whitener.whiten(doubt(fit, model))
+    by_dwells = float(inverse @ inverse)
+    return float(np.sqrt(by_dwells / (by_dwells + by_model @ by_model)))
+
+
+def doubt(fit: Calibration, model: GyroModel) -> Array:
+    """Return what independent deviations of one of the model's values add to each dwell that is fitted, rad/s, shape (n, m)."""
     known = [term for term in seen(model) if term.fitted]
     if model.covariance is None or not known:
-        return 1.0
+        return np.zeros((len(_used(fit)), 1))
     places = _places(model.terms, 0)
     chosen = [place for term in known for place in places[term.effect.name]]
-    whitener = Whitener(_used(fit), fit.scatter)
-    lengths = np.linalg.norm(columns, axis=0)
-    inverse = np.linalg.pinv(whitener.whiten(columns / lengths))[-1]
+    sizes, directions = np.linalg.eigh(model.covariance[np.ix_(chosen, chosen)])
     channels = surroundings(model, _used(fit))
-    rows = [row + np.zeros(len(inverse)) for term in known for row in term.sensitivity(channels)]
-    moved = inverse @ whitener.whiten(np.column_stack(rows))
-    by_model = float(moved @ model.covariance[np.ix_(chosen, chosen)] @ moved)
-    by_dwells = float(inverse @ inverse)
-    return float(np.sqrt(by_dwells / (by_dwells + by_model)))
+    rows = [row + np.zeros(len(_used(fit))) for term in known for row in term.sensitivity(channels)]
+    return np.column_stack(rows) @ (directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
 def _or_twin(effect: Effect, fit: Calibration) -> Effect:

@@ -50,14 +50,23 @@ class Left:
     misfit: Mapping[str, float]
 
 
-def what_is_left(fit: Calibration, level: float) -> Left:
-    """Look for structure in what a fit leaves; `level` is the chance to find any where there is none."""
+def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
+    """
+    Look for structure in what a fit leaves.
+
+    Parameters
+    ----------
+    fit : of dwells
+    level : the chance to find any where there is none
+    doubt : what deviations of the values of the model add to each dwell, rad/s, shape (n, m): that is no structure
+
+    """
     used = take(fit.dwells, fit.scatter.kept)
     probes = {name: columns for name, columns in _probes(used).items() if columns.shape[1]}
     known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
     found, gains, limit = [], {}, level / max(len(probes), 1)
     while probes:
-        judged = [_judged(name, fit, known, columns, error) for name, columns in probes.items()]
+        judged = [_judged(name, fit, known, columns, error, doubt) for name, columns in probes.items()]
         best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
         if best.p_value >= limit:
             break
@@ -67,7 +76,7 @@ def what_is_left(fit: Calibration, level: float) -> Left:
     return Left(tuple(found), gains)
 
 
-def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array) -> tuple[Unexplained, float]:
+def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array, doubt: Array) -> tuple[Unexplained, float]:
     """Return how much a curve explains beside what is known, with its chance, and by what it lowers the misfit."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
@@ -82,13 +91,14 @@ def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
     share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
     # Columns in their own unit, for the covariance of the dwells may be another one.
     plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
-    chance = _chance(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error), count)
+    chance = _chance(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error), new.T @ whitener.whiten(doubt))
     return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
-def _chance(uncertainty: Uncertainty, count: int) -> float:
-    """Return how likely the last values are all nothing, by Fisher's distribution, averaged over what the scatter may be."""
-    values, covariances = uncertainty.offsets[:, -count:], uncertainty.covariances[:, -count:, -count:]
+def _chance(uncertainty: Uncertainty, doubt: Array) -> float:
+    """Return how likely the last values are all nothing but doubt, by Fisher's distribution, averaged over what the scatter may be."""
+    count = len(doubt)
+    values, covariances = uncertainty.offsets[:, -count:], uncertainty.covariances[:, -count:, -count:] + doubt @ doubt.T
     squares = np.einsum('ki,ki->k', values, np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
     return float(uncertainty.weights @ fisher.sf(squares / count, count, uncertainty.freedom))
 

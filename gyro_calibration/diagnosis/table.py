@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from gyro_calibration.calibration import Calibration, columns_of, fit_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.door import refuse
-from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, change_of, model_after, model_before, name_causes, seen, tried
+from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, change_of, doubt, model_after, model_before, name_causes, seen, tried
 from gyro_calibration.diagnosis.dwell_gain import WINDOW, curves, measure_gain
 from gyro_calibration.diagnosis.dwell_rest import RATE, SINGLE_RATES, Left, what_is_left
 from gyro_calibration.diagnosis.dwell_sets import alternatives
@@ -38,9 +38,9 @@ _LEFT, _OUTLYING = 0.2, 0.05
 _POWER = 0.95
 _METHOD = (
     'The rates and temperatures of the dwells were put through the simulation, and what the measured outputs differ by was compared with',
-    'the effects of rate and temperature. How dwells and sweeps scatter was found by restricted likelihood about a smooth surface; an effect',
-    'was taken where it predicts left-out sweeps better, and chance alone, averaged over what the scatter may be, shows as much in one of',
-    'many tables: of tables without any cause, {share:.2g} % give an alarm at most. Then curves over rate, temperature and the order of the',
+    'the effects of rate and temperature. How dwells and sweeps scatter was found by restricted likelihood about a smooth surface. An',
+    'effect was taken where it predicts left-out sweeps better, and chance alone, averaged over what the scatter may be, hardly shows as',
+    'much: of tables without any cause, {share:.2g} % give an alarm. Then curves over rate, temperature and the order of the',
     'dwells were tried on what is left. What is won was measured on sweeps that took no part in choice or fit; intervals are of 95 %.')
 #: A name is withdrawn where more than this part of what it explains is left along the same variable.
 _WITHDRAWN = 0.1
@@ -103,12 +103,12 @@ class _Known:
 def _conclude(dwells: Dwells, model: GyroModel | None, rate: float) -> _Known:
     """Name causes, and withdraw names along a variable where much has none."""
     named = name_causes(dwells, model, rate)
-    left = what_is_left(named.fit, _LEFT * rate)
+    left = what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model))
     withdrawn = frozenset(effect.name for effect in named.causes if effect not in NUISANCES and _doubtful(named, left, effect))
     if not withdrawn:
         return _Known(named, left)
     named = name_causes(dwells, model, rate, withdrawn)
-    return _Known(named, what_is_left(named.fit, _LEFT * rate), withdrawn)
+    return _Known(named, what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model)), withdrawn)
 
 
 def _doubtful(named: Named, left: Left, effect: Effect) -> bool:
