@@ -273,8 +273,9 @@ def _motions(seen: Reach) -> Iterator[Conditions]:
     yield _plan(seen, 'slow_sweep', f'sweep slowly through zero, between -{_degrees(slow)} and {_degrees(slow)}, for 4 min',
                 rate=[(30.0, slow), *[(60.0, -slow), (60.0, slow)] * 2][:5], settled=True)
     fastest = max(2.0, 2.0 * math.pi * top / ACCELERATION)
-    yield _plan(seen, 'swings', f'swing evenly to and fro for 2 min at up to {_degrees(top)}, the quickest swings in {fastest:.1f} s',
-                rate=_swings(top, fastest), settled=True)
+    for name, period in (('slow_swings', 2.5 * fastest), ('swings', 1.6 * fastest), ('quick_swings', fastest)):
+        yield _plan(seen, name, f'swing evenly to and fro for 2 min at up to {_degrees(top)}, the quickest swings in {period:.1f} s',
+                    rate=_swings(top, period), settled=True)
     gentle = max(0.5, 2.0 * top / GENTLY)
     yield _plan(seen, 'gentle_reversals', f'swing to and fro with reversals within {gentle:.1f} s for 2 min at up to {_degrees(top)}',
                 rate=_reversals(top, gentle, 120.0), settled=True)
@@ -346,6 +347,11 @@ def _surroundings(seen: Reach) -> Iterator[Conditions]:
 def _cycles(seen: Reach) -> Iterator[Conditions]:
     if seen.span >= LEAST_SPAN:
         yield from _cycles_between(seen, seen.low, seen.high, seen.heating, '', False)
+        leg = seen.span / QUICK_HEATING
+        many = math.ceil(600.0 / leg)
+        yield _plan(seen, 'quick_triangles', f'heat and cool it faster than in the log, between {seen.low:.0f} and {seen.high:.0f} °C at '
+                    f'{60.0 * QUICK_HEATING:.0f} K/min, {many} times, at rest, {_minutes(2.0 * many * leg)}',
+                    temperature=[(leg, seen.high), (leg, seen.low)] * many, start=seen.low, beyond=True)
     wide = 'go beyond what the log has seen: '
     yield from _cycles_between(seen, seen.low - WIDER, seen.high + WIDER, QUICK_HEATING, wide, True)
 
