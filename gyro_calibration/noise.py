@@ -36,7 +36,7 @@ class Noise:
         return self.angle_random_walk ** 2 / interval
 
     def allan_variance(self, duration: float) -> float:
-        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of the difference of neighbours."""
+        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of neighbours' difference."""
         return (self.angle_random_walk ** 2 / duration + (ALLAN_FLOOR * self.bias_instability) ** 2
                 + self.rate_random_walk ** 2 * duration / 3.0)
 
