@@ -218,14 +218,14 @@ def _rank(plan: Conditions, apart: Pairs) -> tuple[float, ...]:
     Return what is smallest for the best plan.
 
     First come those that part all members, then those that part the named one from all others; of both, those within what was seen, and
-    of these the shortest. Where none is enough, it counts what is parted.
+    of these the shortest, and the first of the menu of those that are as short. Where none is enough, it counts what is parted.
 
     """
     reached = sum(min(value, ENOUGH) for value in apart.values())
     parts_all = min(apart.values()) >= ENOUGH
     if not parts_all and min(value for pair, value in apart.items() if 0 in pair) < ENOUGH:
         return (4.0, -reached, float(plan.beyond), round(plan.minutes))
-    return (2.0 * plan.beyond + (not parts_all), round(plan.minutes), -reached)
+    return (2.0 * plan.beyond + (not parts_all), round(plan.minutes))
 
 
 def _told(question: _Question, plan: Conditions, apart: Pairs, now: Pairs) -> Experiment:

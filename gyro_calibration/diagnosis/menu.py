@@ -378,9 +378,9 @@ def _minutes(seconds: float) -> str:
 
 
 def _beyond(seen: Reach) -> Iterator[Conditions]:
-    for factor in (2.0, 4.0, 10.0):
+    for factor in (2.0, 3.0, 4.0, 6.0, 10.0):
         top = factor * seen.rate
         if top > MOST_RATE:
-            return
+            break
         yield _plan(seen, f'{factor:.0f}_times_as_fast', f'turn faster than in the log, both ways at eight speeds for 4 min, up to '
                     f'{_degrees(top)}', rate=_staircase(top, max(0.1, 2.0 * top / ACCELERATION)), settled=True, beyond=True)
