@@ -23,8 +23,9 @@ UNNAMED = '~'
 KNOTS = 8
 #: Moments and widths of a bump in a log, as parts of it.
 MOMENTS, BUMPS = 40, (0.007, 0.02, 0.05)
-#: Waves over the range of a variable.
-WAVES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)
+#: Waves over the range of a variable, so dense that none falls between two.
+WAVES = {'rate': tuple(np.arange(1.0, 9.5, 0.5)), 'temperature': tuple(np.arange(1.0, 7.5, 0.5))}
+_OTHER_WAVES = (1.0, 1.5, 2.0, 3.0, 4.0)
 HARMONICS = range(2, 9)
 
 Of = Callable[[Replay], Array]
@@ -46,10 +47,9 @@ def probes(replays: Sequence[Replay]) -> list[Candidate]:
     found = [each for name, of in variables.items() for each in _of_one(name, of)]
     if 'rate' in variables:
         found += [*_of_rate(variables['rate']), *_of_heading(variables)]
-        found += [_probe(f'rate and {name}', _product(of, variables['rate'], square)) for name, of in variables.items()
-                  if name not in ('rate', 'temperature') for square in (False,)]
-    for first, second in combinations([name for name in variables if name != 'rate'], 2):
-        found.append(_probe(f'{first} and {second}', _product(variables[first], variables[second], False)))
+    for first, second in combinations(variables, 2):
+        if (first, second) != ('rate', 'temperature'):  # their product has a name
+            found.append(_probe(f'{first} and {second}', _product(variables[first], variables[second])))
     return [*found, *_of_time(replays)]
 
 
@@ -79,7 +79,7 @@ def _scaled(of: Of, low: float, high: float) -> Of:
 
 
 def _of_one(name: str, of: Of) -> Iterator[Candidate]:
-    for waves in WAVES:
+    for waves in WAVES.get(name, _OTHER_WAVES):
         yield _probe(name, _wave(of, waves))
     for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
         if (name, power) != ('rate', 2):
@@ -113,8 +113,8 @@ def _spline(of: Of) -> Callable[[Replay], Sequence[Array]]:
     return columns
 
 
-def _product(first: Of, second: Of, square: bool) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (first(each) * second(each) ** (2 if square else 1),)
+def _product(first: Of, second: Of) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (first(each) * second(each),)
 
 
 def _of_rate(rate: Of) -> Iterator[Candidate]:

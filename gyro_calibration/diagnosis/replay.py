@@ -160,12 +160,12 @@ def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
     A line begins and ends in the mean of as many samples as it bridges: the noise of a single one would be carried across the gap.
 
     """
+    if len(known) == place[-1] + 1:
+        return known
     steps = np.diff(place)
     before = np.flatnonzero(steps > 1)
     whole = np.empty(place[-1] + 1)
     whole[place] = known
-    if not len(before):
-        return whole
     length = steps[before] - 1
     total = np.concatenate([[0.0], np.cumsum(known)])
     first, last = np.maximum(before + 1 - length, 0), np.minimum(before + 1 + length, len(known))

@@ -73,6 +73,9 @@ def _written(folder: str, found: Diagnosis) -> list[str]:
     """Write all files; what they hold is made before the first of them is touched."""
     content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n', 'report.html': report(found),
                'model.yaml': model_text(found.model)}
+    for name in content:
+        if (Path(folder) / name).is_dir():
+            raise IsADirectoryError(f'{Path(folder) / name} is a folder, where a file is to be written; move it away')
     for name, text in content.items():
         write_atomically(Path(folder) / name, text.encode())
     return [f'Written to {folder}: {", ".join(content)}.']
