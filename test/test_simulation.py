@@ -6,12 +6,13 @@ A simulated log is what the model says of the motion, and says so itself.
 import numpy as np
 import pytest
 
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.history import channels_of
 from gyro_calibration.log import read_log, write_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
+from gyro_calibration.simulation import respond, simulate
 
 GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=Noise(7e-4), reference_temperature=33.0)
 
@@ -48,3 +49,23 @@ def test_a_simulated_log_is_a_log(tmp_path):
     log = simulate(GYRO, CALIBRATION, 20.0, np.random.default_rng(0))
     write_log(tmp_path / 'log.csv', log)
     assert np.array_equal(read_log(tmp_path / 'log.csv').output, log.output)
+
+
+def test_a_log_is_replayed_with_its_motion_and_surroundings():
+    """What a simulated gyro said in a temperature that changed is said again by the model in the channels of its log."""
+    model = GyroModel((*GYRO.terms, Term(CATALOGUE['thermal_lag'], (5.0, 1e-3)), Term(CATALOGUE['warm_up'], (10.0, 0.01)),
+                       Term(CATALOGUE['heading_sensitivity'], (1e-3, 0.0)), Term(CATALOGUE['time_offset'], (0.02,))))
+    log = simulate(model, CALIBRATION, 50.0, temperature=25.0 + 10.0 * np.sin(np.arange(1001) / 200.0))
+    channels = channels_of(log)
+    assert np.array_equal(respond(model, log.time, channels.moving(log.reference_rate, log.reference_rate)), log.output)
+    error = log.output - simulate(GYRO, CALIBRATION, 50.0).output
+    late = 0.9 * (CALIBRATION.rate_at(log.time - 0.02) - log.reference_rate)
+    lagging = 1e-3 * (channels.lagged('temperature', 5.0) - log.temperature)
+    assert error - late - lagging == pytest.approx(0.01 * np.exp(-log.time / 10.0) + 1e-3 * np.sin(log.reference_heading), abs=1e-12)
+
+
+def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run):
+    (tmp_path / 'model.yaml').write_text('effects: {warm_up: {warm_up: 0.01, time_constant: 5}, quantization: {quantization: 1e-3}}')
+    code, *_ = run('simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest', '--out', tmp_path / 'log.csv')
+    log = read_log(tmp_path / 'log.csv')
+    assert code == 0 and log.output == pytest.approx(1e-3 * np.round(10.0 * np.exp(-log.time / 5.0)), abs=1e-12)

@@ -69,22 +69,36 @@ class _Found:
             self.heading, self.deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
 
 
+@dataclass(frozen=True)
+class _Piece:
+    """A block of a log, the rows in which the output is known, and the new columns there."""
+
+    log: Log
+    known: Mask
+    columns: dict[str, Array]
+
+
 def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and count what is found in it."""
-    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-    integrator, variance = BlockIntegrator(threshold, model.noise, covariance(model)), 0.0
-    compensation = LogCompensation(model)
-    for log in read_blocks(given):
-        output = output_of(given, log)
-        if log.time is not None and not found.rows:
-            # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
-            variance = model.noise.rate_variance(float(np.median(np.diff(log.time))))
-        known = np.isfinite(output)
-        columns = _columns(model, compensation, integrator, variance, rows_of(replace(log, output=output), known))
-        found.add(log, columns)
-        yield log, {name: _at(known, values) for name, values in columns.items()}
+    pieces = _pieces(given, model)
+    for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
+        found.add(piece.log, piece.columns)
+        yield piece.log, {name: _at(piece.known, values) for name, values in piece.columns.items()}
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
+
+
+def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
+    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
+    integrator, compensation = BlockIntegrator(threshold, model.noise, covariance(model)), LogCompensation(model)
+    variance: float | None = None
+    for log in read_blocks(given):
+        log = replace(log, output=output_of(given, log))
+        if variance is None:
+            # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
+            variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(np.diff(log.time))))
+        known = np.isfinite(np.asarray(log.output))
+        yield _Piece(log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)))
 
 
 def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator, variance: float, log: Log) -> dict[str, Array]:
@@ -94,10 +108,34 @@ def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockI
         time = compensation.true_time(log.time) if model.moves_stamps else log.time
         columns['rate_rad_s'], columns['heading_rad'], columns['heading_std_rad'] = integrator.add(time, result.rate, sensitivity)
         if model.moves_stamps:
-            columns['rate_time_s'] = time
+            columns[_TRUE_TIME] = time
     columns['rate_std_rad_s'] = np.sqrt(variance + quadratic_form(covariance(model), sensitivity))
     columns['temperature_clipped'], columns['beyond_range'] = result.temperature_clipped, result.beyond_range
     return columns
+
+
+#: When samples were taken, where a model moves stamps; what belongs to these times is interpolated at the stamps of the rows.
+_TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad', 'rate_std_rad_s')
+
+
+def _on_stamps(pieces: Iterator[_Piece]) -> Iterator[_Piece]:
+    """Bring what belongs to moved stamps back to the rows, so that it stands beside the reference of its time; blocks beside help."""
+    before: _Piece | None = None
+    here = next(pieces, None)
+    while here is not None:
+        after = next(pieces, None)
+        around = [each.columns for each in (before, here, after) if each is not None and _TRUE_TIME in each.columns]
+        yield _brought(here, around) if around else here
+        before, here = here, after
+
+
+def _brought(piece: _Piece, around: list[dict[str, Array]]) -> _Piece:
+    assert piece.log.time is not None
+    true = np.concatenate([columns[_TRUE_TIME] for columns in around])
+    stamps, columns = piece.log.time[piece.known], {name: values for name, values in piece.columns.items() if name != _TRUE_TIME}
+    if len(true):
+        columns.update({name: np.interp(stamps, true, np.concatenate([each[name] for each in around])) for name in _MOVED})
+    return replace(piece, columns=columns)
 
 
 def _at(known: Mask, values: Array) -> Array:

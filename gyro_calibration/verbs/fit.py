@@ -64,7 +64,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _effects(text: str) -> list[Effect]:
     unknown = [name for name in text.split(',') if name not in STEADY]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect; choose from {", ".join(STEADY)}')
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect that fit knows; choose from {", ".join(STEADY)}')
     return [STEADY[name] for name in dict.fromkeys(text.split(','))]
 
 
