@@ -340,8 +340,9 @@ def _surroundings(seen: Reach) -> Iterator[Conditions]:
         yield _plan(seen, 'poses', 'turn it over slowly and let it rest for half a minute each with its axis up, level, down and level',
                     pose=_held([GRAVITY, 0.0, -GRAVITY, 0.0], 30.0, 40.0), settled=True)
         level = seen.vibration[0] if seen.vibration[0] > 0.01 * VIBRATION else VIBRATION
-        yield _plan(seen, 'motor', f'run the motor and stop it each half minute for 5 min, at rest, shaking with '
-                    f'{math.sqrt(level):.2g} m/s²', motor=_held([0.0, level] * 5, 29.5, 0.5), settled=True)
+        for name, many in (('motor', 5), ('long_motor', 30)):
+            yield _plan(seen, name, f'run the motor and stop it each half minute for {many} min, at rest, shaking with '
+                        f'{math.sqrt(level):.2g} m/s²', motor=_held([0.0, level] * many, 29.5, 0.5), settled=True)
 
 
 def _cycles(seen: Reach) -> Iterator[Conditions]:
