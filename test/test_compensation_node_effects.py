@@ -10,7 +10,7 @@ from fake_gyro import FakeGyro
 from gyro_calibration.heading import integrate
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Log
-from gyro_calibration.log_compensation import compensate_log
+from gyro_calibration.log_compensation import LogCompensation
 from gyro_calibration.model_file import read_model
 from gyro_calibration.simulation import respond
 
@@ -55,7 +55,7 @@ def test_effects_with_a_past_gain_in_a_drive_what_they_promise(start, tmp_path, 
         gyro.interval = 0.1
         gyro.play(log.output, log.temperature)
         headings = np.array([message.data for message in gyro.heading])[-len(log):]
-        promised = integrate(log.time, compensate_log(model, log))
+        promised = integrate(log.time, LogCompensation(model).add(log)[0].rate)
         errors[name] = headings - headings[0] - log.reference_heading
         np.testing.assert_allclose(headings - headings[0], promised, rtol=0.0, atol=0.01)
         assert node.stop() == 0

@@ -78,12 +78,16 @@ def test_a_reference_heading_that_is_lost_for_a_while_is_bridged():
     assert compensate_log(model, torn) == pytest.approx(log.reference_rate, abs=1e-5)
 
 
-def test_rows_without_output_are_left_out():
-    model = model_of(VALUES)
+def test_rows_without_output_are_left_out(tmp_path, run):
+    model = model_of(VALUES | HEADING)
     log = drive(model)
-    torn = replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output))
-    rate = compensate_log(model, torn)
+    write_model(tmp_path / 'model.yaml', model)
+    write_log(tmp_path / 'log.csv', replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output)))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    rate = np.array(read_log(tmp_path / 'out.csv').others['rate_rad_s'], float)
+    assert code == 0 and '18 rows have no output' in text
     assert np.isnan(rate).sum() == 18 and np.nanmax(np.abs(rate - log.reference_rate)) < 1e-3
+    assert np.array_equal(compensate_log(model, read_log(tmp_path / 'log.csv')), rate, equal_nan=True)
 
 
 def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():

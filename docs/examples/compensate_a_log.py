@@ -12,10 +12,11 @@ import sys
 
 import numpy as np
 
-from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.compensation import covariance
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
 from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
 from gyro_calibration.log import DEGREE, write_log
+from gyro_calibration.log_compensation import LogCompensation
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import ROBOT
 from gyro_calibration.noise import Noise
@@ -23,15 +24,15 @@ from gyro_calibration.simulation import simulate
 
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
 MODEL = GyroModel(
-    (Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,))),
-    covariance=np.diag([1e-4, 5e-4]) ** 2,  # of bias, (rad/s)², and of the scale factor error
+    (Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,)), Term(THERMAL_LAG, (60.0, 1e-4))),
+    covariance=np.diag([1e-4, 5e-4, 5.0, 1e-5]) ** 2,  # of bias, (rad/s)², scale factor error, time constant, s², and lag, (rad/s/K)²
     noise=NOISE)
 
 
 def main(path='compensated.csv'):
-    log = simulate(MODEL, ROBOT, 100.0, np.random.default_rng(1))
-    result = compensate(MODEL, log.output, log.temperature)
-    sensitivity = rate_sensitivity(MODEL, log.output, result.rate, log.temperature)
+    temperature = np.linspace(20.0, 45.0, round(100.0 * ROBOT.duration) + 1)
+    log = simulate(MODEL, ROBOT, 100.0, np.random.default_rng(1), temperature)
+    result, sensitivity = LogCompensation(MODEL).add(log)
     integrator = BlockIntegrator(Threshold(angle_random_walk=NOISE.angle_random_walk), NOISE, covariance(MODEL))
     filtered, heading, deviation = integrator.add(log.time, result.rate, sensitivity)
     write_log(path, log, {'rate_rad_s': filtered, 'heading_rad': heading, 'heading_std_rad': deviation})
