@@ -18,6 +18,9 @@ from gyro_calibration.log import Array
 #: Places of a step that are tried in a log.
 STEPS = 64
 
+#: A thermal lag shorter than this, s, is nothing but the rate of the temperature.
+FASTEST_LAG = 12.0
+
 #: Columns of one log: (replay) -> arrays of shape (n,).
 Columns = Callable[[Replay], Sequence[Array]]
 
@@ -137,18 +140,18 @@ def _of_temperature(replays: Sequence[Replay]) -> Iterator[Candidate]:
     yield effect('bias_temperature', middle)
     for reference in reference_temperatures(replays):
         yield effect('bias_temperature_quadratic', reference)
-    for filter_time in (3.0, 10.0):
+    for filter_time in (0.3, 1.0, 3.0, 10.0):
         yield effect('bias_temperature_rate', filter_time)
-    for time_constant in np.geomspace(12.0, min(duration, 3000.0), 8):
+    for time_constant in np.geomspace(FASTEST_LAG, min(duration, 3000.0), 8):
         yield effect('thermal_lag', time_constant)
-    for threshold in (5e-4, 2e-3):
-        yield effect('thermal_hysteresis', 3.0, threshold)
+    for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)):
+        yield effect('thermal_hysteresis', filter_time, threshold)
 
 
 def _of_surroundings(has: frozenset[str]) -> Iterator[Candidate]:
     if 'specific_force' in has:
         yield effect('acceleration_sensitivity')
-        for time_constant in (0.3, 1.0):
+        for time_constant in (0.1, 0.3, 1.0):
             yield effect('vibration_rectification', time_constant)
     if 'supply' in has:
         yield effect('supply_sensitivity', 5.0)

@@ -19,14 +19,15 @@ from gyro_calibration.log import Array
 
 #: Begins the name of what has none; the variable follows along which it lies.
 UNNAMED = '~'
-#: Knots of a spline over a variable.
-KNOTS = 8
+#: Knots of splines over a variable: few for what is smooth, many for what is not.
+KNOTS = {'rate': (8, 24), 'temperature': (8, 24)}
+_OTHER_KNOTS = (8,)
 #: Moments and widths of a bump in a log, as parts of it.
 MOMENTS, BUMPS = 40, (0.007, 0.02, 0.05)
 #: Waves over the range of a variable, so dense that none falls between two.
-WAVES = {'rate': tuple(np.arange(1.0, 9.5, 0.5)), 'temperature': tuple(np.arange(1.0, 7.5, 0.5))}
+WAVES = {'rate': tuple(np.arange(1.0, 12.5, 0.5)), 'temperature': tuple(np.arange(1.0, 8.5, 0.5))}
 _OTHER_WAVES = (1.0, 1.5, 2.0, 3.0, 4.0)
-HARMONICS = range(2, 9)
+HARMONICS = range(2, 11)
 
 Of = Callable[[Replay], Array]
 
@@ -86,7 +87,8 @@ def _of_one(name: str, of: Of) -> Iterator[Candidate]:
             yield _probe(name, _power(of, power))
     for steep in (-8.0, -4.0, 4.0, 8.0):
         yield _probe(name, _exponential(of, steep))
-    yield _probe(name, _spline(of))
+    for knots in KNOTS.get(name, _OTHER_KNOTS):
+        yield _probe(name, _spline(of, knots))
 
 
 def _wave(of: Of, waves: float) -> Callable[[Replay], Sequence[Array]]:
@@ -104,8 +106,8 @@ def _exponential(of: Of, steep: float) -> Callable[[Replay], Sequence[Array]]:
     return lambda each: (np.exp(steep * of(each) - abs(steep)),)
 
 
-def _spline(of: Of) -> Callable[[Replay], Sequence[Array]]:
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, KNOTS - 2), [1.0] * 3])
+def _spline(of: Of, count: int) -> Callable[[Replay], Sequence[Array]]:
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
 
     def columns(each: Replay) -> Sequence[Array]:
         table = BSpline.design_matrix(of(each), knots, 3).toarray().T

@@ -16,7 +16,17 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
-from gyro_calibration.diagnosis.candidates import Candidate, by_cause, candidates, columns_of, effect, fitted_shapes, pulse, with_shape
+from gyro_calibration.diagnosis.candidates import (
+    FASTEST_LAG,
+    Candidate,
+    by_cause,
+    candidates,
+    columns_of,
+    effect,
+    fitted_shapes,
+    pulse,
+    with_shape,
+)
 from gyro_calibration.diagnosis.evidence import Places, beside, drawn, evidence, judge, log_sum, sample, sums
 from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, work
 from gyro_calibration.diagnosis.probes import is_named, probes
@@ -30,8 +40,8 @@ DRAWS = 400
 MOST_NOISES = 60
 #: A cause that explains the data less well than the best by more than this, in logarithms of the likelihood, is ruled out.
 RULED_OUT = 3.2
-#: What a shape costs, for a free one fits a little noise.
-PRICE_OF_SHAPE = 1.5
+#: What a shape costs that is known to some part of where it may be.
+PRICE_OF_SHAPE = 2.0
 #: Causes that have no first shapes, but are scanned for.
 SCANNED = frozenset({'interference_tone', 'reference_slip'})
 #: A tone has at least so many periods in a log; slower ones are wander.
@@ -72,8 +82,8 @@ class Chance:
     def p_value(self, cause: str, found: float) -> float:
         """Return how often chance reaches an evidence."""
         if cause not in self.start:
-            return min(1.0, float(np.exp(-found)))
-        return min(1.0, self.share * float(np.exp(-(found - self.start[cause]) / self.scale[cause])))
+            return float(np.exp(-max(found, 0.0)))
+        return min(1.0, self.share * float(np.exp(min(-(found - self.start[cause]) / self.scale[cause], 700.0))))
 
 
 @dataclass(frozen=True)
@@ -204,10 +214,19 @@ def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
     return replace(whole, shapes=tuple(whole.shapes[place] for place in kept), noises=whole.noises.take(kept))
 
 
+@dataclass(frozen=True)
+class _First:
+    """A candidate with its first shapes: its evidence, and that averaged over all first shapes of its cause."""
+
+    candidate: Candidate
+    most: float
+    mean: float
+
+
 # what happens at any frequency, or at any moment
 
-def tones(done: Work) -> list[tuple[Candidate, float]]:
-    """Return the strongest tone of each log with its evidence, less what the number of frequencies makes likely."""
+def tones(done: Work) -> list[_First]:
+    """Return the strongest tone, of as many as there are frequencies."""
     found = []
     for each, white in zip(done.field.replays, done.white()):
         # Twice as long, since a tone between two frequencies of the log alone would lose more than half of its power.
@@ -215,11 +234,21 @@ def tones(done: Work) -> list[tuple[Candidate, float]]:
         lowest = 2 * LEAST_PERIODS
         if len(power) > 2 * lowest:
             best = lowest + int(power[lowest:-2].argmax())
-            found.append((effect('interference_tone', 0.5 * best / each.duration), float(power[best] - np.log(len(power)))))
-    return [max(found, key=lambda one: one[1])] if found else []
+            if each.rounded and not _of_the_gyro(each, 0.5 * best / each.duration):
+                continue
+            most = float(power[best]) - PRICE_OF_COLUMN
+            found.append(_First(effect('interference_tone', 0.5 * best / each.duration), most, most - float(np.log(len(power)))))
+    return [max(found, key=lambda one: one.mean)] if found else []
 
 
-def slips(done: Work) -> list[tuple[Candidate, float]]:
+def _of_the_gyro(each: Replay, frequency: float) -> bool:
+    """Tell whether a tone stays when the reference is smooth: the steps of an encoder make tones of their own."""
+    wave = np.exp(-2.0j * np.pi * frequency * each.channels.time[each.kept])
+    rough, smooth = (np.abs(np.mean((each.channels.output - rate)[each.kept] * wave)) for rate in (each.reference, each.channels.rate))
+    return bool(smooth > 0.5 * rough)
+
+
+def slips(done: Work) -> list[_First]:
     """Return the clearest jumps of the reference's heading, of those moments where it accelerates."""
     found = []
     parts = np.cumsum([each.points - 1 for each in done.field.replays])[:-1]
@@ -229,24 +258,34 @@ def slips(done: Work) -> list[tuple[Candidate, float]]:
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
             found += [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step)) for width in WIDTHS]
-    return [max(found, key=lambda one: one[1])] if found else []
+    return [max(found, key=lambda one: one.mean)] if found else []
 
 
-def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places, width: float) -> tuple[Candidate, float]:
+def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places, width: float) -> _First:
     """Return the jumps of one width, a second apart or more, each with evidence beyond what so many moments make likely."""
     time = np.arange(each.points) * each.step
     kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
-    value = 0.5 * correlate(white, kernel, 'same')[moments] ** 2 / (kernel @ kernel) - np.log(len(moments) * len(WIDTHS)) - PRICE_OF_COLUMN
+    likely = float(np.log(len(moments) * len(WIDTHS)))
+    value = 0.5 * correlate(white, kernel, 'same')[moments] ** 2 / (kernel @ kernel) - likely - PRICE_OF_COLUMN
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
+        if width <= 2.0 * each.step and not _of_the_reference(each, float(time[moments[place]])):
+            continue
         if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
             break
         at = float(each.channels.time[each.kept][0] + time[moments[place]])
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return effect('reference_slip', width, *chosen, run=run), total
+    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total)
+
+
+def _of_the_reference(each: Replay, moment: float) -> bool:
+    """Tell whether it is the reference that leaps, and not the output: the one that is further off its neighbours."""
+    at = int(np.clip(np.searchsorted(each.channels.time[each.kept], moment + each.channels.time[each.kept][0]), 3, each.kept.sum() - 4))
+    off = [np.abs(np.diff(values[each.kept][at - 3:at + 4], 2)).max() for values in (each.reference, each.channels.output)]
+    return bool(off[0] > off[1])
 
 
 # one cause more
@@ -259,12 +298,21 @@ class Step:
     score: float
 
 
-def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Step:
-    """Add a cause with the best of its shapes near those given."""
+def refined(search: Search, named: Sequence[Named], candidate: Candidate, price: float) -> Step:
+    """
+    Add a cause with the best of its shapes near those given.
+
+    Parameters
+    ----------
+    search, named : to which it is added
+    candidate : the cause
+    price : of the choice of its shape among others, in logarithms of the likelihood
+
+    """
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
         done = work(search.field, [*named, Named(candidate)])
-        width = done.widths[-1]
-        return Step((*named, Named(candidate)), done.score - (0.0 if is_named(candidate) else MARGIN) - PRICE_OF_COLUMN * max(width - 1, 0))
+        columns = PRICE_OF_COLUMN * max(done.widths[-1] - 1, 0)
+        return Step((*named, Named(candidate)), done.score - columns - price - (0.0 if is_named(candidate) else MARGIN))
     begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
     place = fitted_shapes(candidate)[0]
     low, high = _around(search, begin, place)
@@ -273,7 +321,8 @@ def refined(search: Search, named: Sequence[Named], candidate: Candidate) -> Ste
         return -work(search.field, [*named, Named(with_shape(begin, place, _shape(at, begin, place)))]).score
 
     best = minimize_scalar(cost, bounds=(low, high), method='bounded', options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
-    return Step((*named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - PRICE_OF_SHAPE)
+    columns = PRICE_OF_COLUMN if candidate.cause == 'interference_tone' else 0.0
+    return Step((*named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - price - columns)
 
 
 def _shape(at: float, begin: Candidate, place: int) -> float:
@@ -292,7 +341,8 @@ def _around(search: Search, begin: Candidate, place: int) -> tuple[float, float]
         width = 1.0 / (mine * max(each.duration for each in search.field.replays))
         return float(np.log(mine)) - width, float(np.log(mine)) + width
     width = 0.8
-    return float(np.log(abs(mine))) - width, float(np.log(abs(mine))) + width
+    low = float(np.log(FASTEST_LAG)) if begin.cause == 'thermal_lag' else -np.inf
+    return max(float(np.log(abs(mine))) - width, low), float(np.log(abs(mine))) + width
 
 
 #: How the effect of a small shape grows with it.
@@ -311,7 +361,7 @@ def _unbent(search: Search, named: Sequence[Named], candidate: Candidate) -> Can
     return with_shape(candidate, place, candidate.shapes[place] * float(np.copysign(abs(ratio) ** (1.0 / power), ratio)))
 
 
-def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] | None = None) -> tuple[Step | None, list[Step]]:
+def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
     """
     Look for one cause more.
 
@@ -321,24 +371,31 @@ def strongest(search: Search, named: Sequence[Named], held: Mapping[str, float] 
 
     """
     done = work(search.field, named)
-    stock = search.bank if not any(is_of_the_rate(each.candidate.cause) for each in named) else bank(search.field, search.candidates, named)
-    found = screen(done, stock)
-    scans = {'interference_tone': tones, 'reference_slip': slips}
-    scanned = [each for cause in search.scanned for each in scans[cause](done)]
-    # What has nothing but shapes is there or not: another of its kind is the first one, not well refined.
-    taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
-    first = [(search.candidates[max(own, key=lambda place: found[place])], float(averaged(found[own])), float(found[own].max()))
-             for cause, own in by_cause(search.candidates).items() if cause not in taken]
-    first += [(candidate, value, value) for candidate, value in scanned]
-    if not any(search.excess(candidate.cause, value) > 0.0 for candidate, value, _ in first):
+    first = _first(search, done, named)
+    if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         return None, []
-    top = max(most for _, _, most in first)
-    worth = [(most, candidate) for candidate, value, most in first
-             if most > 0.8 * top - 8.0 and (is_named(candidate) or search.excess(candidate.cause, value) > 0.0)]
-    steps = [refined(search, named, candidate) for _, candidate in sorted(worth, key=lambda each: -each[0])[:MOST_RIVALS]]
+    top = max(each.most for each in first)
+    worth = [each for each in first if each.most > 0.8 * top - 8.0
+             and (is_named(each.candidate) or search.excess(each.candidate.cause, each.mean) > 0.0)]
+    worth.sort(key=lambda each: -each.most)
+    steps = [refined(search, named, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
     # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
     steps = sorted((step for step in steps if step.score > done.score), key=lambda step: -step.score)
-    return (steps[0] if steps else None), steps
+    beyond = (step for step in steps if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
+    return next(beyond, None), steps
+
+
+def _first(search: Search, done: Work, named: Sequence[Named]) -> list[_First]:
+    """Return of each cause the first shape that is the best."""
+    changed = any(is_of_the_rate(each.candidate.cause) for each in named)
+    stock = bank(search.field, search.candidates, named) if changed else search.bank
+    found = screen(done, stock)
+    # What has nothing but shapes is there or not: another of its kind is the first one, not well refined.
+    taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
+    first = [_First(search.candidates[max(own, key=lambda place: found[place])], float(found[own].max()), float(averaged(found[own])))
+             for cause, own in by_cause(search.candidates).items() if cause not in taken and np.isfinite(found[own]).any()]
+    scans = {'interference_tone': tones, 'reference_slip': slips}
+    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done)]
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
@@ -373,6 +430,18 @@ def searched(search: Search) -> tuple[Named, ...]:
             break
         named = polished(search, step.named)
         named = _exchanged(search, named) if len(named) > 1 else named
+    return pruned(search, named)
+
+
+def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
+    """Take out causes that, beside the others, are not beyond chance, the weakest first."""
+    while named:
+        left = [search.excess(each.candidate.cause, evidence_of(search, named, place)) for place, each in enumerate(named)]
+        weakest = int(np.argmin(left))
+        if left[weakest] > 0.0:
+            break
+        rest = named[:weakest] + named[weakest + 1:]
+        named = polished(search, rest) if rest else rest
     return named
 
 

@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.diagnosis.search import Search, alternatives, begin, evidence_of, polished, searched
+from gyro_calibration.diagnosis.search import Search, alternatives, begin, evidence_of, polished, pruned, searched
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
@@ -97,7 +97,7 @@ def _repeating(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, .
             if columns and chi2.sf(max(more, 0.0), columns) < _REPEATS:
                 withdrawn.append(candidate.cause)
     kept = tuple(each for each in kept if each.candidate.cause not in withdrawn)
-    return (polished(search, kept) if kept != named else kept), withdrawn
+    return (pruned(search, polished(search, kept)) if kept and kept != named else kept), withdrawn
 
 
 def _simplest(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:

@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from gyro_calibration.effects.effect import Channels, Effect, Parameter, nothing_added
 from gyro_calibration.effects.lag import lagged_signal
 from gyro_calibration.log import Array, Number
 
+#: Points to each interval of the samples, for a lag.
+FINER = 4
 _FAST_REVERSALS = 'reverse quickly: a delay leaves the size of the swing as it is, a lag does not'
+
+
+def _at(when: Array, time: Array, signal: Array) -> Array:
+    """Return a signal at other times; beyond its ends it stays. Straight lines between samples would look like a delay in quick motion."""
+    return CubicSpline(time, signal)(np.clip(when, time[0], time[-1]))
 
 
 def _earlier(time: Number, offset: float) -> Number:
@@ -44,10 +52,16 @@ CLOCK_RATE = Effect(
     undone='It is undone by stretching the stamps of a log; a robot stamps by its own clock, where nothing is to be undone.')
 
 
+def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
+    """Return the signal through a lag, which takes it for straight between points closer than the samples."""
+    finer = np.interp(np.arange(FINER * (len(time) - 1) + 1) / FINER, np.arange(len(time)), time)
+    return lagged_signal(_at(finer, time, signal), finer, time_constant)[::FINER]
+
+
 BANDWIDTH = Effect(
     'bandwidth', 'The output follows the rate through a first-order lag.',
     frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-5, 10.0)),), _FAST_REVERSALS,
-    distortion=lagged_signal, stage='rate', undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
+    distortion=_lagged, stage='rate', undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
 
 
 def _dead_zone(channels: Channels, dead_zone: float) -> Sequence[Number]:
