@@ -1,0 +1,235 @@
+"""The verb diagnose as people call it: what it prints and writes, and what it says where the data do not allow an answer."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden import hide
+
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.log import COLUMNS, DEGREE, Log, read_log, write_log
+from gyro_calibration.model_file import read_model
+
+FILES = {'diagnosis.json', 'report.html', 'model.yaml'}
+SHORT = {'duration': 400.0, 'sample_rate': 20.0}
+
+
+def log_of(hidden):
+    """Return what the program reads of a hidden log."""
+    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1] for name, values in hidden.columns.items()})
+
+
+@pytest.fixture
+def hidden():
+    """Return a log in which a warm-up is hidden, with the truth."""
+    return hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', **SHORT)[0]
+
+
+@pytest.fixture
+def log(hidden, tmp_path):
+    """Return that log as the program reads it, and write it to drive.csv."""
+    write_log(tmp_path / 'drive.csv', log_of(hidden))
+    return log_of(hidden)
+
+
+@pytest.fixture
+def diagnose(run, tmp_path):
+    """Return a function that writes a log, diagnoses it into the folder `found`, and gives exit code, output and errors."""
+    def diagnose(log, *words):
+        write_log(tmp_path / 'given.csv', log)
+        return run('diagnose', tmp_path / 'given.csv', *words, '--out', tmp_path / 'found')
+    return diagnose
+
+
+def told(answer):
+    """Return what the program printed with --json, as data."""
+    code, text, errors = answer
+    assert code == 0, errors
+    return json.loads(text)
+
+
+# what is written and said
+
+def is_interval(values):
+    return len(values) == 2 and values[0] <= values[1]
+
+
+def check_finding(finding):
+    assert finding['effect'] in CAUSES and finding['cause'].endswith('.') and 0.0 <= finding['p_value'] <= 1.0
+    assert finding['minimum_detectable'] is None or finding['minimum_detectable'] > 0.0
+    assert set(finding['ambiguous_with']) <= set(CAUSES) - {finding['effect']}
+    assert bool(finding['ambiguous_with']) <= bool(finding['separate_by'])
+    for value in finding['parameters'].values():
+        low, high = value['ci95']
+        assert low <= value['estimate'] <= high and value['unit']
+
+
+def test_the_files_hold_what_they_say(log, run, tmp_path):
+    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+    assert code == 0 and 'warm up' in text and not errors
+    assert set(os.listdir(tmp_path / 'found')) == FILES
+    told = json.loads((tmp_path / 'found/diagnosis.json').read_text())
+    assert told['schema'] == 'gyro_calibration/diagnosis/1' and told['verdict'] == 'extended' and told['false_alarm_rate'] == 0.01
+    assert [finding['effect'] for finding in told['findings']] == ['warm_up'] and told['unexplained'] == []
+    check_finding(told['findings'][0])
+    assert set(told['noise']) == {'angle_random_walk', 'bias_instability', 'rate_random_walk'}
+    gain = told['gain']
+    assert gain['held_out'] and gain['heading_rms']['window_s'] == 60
+    assert all(gain[name]['after'] < gain[name]['before'] and is_interval(gain[name]['ci95']) for name in ('rate_rms', 'heading_rms'))
+    model = read_model(tmp_path / 'found/model.yaml')
+    assert 'warm_up' in {term.effect.name for term in model.terms}
+    assert model.origin['files'][0]['name'] == 'drive.csv'
+    assert '<html' in (tmp_path / 'found/report.html').read_text()
+
+
+def test_json_is_the_same_as_in_the_file_and_all_there_is(log, run, tmp_path):
+    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found', '--json')
+    assert code == 0 and json.loads(text) == json.loads((tmp_path / 'found/diagnosis.json').read_text())
+
+
+def test_a_seed_gives_the_same_answer_again_and_nothing_is_written_without_a_folder(log, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    answers = [run('diagnose', 'drive.csv', '--seed', '7', '--json') for _ in range(2)]
+    assert answers[0] == answers[1] and answers[0][0] == 0
+    assert os.listdir() == ['drive.csv']
+
+
+def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(log, run, tmp_path):
+    run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--model', tmp_path / 'found/model.yaml', '--json')
+    told = json.loads(text)
+    assert code == 0 and told['verdict'] == 'adequate' and told['gain'] is None, told['findings']
+
+
+def test_the_extended_model_simulates_and_compensates(log, run, tmp_path):
+    run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+    model = tmp_path / 'found/model.yaml'
+    assert run('compensate', tmp_path / 'drive.csv', '--model', model, '--out', tmp_path / 'rates.csv')[0] == 0
+    rate = np.array(read_log(tmp_path / 'rates.csv').others['rate_rad_s'], float)
+    left = [np.std(each - log.reference_rate) for each in (log.output, rate)]
+    assert left[1] < left[0]
+    assert run('simulate', '--model', model, '--motion', 'robot', '--out', tmp_path / 'simulated.csv', '--seed', '1')[0] == 0
+
+
+def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
+    names = ['first.csv', 'second.csv']
+    for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', runs=2, **SHORT)):
+        write_log(tmp_path / name, log_of(log))
+    answer = told(run('diagnose', *(tmp_path / name for name in names), '--json'))
+    assert [name.rpartition('/')[2] for name in answer['logs']] == names
+    assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
+
+
+# what allows no answer
+
+def one_sentence(errors):
+    """Tell whether the program said one thing, in one line, and no traceback."""
+    return len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors and len(errors.strip()) > 20
+
+
+def until(log, count):
+    return Log(**{name: getattr(log, name)[:count] for name in ('time', 'output', 'temperature', 'reference_rate', 'moving')})
+
+
+REFUSED = {
+    'without reference': (lambda log: replace(log, reference_rate=None, moving=None), 'no reference'),
+    'too short': (lambda log: until(log, 300), 'lasts 14.9'),
+    'too few samples': (lambda log: until(log, 50), 'samples'),
+    'constant gyro': (lambda log: replace(log, output=0.0 * log.output + 0.01), 'in 100 % of the samples'),
+    'reference that is the gyro': (lambda log: replace(log, reference_rate=log.output), 'one is made of the other'),
+    'nan everywhere': (lambda log: replace(log, output=np.nan * log.output), 'has a value in 0 of'),
+    'reference lost': (lambda log: replace(log, reference_rate=np.where(log.time < 2.0, log.reference_rate, np.nan)),
+                       'reference has a value'),
+}
+
+
+@pytest.mark.parametrize('spoilt, reason', REFUSED.values(), ids=REFUSED)
+def test_what_allows_no_answer_is_refused_in_one_sentence(spoilt, reason, log, diagnose, tmp_path):
+    code, text, errors = diagnose(spoilt(log))
+    assert code == 1 and not text and reason in errors and one_sentence(errors)
+    assert not (tmp_path / 'found').exists()
+
+
+def test_a_model_of_other_units_is_refused(log, diagnose, tmp_path):
+    (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: 56.3}}\n')
+    code, text, errors = diagnose(log, '--model', tmp_path / 'wrong.yaml')
+    assert code == 1 and not text and 'of other units' in errors and one_sentence(errors)
+    assert not (tmp_path / 'found').exists()
+
+
+@pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)], ids=' '.join)
+def test_a_wrong_use_is_one_sentence_and_writes_nothing(words, log, diagnose, tmp_path):
+    code, text, errors = diagnose(log, *words)
+    assert code in (1, 2) and not text and 'Traceback' not in errors and errors.strip()
+    assert not (tmp_path / 'found').exists()
+
+
+def test_a_missing_log_and_text_for_a_log_are_one_sentence(run, tmp_path):
+    (tmp_path / 'text.csv').write_text('these are\nno numbers\n')
+    for name in ('text.csv', 'missing.csv'):
+        code, text, errors = run('diagnose', tmp_path / name, '--out', tmp_path / 'found')
+        assert code != 0 and not text and name in errors and one_sentence(errors)
+    assert not (tmp_path / 'found').exists()
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(log, run, tmp_path):
+    (tmp_path / 'taken').write_text('mine')
+    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'taken')
+    assert code != 0 and not text and one_sentence(errors)
+    assert (tmp_path / 'taken').read_text() == 'mine'
+
+
+def test_where_one_file_cannot_be_written_none_is(log, run, tmp_path):
+    (tmp_path / 'found/model.yaml').mkdir(parents=True)
+    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+    assert code != 0 and not text and one_sentence(errors)
+    assert os.listdir(tmp_path / 'found') == ['model.yaml']
+
+
+# what allows an answer, and not every one
+
+@pytest.fixture
+def say(diagnose, run, tmp_path):
+    """Return a function that diagnoses a log and gives the answer as data."""
+    def say(log, *words):
+        write_log(tmp_path / 'given.csv', log)
+        return told(run('diagnose', tmp_path / 'given.csv', *words, '--json'))
+    return say
+
+
+def test_one_temperature_says_what_cannot_be_shown(log, say):
+    answer = say(replace(log, temperature=np.full(len(log), 25.0)))
+    assert {'bias_temperature', 'scale_factor_temperature', 'thermal_lag'} <= set(answer['cannot_show'])
+    assert 'temperature' in answer['cannot_show']['bias_temperature']
+
+
+def test_without_motion_what_the_motion_shows_cannot_be_shown(hidden, log, say):
+    truth = hidden.truth
+    rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
+    answer = say(replace(log, output=rest, reference_rate=0.0 * rest, moving=0.0 * rest))
+    assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
+    assert {'scale_factor_asymmetry', 'time_offset', 'reference_once_per_rev'} <= set(answer['cannot_show'])
+
+
+def test_stretches_of_nan_are_left_out(log, say):
+    output, reference = log.output.copy(), log.reference_rate.copy()
+    output[1000:1400], reference[5000:5300] = np.nan, np.nan
+    answer = say(replace(log, output=output, reference_rate=reference))
+    assert [finding['effect'] for finding in answer['findings'] if finding['effect'] != 'dropped_samples'] == ['warm_up']
+
+
+def test_a_log_without_temperature_supply_and_force_says_what_it_cannot_show(log, say):
+    answer = say(replace(log, temperature=None, supply=None, specific_force=None))
+    shown = answer['cannot_show']
+    assert all(word in shown[name] for name, word in (
+        ('bias_temperature', 'temperature'), ('supply_sensitivity', 'supply'), ('acceleration_sensitivity', 'specific force')))
+    assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
+
+
+def test_a_log_in_degrees_and_one_in_radians_are_the_same(log, run, tmp_path):
+    rows = np.column_stack([log.time, log.output / DEGREE, log.temperature, log.reference_rate / DEGREE])
+    np.savetxt(tmp_path / 'degrees.csv', rows, '%.12g', ',', header='time_s,gyro_dps,temperature_degc,reference_rate_dps', comments='')
+    answer = told(run('diagnose', tmp_path / 'degrees.csv', '--json'))
+    assert [finding['effect'] for finding in answer['findings']] == ['warm_up']

@@ -1,0 +1,260 @@
+"""
+The diagnosis names what is hidden, with its size, and wins what there is to win; and it names nothing where there is nothing.
+
+The logs are made by `hidden`, which shares nothing with the package. The seeds of the fixed set are places in lists; those of the last test
+vary from run to run, and are printed.
+
+"""
+
+import secrets
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosed import described as told
+from diagnosed import diagnosis_of, held, judged_diagnosis, log_of, model_of, won
+from hidden import FORMS, KINDS, OUTSIDE, NoiseFigures, described, draw_gyro, hide, record, session
+from hidden.effects import AGAINST_A_MODEL
+
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.history import channels_of
+from gyro_calibration.log_compensation import compensate_log
+from gyro_calibration.model_file import model_text, read_model
+from gyro_calibration.simulation import respond
+
+SHORT = {'duration': 600.0, 'sample_rate': 25.0}
+#: References in turn.
+REFERENCES = ({'reference': 'rate'}, {'reference': 'heading'}, {'reference': 'heading', 'encoder_step': 2.0 * np.pi / 65536})
+ENCODER = ('reference_quantization',)  # an encoder does have steps
+
+
+def turn(choices, number):
+    return choices[number % len(choices)]
+
+
+def hidden_in(names, multiple, seed, noise=None, reference=None, **how):
+    """Hide effects in a log with the noise and the reference whose turn it is."""
+    noise = noise or turn(KINDS, seed)
+    reference = turn(REFERENCES, seed) if reference is None else reference
+    return hide(names, multiple, np.random.default_rng(seed), noise=noise, **{**SHORT, **reference, **how})
+
+
+def names_of(found):
+    return [each.effect for each in found.findings]
+
+
+# one effect of each kind, some together, and none
+
+@pytest.mark.parametrize('seed, name', list(enumerate(FORMS)), ids=FORMS)
+def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
+    log, = hidden_in([name], 5.0, seed)
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    how = judged_diagnosis(log, found, ENCODER)
+    assert how.right, told(log, found)
+    assert all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(log, found)
+    for measure, (mine, oracle) in won(log, found).items():
+        # some blocks say little of a mean square: a gain is compared where it is more than what their noise makes of it
+        if oracle > {'rate': 0.01, 'heading': 1.0}[measure]:
+            assert mine > 0.8 * oracle, (measure, mine, oracle, told(log, found))
+
+
+TOGETHER = [
+    ('bias_temperature', 'cubic_nonlinearity'), ('warm_up', 'heading_sensitivity'), ('time_offset', 'scale_factor_asymmetry'),
+    ('interference_tone', 'thermal_lag'), ('outliers', 'vibration_rectification'), ('quantization', 'scale_factor_temperature'),
+    ('reference_once_per_rev', 'bias_step'), ('bandwidth', 'supply_sensitivity', 'saturation')]
+
+
+@pytest.mark.parametrize('seed, names', list(enumerate(TOGETHER)), ids=map('+'.join, TOGETHER))
+def test_effects_together_are_all_named(seed, names):
+    log, = hidden_in(names, 5.0, seed)
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert judged_diagnosis(log, found, ENCODER).right, told(log, found)
+
+
+@pytest.mark.parametrize('reference', range(len(REFERENCES)), ids=['rate', 'heading', 'encoder'])
+@pytest.mark.parametrize('seed, noise', list(enumerate(KINDS)), ids=KINDS)
+def test_where_nothing_is_hidden_nothing_is_found(seed, noise, reference):
+    log, = hidden_in([], 0.0, seed, noise, REFERENCES[reference])
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert judged_diagnosis(log, found, ENCODER).right and (found.verdict == 'adequate' or found.findings), told(log, found)
+    assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
+    with_model = diagnosis_of([log], np.random.default_rng(seed), with_model=True)
+    assert judged_diagnosis(log, with_model, ENCODER).right, told(log, with_model)
+
+
+@pytest.mark.parametrize('name', ['third_harmonic_of_heading', 'resonance_at_a_speed', 'bias_pulse', 'supply_times_rate'])
+def test_what_the_catalogue_does_not_have_is_said_to_be_unexplained(name):
+    log, = hidden_in([name], 5.0, list(OUTSIDE).index(name), reference=REFERENCES[0])
+    found = diagnosis_of([log], np.random.default_rng(0))
+    assert found.verdict == 'unexplained' and judged_diagnosis(log, found).right, told(log, found)
+
+
+def test_random_effects_are_found():
+    seed = secrets.randbits(32)
+    print(f'seed {seed}')
+    generator = np.random.default_rng(seed)
+    wrong = []
+    for _ in range(8):
+        name = str(generator.choice(list(FORMS)))
+        log, = hide([name], 5.0, generator, noise=str(generator.choice(KINDS)), **SHORT)
+        found = diagnosis_of([log], generator)
+        wrong += [] if judged_diagnosis(log, found).right else [told(log, found)]
+    # at 5 times the minimum detectable effect it should be right in 99 %, and then 3 of 8 are wrong once in 20 000 runs
+    assert len(wrong) <= 2, '\n'.join(wrong)
+
+
+# what is wrong with the reference
+
+@pytest.mark.parametrize('reference', range(len(REFERENCES)), ids=['rate', 'heading', 'encoder'])
+@pytest.mark.parametrize('name', ['reference_once_per_rev', 'reference_slip'])
+def test_a_wrong_reference_is_blamed_on_the_reference(name, reference):
+    log, = hidden_in([name], 10.0, reference, 'mixed', REFERENCES[reference])
+    found = diagnosis_of([log], np.random.default_rng(1))
+    assert judged_diagnosis(log, found, ENCODER).right and CAUSES[name].of == 'reference', told(log, found)
+    assert name not in {term.effect.name for term in found.model.terms}
+
+
+def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
+    def given(sessions):
+        return {'reference_scale': {'size': 59.8 / 60.0 - 1.0}}
+    log, = hidden_in(['reference_scale'], 1.0, 5, 'mixed', REFERENCES[0], given=given)
+    found = diagnosis_of([log], np.random.default_rng(1))
+    (finding,) = found.findings
+    assert {finding.effect, *finding.ambiguous_with} >= {'scale_factor_error', 'reference_scale'} and finding.separate_by, told(log, found)
+
+
+# a large effect brings no companions
+
+LARGE = {
+    'time_offset': lambda sessions: {'size': 0.02},
+    'scale_factor_error': lambda sessions: {'size': 0.05},
+    'saturation': lambda sessions: {'size': 0.5 * max(np.abs(each.rate).max() for each in sessions)},
+}
+
+
+@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize('name', LARGE)
+def test_a_large_effect_brings_no_companions(name, seed):
+    log, = hidden_in([name], 1.0, seed, 'mixed', REFERENCES[0], given=lambda sessions: {name: LARGE[name](sessions)})
+    found = diagnosis_of([log], np.random.default_rng(seed))
+    assert judged_diagnosis(log, found).right, told(log, found)
+    assert held(log.truth.gyro.causes, found.findings, 4.0).get(name, True), told(log, found)
+
+
+# what a log cannot show
+
+def test_a_log_without_channels_says_what_it_cannot_show():
+    log, = hidden_in(['cubic_nonlinearity'], 5.0, 0, 'mixed', REFERENCES[0])
+    found = diagnose([replace(log_of(log), temperature=None, supply=None, specific_force=None)], np.random.default_rng(0))
+    needed = {name for name, cause in CAUSES.items() if cause.needs & {'temperature', 'supply', 'specific_force'}}
+    assert needed <= set(found.cannot_show) and 'cubic_nonlinearity' not in found.cannot_show
+    assert judged_diagnosis(log, found).right, told(log, found)
+
+
+def test_a_log_of_a_gyro_at_rest_needs_no_reference():
+    log, = hidden_in(['warm_up'], 5.0, 0, 'white', REFERENCES[0])
+    truth = log.truth
+    rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
+    found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)], np.random.default_rng(0))
+    assert judged_diagnosis(log, found).in_set and not judged_diagnosis(log, found).extra, told(log, found)
+    assert {'cubic_nonlinearity', 'time_offset', 'reference_once_per_rev'} <= set(found.cannot_show)
+
+
+# several logs of one gyro
+
+def recorded(names, steps, seed, given=None, multiple=8.0):
+    """Record a gyro once for each moment at which the temperature steps up by 10 K, to go down by 15 K later."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, SHORT['duration'], 1.0 / SHORT['sample_rate'])
+    motion = 1.5 * np.sin(0.7 * time) * (np.sin(0.05 * time) > 0.0)
+    sessions = [described(generator, time, motion, 25.0 + 10.0 * (time > step) - 15.0 * (time > step + 100.0)) for step in steps]
+    gyro = draw_gyro(names, multiple, generator, sessions, NoiseFigures(1e-4), given=given)
+    return [record(gyro, each, generator, run=run) for run, each in enumerate(sessions)]
+
+
+STEPS = (300.0, 150.0, 420.0)
+
+
+def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_other_logs_say_so():
+    logs = recorded(['bias_step'], STEPS, 1, {'bias_step': {'run': 0, 'step_time': STEPS[0] + 5.0}})
+    found = diagnosis_of(logs, np.random.default_rng(0))
+    assert judged_diagnosis(logs[0], found).right, told(logs[0], found)
+    named = {name for each in found.findings for name in (each.effect, *each.ambiguous_with)}
+    assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(logs[0], found)
+
+
+def test_a_temperature_effect_that_repeats_is_named():
+    logs = recorded(['bias_temperature'], STEPS, 2)
+    found = diagnosis_of(logs, np.random.default_rng(0))
+    assert names_of(found) == ['bias_temperature'] and not found.findings[0].ambiguous_with, told(logs[0], found)
+
+
+def test_an_effect_of_the_motion_is_found_in_several_logs_together():
+    logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3, **SHORT)
+    found = diagnosis_of(logs, np.random.default_rng(0))
+    assert judged_diagnosis(logs[0], found).right and all(judged_diagnosis(logs[0], found).held.values()), told(logs[0], found)
+
+
+# against a model
+
+@pytest.mark.parametrize('factor', [0.7, 1.5])
+def test_a_model_of_other_noise_is_told_so(factor):
+    log, = hidden_in([], 0.0, 4, 'white', REFERENCES[0])
+    model = model_of(log)
+    other = replace(model, noise=replace(model.noise, angle_random_walk=factor * model.noise.angle_random_walk))
+    found = diagnose([log_of(log)], np.random.default_rng(0), other)
+    assert names_of(found) == ['angle_random_walk'], told(log, found)
+    assert found.findings[0].parameters['angle_random_walk'].estimate == pytest.approx(model.noise.angle_random_walk, rel=0.03)
+
+
+def test_a_model_that_knows_the_effect_leaves_nothing():
+    log, = hidden_in(['sine_response'], 20.0, 0, 'white', REFERENCES[0])
+    first = diagnosis_of([log], np.random.default_rng(0))
+    again = diagnose([log_of(log)], np.random.default_rng(0), first.model)
+    assert first.verdict == 'extended' and again.verdict == 'adequate', told(log, again)
+
+
+# the extended model at work
+
+EXTENSIONS = [['cubic_nonlinearity'], ['thermal_lag', 'scale_factor_temperature'], ['heading_sensitivity'], ['vibration_rectification'],
+              ['time_offset']]
+
+
+def again(hidden, seed):
+    """Record the same gyro in another motion at the same temperatures, after another power-on."""
+    generator = np.random.default_rng(seed)
+    other = session(generator, **SHORT)
+    other = described(generator, other.time, other.rate, hidden.session.temperature)
+    return record(hidden.truth.gyro, other, generator, reference='both', run=1)
+
+
+def left_over(model, log):
+    """Return what a model leaves of a log: of its output, simulated, and of its reference rate, compensated."""
+    channels = channels_of(log)
+    simulated = respond(model, log.time, channels.moving(log.reference_rate, log.reference_rate))
+    known = np.interp(model.true_time(log.time), log.time, log.reference_rate)
+    return np.var(log.output - simulated), np.var(compensate_log(model, log) - known)
+
+
+@pytest.mark.parametrize('seed, names', list(enumerate(EXTENSIONS)), ids=map('+'.join, EXTENSIONS))
+def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path):
+    def given(sessions):
+        # as small as it is detectable, no motion tells a delay from a lag
+        return {'time_offset': {'size': 0.01}} if 'time_offset' in names else {}
+    first, = hide(names, 10.0, np.random.default_rng(seed), noise='white', reference='both', given=given, **SHORT)
+    found, second = diagnosis_of([first], np.random.default_rng(0)), again(first, seed)
+    (tmp_path / 'model.yaml').write_text(model_text(found.model))
+    model = read_model(tmp_path / 'model.yaml')
+    assert set(names) <= {term.effect.name for term in model.terms} <= set(CATALOGUE), told(first, found)
+    noise = np.var(second.truth.noise)
+    for before, after in zip(left_over(found.before, log_of(second)), left_over(model, log_of(second))):
+        # the noise that is compensated, too, has the scale factor of the gyro
+        assert after - noise < 0.1 * (before - noise) + 0.06 * noise and after < before, (before, after, noise, told(first, found))
+
+
+def test_noise_is_found_against_a_model_only():
+    assert {name for name, cause in CAUSES.items() if cause.of == 'noise'} <= set(AGAINST_A_MODEL)
+    log, = hidden_in(['angle_random_walk'], 20.0, 1, 'white', REFERENCES[0])
+    assert names_of(diagnosis_of([log], np.random.default_rng(0), with_model=False)) == []
