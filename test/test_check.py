@@ -4,12 +4,14 @@ The live check against simulated gyros: as few false alarms as it states, over h
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from gyro_calibration.allan import even_record, fit_noise
 from gyro_calibration.check import STRETCH, Check, changed, examine, step_of
-from gyro_calibration.log import DEGREE
+from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
@@ -115,6 +117,21 @@ def test_motion_is_not_taken_for_a_misfit():
         wobble = np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same') * ROBOT.rate_at(time)
         fed(check, ROBOT.rate_at(time) + wobble + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
         assert not check.noise_alarm and not check.bias_alarm, drive
+
+
+def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(data):
+    """An ADIS16405 at rest for 10 000 s; the model has the noise of that record and the bias of its first 15 s."""
+    log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
+    record = even_record(log.time, log.output)
+    noise, rate = fit_noise(record.rate, record.interval).noise, log.output - log.output[:1500].mean()
+    half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
+    for claimed, length in ((noise, len(rate)), (half, 4000)):
+        check, alarmed = Check(claimed, 0.001, 0.3 * DEGREE), 0
+        for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(), rate[:length].tolist()):
+            if check.add(*sample):
+                check.examine(claimed.angle_random_walk ** 2 / 15.0, sample[0])
+                alarmed += bool(check.noise_alarm or check.bias_alarm)
+        assert check.examined == length // 1001 and bool(alarmed) == (claimed is half)
 
 
 def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged():
