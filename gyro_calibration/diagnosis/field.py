@@ -102,6 +102,7 @@ class Work:
     Attributes
     ----------
     field : with the rate that the gyro sees, if something happens to it before
+    plain : the logs as they are
     named : causes
     residual : whitened, without what the causes of fixed amplitude make, shape (m,)
     columns : whitened and independent: scale factor error, those of the causes, what their shapes change, shape (q, m)
@@ -112,6 +113,7 @@ class Work:
     """
 
     field: Field
+    plain: tuple[Replay, ...]
     named: tuple[Named, ...]
     residual: Array
     columns: Array
@@ -203,7 +205,8 @@ def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) 
         own = columns_of(candidate, replays)
         columns.append(own)
         owner += [(-2, 0)] * len(own)
-    return _worked(replace(whole, replays=tuple(replays)), tuple(named), residual, np.concatenate(columns), tuple(owner), tuple(widths))
+    return _judged(replace(whole, replays=tuple(replays)), whole.replays, tuple(named), residual / whole.deviation,
+                   np.concatenate(columns) / whole.deviation, tuple(owner), tuple(widths))
 
 
 def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[int, Array]]:
@@ -222,14 +225,38 @@ def free_shapes(candidate: Candidate) -> list[int]:
     return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
 
 
-def _worked(whole: Field, named: tuple[Named, ...], residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
-            widths: tuple[int, ...]) -> Work:
-    kept = _independent(columns / whole.deviation)
-    white, of = residual / whole.deviation, columns[kept] / whole.deviation
-    nothing = np.empty((0, len(white)))
-    given = sample(white[None], of, nothing, whole.starts)
+def with_one_more(before: Work, candidate: Candidate) -> Work:
+    """Put one cause more into a field, at its shapes as they are; what is there already is not made again."""
+    if is_of_the_rate(candidate.cause):
+        return work(replace(before.field, replays=before.plain), [*before.named, Named(candidate)])
+    own, residual, columns = columns_of(candidate, before.field.replays) / before.field.deviation, before.residual, before.columns
+    owner, place = before.owner, len(before.named)
+    if candidate.amplitude is None:
+        columns = np.concatenate([columns, own])
+        owner = (*owner, *((place, number) for number in range(len(own))))
+    else:
+        residual = residual - candidate.amplitude * own[0]
+    widths = (*before.widths, len(own) if candidate.amplitude is None else 0)
+    return _judged(before.field, before.plain, (*before.named, Named(candidate)), residual, columns, owner, widths)
+
+
+def with_columns(before: Work, columns: Array) -> Work:
+    """Put whitened columns more into a field, which belong to no cause."""
+    owner = (*before.owner, *[(-2, 0)] * len(columns))
+    return _judged(before.field, before.plain, before.named, before.residual, np.concatenate([before.columns, columns]), owner,
+                   before.widths)
+
+
+def _judged(whole: Field, plain: tuple[Replay, ...], named: tuple[Named, ...], residual: Array, columns: Array,
+            owner: tuple[tuple[int, int], ...], widths: tuple[int, ...]) -> Work:
+    """Sum whitened residual and columns, those that are independent, and judge them."""
+    kept = _independent(columns)
+    of = columns[kept]
+    nothing = np.empty((0, len(residual)))
+    given = sample(residual[None], of, nothing, whole.starts)
     by = beside(sums(of, nothing, (), whole.starts), (), whole.noises)
-    return Work(whole, named, white, of, tuple(owner[place] for place in kept), widths, given, by, judge(given, whole.noises, by))
+    return Work(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths, given, by,
+                judge(given, whole.noises, by))
 
 
 def _independent(columns: Array) -> list[int]:

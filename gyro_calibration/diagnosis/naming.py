@@ -9,18 +9,18 @@ from scipy.stats import norm
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.factors import unit_of_offset
-from gyro_calibration.diagnosis.field import Named
+from gyro_calibration.diagnosis.field import Named, work
 from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
 from gyro_calibration.diagnosis.outcome import Outcome, Value, joined
 from gyro_calibration.diagnosis.probes import along, is_named
-from gyro_calibration.diagnosis.search import Search
+from gyro_calibration.diagnosis.search import MOST_SLIPS, Search, evidence_of
 from gyro_calibration.effects import CATALOGUE
 
 #: Power with which an effect of the minimum detectable size is found.
 _POWER = 0.95
 _DEVIATIONS = 1.96
 #: Names of what has no other.
-_SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(8)))}
+_SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
 
 
 def named_finding(search: Search, found: Outcome, place: int, p_value: float, rivals: Sequence[Named], separate_by: str) -> Finding:
@@ -92,19 +92,23 @@ def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Valu
             'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
 
 
-def unexplained(search: Search, found: Outcome, evidence: Mapping[int, float]) -> list[Unexplained]:
-    """Return the structures without a name, with their share of the variance of what the simulation leaves."""
-    left = [residual - bias for residual, bias in zip(found.residuals, found.biases)]
-    rest = float(np.var(joined([part[each.kept] for part, each in zip(left, found.replays)])))
-    said = {}
-    for place, known in enumerate(found.named):
-        if is_named(known.candidate):
-            continue
-        values = [one.value for one in found.coefficients(place)]
-        parts = [np.tensordot(values, np.array(known.candidate.columns(each)), 1)[each.kept] for run, each in enumerate(found.replays)
-                 if known.candidate.run in (None, run)]
-        size = float(np.var(joined(parts))) * sum(map(len, parts)) / sum(int(each.kept.sum()) for each in found.replays)
-        share = size / (size + rest)
-        p_value = search.chance.p_value(known.candidate.cause, evidence[place])
-        said[along(known.candidate)] = Unexplained(along(known.candidate), share, p_value)
-    return list(said.values())
+def unexplained(search: Search, found: Outcome, unnamed: Sequence[Named]) -> list[Unexplained]:
+    """Return the structures without a name, with the part of the variance that the named causes leave, which each would explain."""
+    everything = (*found.named, *unnamed)
+    variables: dict[str, list[int]] = {}
+    for place, known in enumerate(unnamed):
+        name = CAUSES[known.candidate.cause].along if is_named(known.candidate) else along(known.candidate)
+        variables.setdefault(name, []).append(len(found.named) + place)
+    least, most = _variance(search, found, everything), _variance(search, found, found.named)
+    told = []
+    for name, places in variables.items():
+        without = _variance(search, found, [known for place, known in enumerate(everything) if place not in places])
+        chance = min(search.chance.p_value(everything[place].candidate.cause, evidence_of(search, everything, place)) for place in places)
+        told.append(Unexplained(name, max(without - least, 0.0) / most, chance))
+    return told
+
+
+def _variance(search: Search, found: Outcome, named: Sequence[Named]) -> float:
+    """Return the variance of what some causes leave, on the points that are searched."""
+    left = Outcome(work(search.field, named), found.replays)
+    return float(np.var(joined([each.on_grid(rest - bias) for each, rest, bias in zip(found.replays, left.residuals, left.biases)])))

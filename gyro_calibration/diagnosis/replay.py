@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_filter
+from scipy.ndimage import uniform_filter1d
 
-from gyro_calibration.diagnosis.spectrum import transform
+from gyro_calibration.diagnosis.spectrum import differentiated, transform
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Array, Log, Mask
@@ -21,8 +23,8 @@ from gyro_calibration.model import GyroModel
 
 #: More points of the grid than this are averaged in neighbours, for a million samples are more than are needed to part causes.
 MOST_POINTS = 50_000
-#: A heading is smoothed over so long, s, to find the rate that nonlinear effects look at.
-SMOOTHING = 0.15
+#: Frequencies over which the power of a rate is averaged, and by what rounding is taken to be stronger than on average.
+_NEIGHBOURS, _OVER = 101, 1.5
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class Replay:
 
     @property
     def points(self) -> int:
-        """Return how many points are searched."""
-        return (int(self.place[-1]) + 1) // self.every
+        """Return how many points are searched: a number that has a fast transform, so that a few at the end may be left out."""
+        return _fast((int(self.place[-1]) + 1) // self.every)
 
     @property
     def duration(self) -> float:
@@ -88,7 +90,8 @@ class Replay:
             lost = np.ones(len(whole), dtype=bool)
             lost[self.place] = False
             whole[lost] += filling * self.filling[lost]
-        return whole[:self.points * self.every].reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
+        whole = whole[:self.points * self.every]
+        return whole.reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
 
     def noisy(self, values: Array) -> Array:
         """Return the cosine transform of a residual, whose bridges get the white noise that the rest has."""
@@ -153,6 +156,14 @@ def _simulated(plain: Replay, model: GyroModel) -> Replay:
                    added=added)
 
 
+@cache
+def _fast(count: int) -> int:
+    """Return the largest number up to a count whose only factors are 2, 3 and 5; none is further off than some percent."""
+    while next_fast_len(count, real=True) != count:
+        count -= 1
+    return count
+
+
 def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
     """
     Return samples on the whole grid, straight lines across what is lost.
@@ -203,10 +214,20 @@ def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
     rate = CubicSpline(time, filled)(time, 1)
     near = known & np.append(known[1:], True) & np.append(True, known[:-1])
     raw = np.where(near, rate, np.nan)
-    if not step:
-        return raw, rate
-    length = max(5, 2 * round(0.5 * SMOOTHING / np.median(np.diff(time))) + 1)
-    return raw, CubicSpline(time, savgol_filter(filled, length, 3))(time, 1)
+    return raw, _without_rounding(rate, step, float(np.median(np.diff(time)))) if step else rate
+
+
+def _without_rounding(rate: Array, step: float, interval: float) -> Array:
+    """
+    Return the rate of a heading without what rounding to steps makes of it, by the filter of Wiener.
+
+    Each frequency is kept as far as its power is beyond that of the rounding, so that quick motion stays.
+
+    """
+    coefficients = dct(rate, norm='ortho')
+    rounding = (step / interval) ** 2 / 12.0 * differentiated(np.arange(len(rate)) * math.pi / len(rate))
+    power = uniform_filter1d(coefficients ** 2, _NEIGHBOURS, mode='nearest')
+    return idct(coefficients * np.clip(1.0 - _OVER * rounding / np.maximum(power, 1e-300), 0.0, 1.0), norm='ortho')
 
 
 def _heading(time: Array, log: Log, rate: Array) -> Array:

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as field_of
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -28,7 +30,7 @@ from gyro_calibration.diagnosis.candidates import (
     with_shape,
 )
 from gyro_calibration.diagnosis.evidence import Places, beside, drawn, evidence, judge, log_sum, sample, sums
-from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, work
+from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, with_columns, with_one_more, work
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
@@ -44,12 +46,14 @@ RULED_OUT = 3.2
 PRICE_OF_SHAPE = 2.0
 #: Causes that have no first shapes, but are scanned for.
 SCANNED = frozenset({'interference_tone', 'reference_slip'})
+#: So many of a kind at most: slips are found all at once, and many tones are no tones, but something that is not even.
+MOST_OF = {'interference_tone': 3, 'reference_slip': 1}
 #: A tone has at least so many periods in a log; slower ones are wander.
 LEAST_PERIODS = 20
 #: Within which times a reference may slip, s.
 WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
 #: So many slips at most are counted in a log.
-MOST_SLIPS = 8
+MOST_SLIPS = 20
 #: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
 UNLIKELY = 12.0
 #: What each column beyond the first costs, for it fits a little noise.
@@ -120,6 +124,10 @@ def bank(whole: Field, found: Sequence[Candidate], named: Sequence[Named] = ()) 
     return Bank(tuple(found), groups, np.concatenate(parts))
 
 
+#: Causes with their shapes.
+Key: TypeAlias = 'tuple[tuple[Any, ...], ...]'
+
+
 @dataclass(frozen=True)
 class Search:
     """
@@ -132,6 +140,7 @@ class Search:
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
     scanned : causes that are scanned for over all frequencies, or all moments
+    banks, looked : what was made before, by the causes that were named then
 
     """
 
@@ -140,6 +149,8 @@ class Search:
     chance: Chance
     rate: float
     scanned: frozenset[str] = SCANNED
+    banks: dict[Key, Bank] = field_of(default_factory=dict)
+    looked: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -203,7 +214,7 @@ def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str], r
     """Return a search for some causes in other parts of the same logs, at a rate of false alarms a cause."""
     found = [each for each in search.candidates if each.cause in causes]
     whole = _of_likely_noises(field(replays), found)
-    return replace(search, field=whole, bank=bank(whole, found), rate=rate, scanned=SCANNED & frozenset(causes))
+    return replace(search, field=whole, bank=bank(whole, found), rate=rate, scanned=SCANNED & frozenset(causes), banks={}, looked={})
 
 
 def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
@@ -264,9 +275,12 @@ def slips(done: Work) -> list[_First]:
 def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places, width: float) -> _First:
     """Return the jumps of one width, a second apart or more, each with evidence beyond what so many moments make likely."""
     time = np.arange(each.points) * each.step
-    kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
     likely = float(np.log(len(moments) * len(WIDTHS)))
-    value = 0.5 * correlate(white, kernel, 'same')[moments] ** 2 / (kernel @ kernel) - likely - PRICE_OF_COLUMN
+    size, deviation = _matched(white, factor, time, width)
+    wide, _ = _matched(white, factor, time, 5.0 * width + 0.3)
+    value = 0.5 * (size[moments] / deviation) ** 2 - likely - PRICE_OF_COLUMN
+    # What a slip turned stays turned; an error that comes and goes again has nothing left over a longer time.
+    value[wide[moments] / size[moments] < 0.3] = -np.inf
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
@@ -278,7 +292,13 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total)
+    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if chosen else -np.inf)
+
+
+def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
+    """Return the size of a pulse at each moment, rad, and its standard deviation."""
+    kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
+    return correlate(white, kernel, 'same') / (kernel @ kernel), float(1.0 / np.sqrt(kernel @ kernel))
 
 
 def _of_the_reference(each: Replay, moment: float) -> bool:
@@ -290,6 +310,17 @@ def _of_the_reference(each: Replay, moment: float) -> bool:
 
 # one cause more
 
+def _stock(search: Search, named: Sequence[Named]) -> Bank:
+    """Return all candidates as the gyro sees its rate; what a shape changes in its third digit changes none of their columns visibly."""
+    changes = [each for each in named if is_of_the_rate(each.candidate.cause)]
+    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes)) for each in changes)
+    if not changes:
+        return search.bank
+    if key not in search.banks:
+        search.banks[key] = bank(search.field, search.candidates, changes)
+    return search.banks[key]
+
+
 @dataclass(frozen=True)
 class Step:
     """A list of causes and its score."""
@@ -298,47 +329,47 @@ class Step:
     score: float
 
 
-def refined(search: Search, named: Sequence[Named], candidate: Candidate, price: float) -> Step:
+def refined(before: Work, candidate: Candidate, price: float) -> Step:
     """
     Add a cause with the best of its shapes near those given.
 
     Parameters
     ----------
-    search, named : to which it is added
+    before : to which it is added
     candidate : the cause
     price : of the choice of its shape among others, in logarithms of the likelihood
 
     """
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
-        done = work(search.field, [*named, Named(candidate)])
+        done = with_one_more(before, candidate)
         columns = PRICE_OF_COLUMN * max(done.widths[-1] - 1, 0)
-        return Step((*named, Named(candidate)), done.score - columns - price - (0.0 if is_named(candidate) else MARGIN))
-    begin = candidate if candidate.amplitude is None else _unbent(search, named, candidate)
+        return Step(done.named, done.score - columns - price - (0.0 if is_named(candidate) else MARGIN))
+    begin = candidate if candidate.amplitude is None else _unbent(before, candidate)
     place = fitted_shapes(candidate)[0]
-    low, high = _around(search, begin, place)
+    low, high = _around(before.plain, begin, place)
 
     def cost(at: float) -> float:
-        return -work(search.field, [*named, Named(with_shape(begin, place, _shape(at, begin, place)))]).score
+        return -with_one_more(before, with_shape(begin, place, _shape(at, begin, place))).score
 
     best = minimize_scalar(cost, bounds=(low, high), method='bounded', options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
     columns = PRICE_OF_COLUMN if candidate.cause == 'interference_tone' else 0.0
-    return Step((*named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - price - columns)
+    return Step((*before.named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - price - columns)
 
 
 def _shape(at: float, begin: Candidate, place: int) -> float:
     return at if begin.cause == 'bias_step' else float(np.copysign(np.exp(at), begin.shapes[place]))
 
 
-def _around(search: Search, begin: Candidate, place: int) -> tuple[float, float]:
+def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[float, float]:
     """Return where to look for a shape: between its neighbours, on a scale of logarithms but for moments."""
     mine = begin.shapes[place]
     if begin.cause == 'bias_step':
-        width = 1.5 * max(each.duration for each in search.field.replays) / 64
+        width = 1.5 * max(each.duration for each in replays) / 64
         return mine - width, mine + width
     if begin.amplitude is not None:
         return float(np.log(abs(mine))) - 0.7, float(np.log(abs(mine))) + 0.7
     if begin.cause == 'interference_tone':
-        width = 1.0 / (mine * max(each.duration for each in search.field.replays))
+        width = 1.0 / (mine * max(each.duration for each in replays))
         return float(np.log(mine)) - width, float(np.log(mine)) + width
     width = 0.8
     low = float(np.log(FASTEST_LAG)) if begin.cause == 'thermal_lag' else -np.inf
@@ -349,12 +380,13 @@ def _around(search: Search, begin: Candidate, place: int) -> tuple[float, float]
 _POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 
 
-def _unbent(search: Search, named: Sequence[Named], candidate: Candidate) -> Candidate:
+def _unbent(before: Work, candidate: Candidate) -> Candidate:
     """Return a cause of fixed amplitude with the shape that the free amplitude of its column speaks for."""
     power = _POWERS.get(candidate.cause)
     if power is None:
         return candidate
-    free = work(search.field, named, [replace(candidate, amplitude=None)])
+    own = columns_of(candidate, before.field.replays) / before.field.deviation
+    free = with_columns(before, own)
     values, _ = free.estimates
     ratio = float(values[-1])
     place = fitted_shapes(candidate)[0]
@@ -370,6 +402,13 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     the best, None where nothing is beyond chance, and all that were refined, the best first
 
     """
+    key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes) for each in named)
+    if key not in search.looked:
+        search.looked[key] = _strongest(search, named)
+    return search.looked[key]
+
+
+def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
     done = work(search.field, named)
     first = _first(search, done, named)
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
@@ -378,7 +417,7 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     worth = [each for each in first if each.most > 0.8 * top - 8.0
              and (is_named(each.candidate) or search.excess(each.candidate.cause, each.mean) > 0.0)]
     worth.sort(key=lambda each: -each.most)
-    steps = [refined(search, named, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
+    steps = [refined(done, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
     # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
     steps = sorted((step for step in steps if step.score > done.score), key=lambda step: -step.score)
     beyond = (step for step in steps if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
@@ -387,15 +426,15 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
 
 def _first(search: Search, done: Work, named: Sequence[Named]) -> list[_First]:
     """Return of each cause the first shape that is the best."""
-    changed = any(is_of_the_rate(each.candidate.cause) for each in named)
-    stock = bank(search.field, search.candidates, named) if changed else search.bank
-    found = screen(done, stock)
+    found = screen(done, _stock(search, named))
     # What has nothing but shapes is there or not: another of its kind is the first one, not well refined.
     taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
     first = [_First(search.candidates[max(own, key=lambda place: found[place])], float(found[own].max()), float(averaged(found[own])))
              for cause, own in by_cause(search.candidates).items() if cause not in taken and np.isfinite(found[own]).any()]
     scans = {'interference_tone': tones, 'reference_slip': slips}
-    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done)]
+    already = [each.candidate.cause for each in named]
+    return first + [each for cause in sorted(search.scanned) if already.count(cause) < MOST_OF[cause] for each in scans[cause](done)
+                    if np.isfinite(each.mean)]
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
@@ -424,13 +463,14 @@ def _updated(done: Work, place: int, values: Array) -> Named:
 def searched(search: Search) -> tuple[Named, ...]:
     """Return the causes that the data support, with values."""
     named: tuple[Named, ...] = ()
-    while len(named) < MOST_CAUSES:
-        step, _ = strongest(search, named)
+    for _ in range(2 * MOST_CAUSES):  # some are taken out again
+        step, _ = strongest(search, named) if len(named) < MOST_CAUSES else (None, [])
         if step is None:
             break
         named = polished(search, step.named)
-        named = _exchanged(search, named) if len(named) > 1 else named
-    return pruned(search, named)
+        if len(named) > 1:
+            named = pruned(search, named)
+    return _exchanged(search, pruned(search, named))
 
 
 def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
@@ -466,7 +506,7 @@ def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list
             if mine - step.score < RULED_OUT and is_named(step.named[-1].candidate)]
 
 
-def evidence_of(search: Search, named: tuple[Named, ...], place: int) -> float:
+def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the evidence of one of the causes beside the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
     price = PRICE_OF_SHAPE * len(fitted_shapes(named[place].candidate)) + PRICE_OF_COLUMN * max(len(named[place].values) - 1, 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -23,7 +23,7 @@ from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.diagnosis.search import Search, alternatives, begin, evidence_of, polished, pruned, searched
+from gyro_calibration.diagnosis.search import MOST_OF, Search, alternatives, begin, evidence_of, polished, pruned, searched
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
@@ -66,16 +66,40 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
                for log, clean in zip(logs, hygiene)]
     say('search')
     search = begin(replays, generator, _OF_SEARCH * rate)
-    named, withdrawn = _repeating(search, searched(search))
+    named, unnamed = _parted(search, searched(search))
     say('sets')
-    named, rivals = _simplest(search, named)
+    named, rivals = _simplest(search, named, unnamed)
     found = Outcome(work(search.field, named), search.field.replays)
     say('noise')
     figures = noise_figures(found.work, Noise() if model is None else model.noise)
     say('gain')
-    causes = {each.candidate.cause for members in rivals for each in members if is_named(each.candidate)}
-    won = gain(search, causes, generator) if causes else None
-    return _told(search, found, figures, rivals, withdrawn, hygiene, won, model, rate, names, generator)
+    won = gain(search, {each.candidate.cause for members in rivals for each in members}, generator) if named else None
+    say('report')
+    return _told(_Conclusion(search, found, rivals, unnamed, figures, won), hygiene, model, rate, names, generator)
+
+
+@dataclass(frozen=True)
+class _Conclusion:
+    """
+    What the search came to.
+
+    Attributes
+    ----------
+    search : in the logs
+    found : the causes that are named, in values
+    rivals : of each, itself and those that may be in its place
+    unnamed : structure without a name, and causes whose names were withdrawn
+    figures : of the noise that is left
+    won : on what was held out
+
+    """
+
+    search: Search
+    found: Outcome
+    rivals: Sequence[Sequence[Named]]
+    unnamed: tuple[Named, ...]
+    figures: NoiseFigures
+    won: Gain | None
 
 
 def _mended(log: Log, clean: Hygiene) -> Log:
@@ -83,29 +107,48 @@ def _mended(log: Log, clean: Hygiene) -> Log:
     return log if clean.factor == 1.0 else replace(log, output=log.output * clean.factor)
 
 
-def _repeating(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
-    """Withdraw causes named from a temperature that differ between the logs, and names along variables where there is more."""
-    beyond = {name for each in named if not is_named(each.candidate) for name in along(each.candidate).split(' and ')}
-    kept = tuple(each for each in named if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in beyond)
-    withdrawn = []
-    for known in kept:
-        candidate = known.candidate
-        if len(search.field.replays) > 1 and is_named(candidate) and CAUSES[candidate.cause].along in _MUST_REPEAT:
-            alone = [replace(candidate, run=run) for run in range(len(search.field.replays) - 1)]
-            columns = len(known.values) * len(alone)
-            more = 2.0 * (work(search.field, kept, alone).score - work(search.field, kept).score)
-            if columns and chi2.sf(max(more, 0.0), columns) < _REPEATS:
-                withdrawn.append(candidate.cause)
-    kept = tuple(each for each in kept if each.candidate.cause not in withdrawn)
-    return (pruned(search, polished(search, kept)) if kept and kept != named else kept), withdrawn
+def _parted(search: Search, everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
+    """
+    Part what is named from what is not.
+
+    A name is withdrawn where there is more along its variable than it explains, where tones are many, and where a cause named from a
+    temperature is another one in each log.
+
+    """
+    beyond = {name for each in everything if not is_named(each.candidate) for name in along(each.candidate).split(' and ')}
+    tones = [each for each in everything if each.candidate.cause == 'interference_tone']
+    if len(tones) >= MOST_OF['interference_tone']:
+        beyond.add('frequency')
+    kept = tuple(each for each in everything if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in beyond)
+    kept = tuple(each for each in kept if _repeats(search, everything, each))
+    unnamed = tuple(each for each in everything if each not in kept)
+    if not unnamed:
+        return kept, ()
+    rest = tuple(each for each in unnamed if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in
+                 {along(other.candidate) for other in unnamed if not is_named(other.candidate)})
+    left = pruned(search, polished(search, (*kept, *rest)))
+    return tuple(each for each in left if any(_same(each, one) for one in kept)), rest
 
 
-def _simplest(search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
+def _same(one: Named, other: Named) -> bool:
+    return one.candidate.cause == other.candidate.cause and one.candidate.run == other.candidate.run
+
+
+def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:
+    """Tell whether a cause named from a temperature is the same in all logs, as far as chance allows."""
+    candidate, runs = known.candidate, len(search.field.replays)
+    if runs == 1 or CAUSES[candidate.cause].along not in _MUST_REPEAT or not known.values or candidate.amplitude is not None:
+        return True
+    alone = [replace(candidate, run=run) for run in range(runs - 1)]
+    more = 2.0 * (work(search.field, everything, alone).score - work(search.field, everything).score)
+    return bool(chi2.sf(max(more, 0.0), len(known.values) * len(alone)) > _REPEATS)
+
+
+def _simplest(search: Search, named: tuple[Named, ...], unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
     """Put the simplest member of each set in its place, and return all members of each."""
     rivals: list[list[Named]] = []
     for place, known in enumerate(named):
-        members = [] if not is_named(known.candidate) else [each for each, _ in alternatives(search, named, known)]
-        members = members or [known]
+        members = [each for each, _ in alternatives(search, (*named, *unnamed), known)] or [known]
         chosen = min(members, key=_size)
         if _size(chosen) < _size(known):
             named = polished(search, (*named[:place], chosen, *named[place + 1:]))
@@ -119,30 +162,33 @@ def _size(known: Named) -> int:
     return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else max(len(known.values), 1))
 
 
-def _told(search: Search, found: Outcome, figures: NoiseFigures, rivals: Sequence[Sequence[Named]], withdrawn: Sequence[str],
-          hygiene: Sequence[Hygiene], won: Gain | None, model: GyroModel | None, rate: float, names: Sequence[str],
+def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float, names: Sequence[str],
           generator: np.random.Generator) -> Diagnosis:
     """Put all that was found into words and records."""
-    plain = Outcome(work(search.field, []), found.replays)
-    strength = {place: evidence_of(search, found.named, place) for place in range(len(found.named))}
-    findings = [named_finding(search, found, place, search.chance.p_value(known.candidate.cause, strength[place]), rivals[place],
-                              _separated(search, found, place, rivals[place], generator))
-                for place, known in enumerate(found.named) if is_named(known.candidate)]
-    findings += _once([each for clean in hygiene for each in clean.findings])
+    search, found, noise = known.search, known.found, known.figures.noise
+    given, simulated = (GyroModel(), Noise()) if model is None else (model, model.noise)
+    findings = [*_named(known, generator), *_once([each for clean in hygiene for each in clean.findings])]
     if model is not None:
-        findings += [*_of_model(found, model, figures.noise, rate), *_of_noise(figures, model.noise, rate)]
+        findings += [*_of_model(found, model, noise, rate), *_of_noise(known.figures, model.noise, rate)]
     findings.sort(key=lambda each: each.p_value)
-    deviation = _bias_deviation(found, figures.noise)
-    before = extended(model or GyroModel(), plain, figures.noise, deviation, {}) if model is None else model
-    offered = won is None or not won.worse
-    after = extended(model or GyroModel(), found, figures.noise, deviation, _said_of_sets(findings)) if offered else before
-    # What has no name is in no model, and so not in what the extended one predicts.
-    shown = Outcome(work(search.field, [each for each in found.named if is_named(each.candidate)] if offered else []), found.replays)
+    plain, deviation = Outcome(work(search.field, []), found.replays), _bias_deviation(found, noise)
+    offered = known.won is None or not known.won.worse
+    before = extended(given, plain, noise, deviation, {}) if model is None else model
+    after = extended(given, found, noise, deviation, _said_of_sets(findings)) if offered else before
+    shown = found if offered else plain
     return Diagnosis(
-        tuple(findings), tuple(unexplained(search, found, strength)), figures.noise, Noise() if model is None else model.noise, won, before,
-        after, _cannot_show(search), curves(plain, shown), heading_curve(plain, shown),
-        noise_curve(found, figures.noise, Noise() if model is None else model.noise),
-        tuple(_remarks(hygiene, names, withdrawn, findings, offered)), rate, tuple(names))
+        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated, known.won, before, after, _cannot_show(search),
+        curves(plain, shown), heading_curve(plain, shown), noise_curve(found, noise, simulated),
+        tuple(_remarks(hygiene, names, known, offered)), rate, tuple(names))
+
+
+def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
+    """Return the causes that were named."""
+    search, found, findings = known.search, known.found, []
+    for place, (each, members) in enumerate(zip(found.named, known.rivals)):
+        chance = search.chance.p_value(each.candidate.cause, evidence_of(search, (*found.named, *known.unnamed), place))
+        findings.append(named_finding(search, found, place, chance, members, _separated(search, found, place, members, generator)))
+    return findings
 
 
 def _separated(search: Search, found: Outcome, place: int, members: Sequence[Named], generator: np.random.Generator) -> str:
@@ -239,12 +285,11 @@ def _constant(replays: Sequence[Replay]) -> dict[str, str]:
     return quiet
 
 
-def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], withdrawn: Sequence[str], findings: Sequence[Finding],
-             offered: bool) -> Iterator[str]:
+def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion, offered: bool) -> Iterator[str]:
     for place, clean in enumerate(hygiene):
         where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for name in withdrawn:
-        yield f'What looked like {name.replace("_", " ")} differs from log to log, and is not named.'
+    for name in dict.fromkeys(each.candidate.cause for each in known.unnamed if is_named(each.candidate)):
+        yield f'What looks like {name.replace("_", " ")} is not named: it differs from log to log, or is not alone.'
     if not offered:
         yield 'On the parts held out, the extended model was worse than the one before; it is not offered.'
