@@ -171,10 +171,17 @@ def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
     out = (number % EVERY == 1) & (number < int((stamps[-1] - stamps[0]) / length + 1e-9))
     kept = good & ~out
     design = np.column_stack([np.ones_like(output), truth.reference])
-    left = [output - design @ np.linalg.lstsq(design[kept], output[kept], rcond=None)[0], output - truth.prediction]
+    left = [output - design @ np.linalg.lstsq(design[kept], output[kept], rcond=None)[0], output - _predicted(hidden)]
     left[1] = left[1] - np.mean(left[1][kept])
     headings = [[length * np.mean(each[out & good & (number == block)]) for block in np.unique(number[out])] for each in left]
     return {'rate': _squares([each[out & good] for each in left]), 'heading': _squares(headings)}
+
+
+def _predicted(hidden: HiddenLog) -> np.ndarray:
+    """Return the output to expect; that of a noisy gyro has no steps."""
+    truth, gyro = hidden.truth, hidden.truth.gyro
+    limit = gyro.value('saturation') or np.inf
+    return np.clip(truth.rate + truth.added, -limit, limit) * (gyro.value('unit_error') or 1.0)
 
 
 def _squares(both: Sequence[Sequence[float]]) -> tuple[float, float]:
