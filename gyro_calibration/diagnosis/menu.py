@@ -260,7 +260,7 @@ def _repeats(replays: Sequence[Replay]) -> Iterator[Conditions]:
     """Do all again: what happened once does not happen again."""
     longest = max(replays, key=lambda each: each.duration)
     channels = longest.channels
-    time = longest.on_grid(channels.time)
+    time = float(channels.time[longest.kept][0]) + np.arange(longest.points) * longest.step
     known = {name: longest.on_grid(np.asarray(getattr(channels, name))) if name in longest.has else None
              for name in ('temperature', 'supply', 'specific_force')}
     yield Conditions('repeat', f'record the same {longest.duration / 60.0:.0f} min again, from another power-on', time,
