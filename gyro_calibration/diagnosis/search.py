@@ -461,7 +461,34 @@ def _updated(done: Work, place: int, values: Array) -> Named:
 
 
 def searched(search: Search) -> tuple[Named, ...]:
-    """Return the causes that the data support, with values."""
+    """
+    Return the causes that the data support, with values.
+
+    Several causes along one variable together may look like none of them. So where something without a name is found, the search is done
+    without such things too, and the likelier list is taken.
+
+    """
+    everything = _grown(search)
+    if all(is_named(each.candidate) for each in everything):
+        return everything
+    named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates if is_named(each)]), banks={}, looked={}))
+    return max((everything, named), key=lambda each: work(search.field, each).score - sum(_price(search, known) for known in each))
+
+
+def _price(search: Search, known: Named) -> float:
+    """Return what a cause of a list costs, in logarithms of the likelihood."""
+    price = _price_of_freedom(known)
+    if is_named(known.candidate):
+        return price
+    return price + MARGIN + float(np.log(sum(each.cause == known.candidate.cause for each in search.candidates)))
+
+
+def _price_of_freedom(known: Named) -> float:
+    return PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)) + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
+
+
+def _grown(search: Search) -> tuple[Named, ...]:
+    """Add causes one by one."""
     named: tuple[Named, ...] = ()
     for _ in range(2 * MOST_CAUSES):  # some are taken out again
         step, _ = strongest(search, named) if len(named) < MOST_CAUSES else (None, [])
@@ -509,5 +536,4 @@ def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the evidence of one of the causes beside the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
-    price = PRICE_OF_SHAPE * len(fitted_shapes(named[place].candidate)) + PRICE_OF_COLUMN * max(len(named[place].values) - 1, 0)
-    return work(search.field, named).score - work(search.field, others).score - price
+    return work(search.field, named).score - work(search.field, others).score - _price_of_freedom(named[place])
