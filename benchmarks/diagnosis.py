@@ -86,6 +86,11 @@ class Case:
         return f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/{self.number}'
 
     @property
+    def against_a_model(self) -> bool | None:
+        """Whether twins show only beside a model; None where what is hidden decides it."""
+        return True if self.twins is not None and TWINS[self.twins].against_a_model else None
+
+    @property
     def row(self) -> str:
         """The row of the table that it belongs to."""
         return {'nothing': f'nothing, {self.noise}', 'effects': f'one effect, {self.multiple:g} times',
@@ -110,7 +115,7 @@ class Answer:
 
 # the cases
 
-def cases(part: str, logs: int, seed: int) -> Iterator[Case]:
+def cases(part: str, logs: int) -> Iterator[Case]:
     """Go through the cases of a part."""
     if part == 'nothing':
         yield from (Case(part, (), 0.0, noise, _turn(REFERENCES, number), number) for number in range(logs) for noise in ALARMS)
@@ -126,10 +131,6 @@ def cases(part: str, logs: int, seed: int) -> Iterator[Case]:
 
 def _turn(choices: Sequence[str], number: int) -> str:
     return choices[number % len(choices)]
-
-
-def _generator(case: Case, seed: int) -> np.random.Generator:
-    return np.random.default_rng([seed, zlib.crc32(str(case).encode())])
 
 
 def made(case: Case, generator: np.random.Generator) -> HiddenLog:
@@ -155,7 +156,7 @@ def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
     hidden = made(case, generator)
     begin, found, problem = time.process_time(), None, ''
     try:
-        found = diagnosis_of([hidden], generator, with_model)
+        found = diagnosis_of([hidden], generator, with_model or case.against_a_model)
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
@@ -236,7 +237,7 @@ def main(words: Sequence[str] | None = None) -> None:
     given = parser.parse_args(words)
     print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 12}', flush=True)
     for part in given.part:
-        chosen = [case for case in cases(part, given.logs, given.seed) if re.search(given.only, str(case))]
+        chosen = [case for case in cases(part, given.logs) if re.search(given.only, str(case))]
         _print(_run(chosen, given))
 
 
