@@ -125,12 +125,17 @@ def cases(part: str, logs: int) -> Iterator[Case]:
     else:
         multiples = (3.0,) if part == 'outside' else MULTIPLES
         names: Sequence[tuple[str, ...]] = [(name,) for name in {'effects': FORMS, 'outside': OUTSIDE}.get(part, ())] or [()]
-        yield from (Case(part, each, multiple, _turn(NOISES, number + place), _turn(REFERENCES, number + place), number)
+        yield from (Case(part, each, multiple, _turn(NOISES, number + place), _reference(each, number + place), number)
                     for number in range(logs) for multiple in multiples for place, each in enumerate(names))
 
 
 def _turn(choices: Sequence[str], number: int) -> str:
     return choices[number % len(choices)]
+
+
+def _reference(names: Sequence[str], number: int) -> str:
+    """Choose a reference; figures of the noise are sized without the steps of an encoder, which hide them."""
+    return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise' for name in names) else _turn(REFERENCES, number)
 
 
 def made(case: Case, generator: np.random.Generator) -> HiddenLog:

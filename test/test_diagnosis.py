@@ -49,14 +49,16 @@ def names_of(found):
 
 @pytest.mark.parametrize('seed, name', list(enumerate(FORMS)), ids=FORMS)
 def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
-    log, = hidden_in([name], 5.0, seed)
+    # figures of the noise are sized without the steps of an encoder, which hide them
+    reference = turn(REFERENCES, 0 if FORMS[name].stage == 'noise' else seed)
+    log, = hidden_in([name], 5.0, seed, reference=reference)
     found = diagnosis_of([log], np.random.default_rng(seed))
     how = judged_diagnosis(log, found, ENCODER)
     assert how.right, told(log, found)
     assert all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(log, found)
     for measure, (mine, oracle) in won(log, found).items():
         # gains are compared where they are more than what noise and the steps of an encoder make of the mean square of some blocks
-        if oracle > {'rate': 0.01, 'heading': 1.0}[measure] and not (measure == 'rate' and 'encoder_step' in turn(REFERENCES, seed)):
+        if oracle > {'rate': 0.01, 'heading': 1.0}[measure] and not (measure == 'rate' and 'encoder_step' in reference):
             assert mine > 0.8 * oracle, (measure, mine, oracle, told(log, found))
 
 
@@ -77,11 +79,10 @@ def test_effects_together_are_all_named(seed, names):
 @pytest.mark.parametrize('seed, noise', list(enumerate(KINDS)), ids=KINDS)
 def test_where_nothing_is_hidden_nothing_is_found(seed, noise, reference):
     log, = hidden_in([], 0.0, seed, noise, REFERENCES[reference])
-    found = diagnosis_of([log], np.random.default_rng(seed))
-    assert judged_diagnosis(log, found, ENCODER).right and (found.verdict == 'adequate' or found.findings), told(log, found)
+    # every other log is held against a model that is right, so that bias, scale factor and noise must fit as well
+    found = diagnosis_of([log], np.random.default_rng(seed), with_model=bool((seed + reference) % 2))
+    assert judged_diagnosis(log, found, ENCODER).right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
-    with_model = diagnosis_of([log], np.random.default_rng(seed), with_model=True)
-    assert judged_diagnosis(log, with_model, ENCODER).right, told(log, with_model)
 
 
 @pytest.mark.parametrize('name', ['third_harmonic_of_heading', 'resonance_at_a_speed', 'bias_pulse', 'supply_times_rate'])
