@@ -116,6 +116,31 @@ def test_the_models_in_the_documents_can_be_read(tmp_path):
     assert full.covariance is not None and full.self_calibration is not None and full.gyro and full.origin and full.noise.rate_random_walk
 
 
+def headline(text):
+    """Return the first two sentences of the diagnosis of the example, with # for each number, and the numbers."""
+    said = re.search(r'Simulation and measurement differ because of warm up:.*? parts\.', ' '.join(text.split()))[0]
+    number = r'\d+(?:\.\d+)?'
+    return re.sub(number, '#', said), [float(each) for each in re.findall(number, said)]
+
+
+def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path, monkeypatch):
+    page = (ROOT / 'docs/diagnosis.md').read_text()
+    monkeypatch.chdir(tmp_path)
+    for name in ('gyro.yaml', 'real.yaml', 'profile.csv'):
+        block = re.search(rf'`{name}`[^`]*?:\n\n((?:    .*\n)+)', page)[1]
+        (tmp_path / name).write_text(block.replace('\n    ', '\n')[4:])
+    simulate, diagnose, compensate = (next(shlex.split(each) for each in COMMAND.findall(page) if each.startswith(start))
+                                      for start in ('simulate', 'diagnose drive.csv --model gyro.yaml', 'compensate'))
+    assert run(*simulate)[0] == 0
+    code, text, _ = run(*diagnose)
+    assert code == 0
+    words, numbers = headline(text)
+    for shown in (page, (ROOT / 'README.md').read_text()):
+        # To some part, for another numpy draws and rounds otherwise.
+        assert headline(shown) == (words, pytest.approx(numbers, rel=0.25)), text
+    assert run(*compensate)[0] == 0
+
+
 @pytest.mark.parametrize('effect', [*CATALOGUE, POLYNOMIAL])
 def test_the_error_model_describes_every_effect(effect):
     assert f'`{effect}`' in (ROOT / 'docs/error_model.md').read_text()

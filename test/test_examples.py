@@ -64,6 +64,13 @@ def test_record_player_and_encoder_find_the_gyro(run):
     assert len(found) == 4 and not wrong
 
 
+def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(run, tmp_path):
+    off = [float(line.split()[-6]) for line in run('diagnose_a_log.py').splitlines() if line.startswith('Another drive')]
+    lag, = (term.values for term in read_model(tmp_path / 'model.yaml').terms if term.effect.name == 'thermal_lag')
+    assert abs(lag[0] / 120.0 - 1.0) < 0.2 and abs(lag[1] / 2e-4 - 1.0) < 0.2
+    assert off[1] < 0.3 * off[0] and (tmp_path / 'report.html').exists()
+
+
 def test_the_compensated_log_has_a_heading(run, tmp_path):
     run('compensate_a_log.py')
     assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(read_log(tmp_path / 'compensated.csv').others)

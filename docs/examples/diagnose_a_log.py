@@ -1,0 +1,57 @@
+"""
+Diagnose a log: hide an effect in a simulated drive, let the diagnosis name it, and compensate another drive by the extended model.
+
+    python diagnose_a_log.py [DIR]
+
+The logs are simulated here, so that the truth is known. With logs of your own: ``diagnose([read_log('drive.csv')], generator, model)``.
+
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE
+from gyro_calibration.log_compensation import compensate_log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model_file import write_model
+from gyro_calibration.motion import turns
+from gyro_calibration.noise import Noise
+from gyro_calibration.simulation import simulate
+
+NOISE = Noise(angle_random_walk=1.5e-4)
+#: What is believed of the gyro.
+MODEL = GyroModel((Term(BIAS, (2e-4,)), Term(SCALE_FACTOR_ERROR, (0.01,))), noise=NOISE)
+#: What the gyro is: its element is as warm as the thermometer beside it only after some minutes.
+TRUE_GYRO = GyroModel((*MODEL.terms, Term(THERMAL_LAG, (120.0, 2e-4))), noise=NOISE)
+DRIVE = turns([(30.0, 0.0), (9.0, 40.0), (20.0, 0.0), (6.0, -60.0), (15.0, 20.0), (40.0, -10.0)] * 8, ramp=1.0)
+
+
+def drive(generator):
+    """Return a log over 16 min, in which the gyro is heated and cooled twice."""
+    time = np.linspace(0.0, DRIVE.duration, round(25.0 * DRIVE.duration) + 1)
+    temperature = 30.0 + 8.0 * np.abs(np.sin(2.0 * np.pi * time / DRIVE.duration))
+    return simulate(TRUE_GYRO, DRIVE, 25.0, generator, temperature)
+
+
+def main(folder='.'):
+    generator = np.random.default_rng(1)
+    found = diagnose([drive(generator)], generator, MODEL)
+    print('\n'.join(lines(found)))
+    write_model(Path(folder) / 'model.yaml', found.model)
+    (Path(folder) / 'report.html').write_text(report(found))
+
+    other = drive(generator)
+    for name, model in (('as it was', MODEL), ('extended', found.model)):
+        error = integrate(other.time, compensate_log(model, other)) - other.reference_heading
+        print(f'Another drive, compensated by the model {name}: up to {np.abs(error).max() / DEGREE:.2f} deg off the true heading.')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
