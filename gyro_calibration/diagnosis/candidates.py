@@ -15,6 +15,8 @@ from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array
 
+#: A dead zone is looked for where an encoder makes so many steps a second or more.
+STEPS_A_SECOND = 20.0
 #: Places of a step that are tried in a log.
 STEPS = 64
 
@@ -167,7 +169,9 @@ def _of_rate(replays: Sequence[Replay], has: frozenset[str]) -> Iterator[Candida
     yield effect('reference_once_per_rev')
     if 'temperature' in has:
         yield effect('scale_factor_temperature', reference_temperatures(replays)[2])
-    for zone in np.geomspace(1e-5, 0.5, 14) * fastest:
+    # Slower than so many steps a second, it is the encoder that stands still.
+    slowest = max(1e-5 * fastest, STEPS_A_SECOND * max(each.rounded for each in replays))
+    for zone in np.geomspace(slowest, 0.5 * fastest, 14):
         yield effect('dead_zone', zone)
     for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
         yield effect('saturation', limit * fastest)

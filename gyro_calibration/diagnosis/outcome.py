@@ -113,6 +113,22 @@ class Outcome:
         """Return the bias of each log beside the simulation's, rad/s."""
         return [float(left[each.kept].mean()) for each, left in zip(self.replays, self.residuals)]
 
+    @cached_property
+    def bias_variance(self) -> float:
+        """Return the variance of the mean of the biases by what is open of the other values, (rad/s)²."""
+        means = np.array([self._mean_change(place, number) for place, number in self.work.owner])
+        return float(means @ self.covariance @ means)
+
+    def _mean_change(self, cause: int, number: int) -> float:
+        """Return by what one value more of a cause, or of the scale, lowers the mean of the biases."""
+        if cause < 0:
+            parts = [seen(each, self.named).channels.rate for each in self.replays]
+        elif number >= 0:
+            parts = [self.named[cause].candidate.columns(seen(each, self.named))[number] for each in self.replays]
+        else:
+            return 0.0
+        return float(np.mean([part[each.kept].mean() for part, each in zip(parts, self.replays)]))
+
 
 def rms(values: Array) -> float:
     """Return the root mean square."""

@@ -56,6 +56,8 @@ WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
 MOST_SLIPS = 20
 #: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
 UNLIKELY = 12.0
+#: An effect with so much evidence passes for a noise that is none, so that all noises are tried throughout.
+STRONG = 60.0
 #: What each column beyond the first costs, for it fits a little noise.
 PRICE_OF_COLUMN = 1.2
 #: By so much a structure without a name must be better than every cause.
@@ -204,16 +206,18 @@ def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
 def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006) -> Search:
     """Lay out logs and learn what chance shows in them."""
     found = [*candidates(replays), *probes(replays)]
-    whole = _of_likely_noises(field(replays), found)
-    done = work(whole, [])
-    stock = bank(whole, found)
+    everywhere = field(replays)
+    whole = _of_likely_noises(everywhere, found)
+    done, stock = work(whole, []), bank(whole, found)
+    if screen(done, stock).max() > STRONG:
+        whole, done = everywhere, work(everywhere, [])
     return Search(whole, stock, chances(done, stock, generator), rate / len(by_cause(found)))
 
 
 def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str], rate: float) -> Search:
     """Return a search for some causes in other parts of the same logs, at a rate of false alarms a cause."""
     found = [each for each in search.candidates if each.cause in causes]
-    whole = _of_likely_noises(field(replays), found)
+    whole = field(replays)
     return replace(search, field=whole, bank=bank(whole, found), rate=rate, scanned=SCANNED & frozenset(causes), banks={}, looked={})
 
 
@@ -284,7 +288,7 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
-        if width <= 2.0 * each.step and not _of_the_reference(each, float(time[moments[place]])):
+        if _is_single(white, int(moments[place]), width / each.step) and not _of_the_reference(each, float(time[moments[place]])):
             continue
         if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
             break
@@ -299,6 +303,13 @@ def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Ar
     """Return the size of a pulse at each moment, rad, and its standard deviation."""
     kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
     return correlate(white, kernel, 'same') / (kernel @ kernel), float(1.0 / np.sqrt(kernel @ kernel))
+
+
+def _is_single(white: Array, at: int, width: float) -> bool:
+    """Tell whether one sample has most of what is off about a moment."""
+    reach = max(3, round(2.0 * width))
+    near = white[max(at - reach, 0):at + reach + 1] ** 2
+    return bool(near.max() > max(25.0, 0.4 * near.sum()))
 
 
 def _of_the_reference(each: Replay, moment: float) -> bool:
@@ -413,9 +424,11 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     first = _first(search, done, named)
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         return None, []
-    top = max(each.most for each in first)
-    worth = [each for each in first if each.most > 0.8 * top - 8.0
-             and (is_named(each.candidate) or search.excess(each.candidate.cause, each.mean) > 0.0)]
+    top = max(first, key=lambda each: each.most)
+    # What changes the rate itself is alike to first order, and of a large one a first shape says little.
+    alike = is_of_the_rate(top.candidate.cause)
+    worth = [each for each in first if each.most > 0.8 * top.most - 8.0 or (alike and is_of_the_rate(each.candidate.cause))]
+    worth = [each for each in worth if is_named(each.candidate) or search.excess(each.candidate.cause, each.mean) > 0.0]
     worth.sort(key=lambda each: -each.most)
     steps = [refined(done, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
     # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
