@@ -113,7 +113,7 @@ class Replay:
 
 
 def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, step: float = 0.0,
-           model: GyroModel | None = None) -> Replay:
+           codes: float = 0.0, model: GyroModel | None = None) -> Replay:
     """
     Lay a log out.
 
@@ -124,20 +124,21 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     generator : source of the noise that fills what is lost
     update : interval at which the reference is renewed, s, where it is held in between
     step : of a reference heading, rad; 0 where it has none
+    codes : step between codes of the output, rad/s; 0 where it does not matter
     model : the simulation that the output is compared with; that of an ideal gyro where it is None
 
     """
     assert log.time is not None and log.output is not None
     time = _even(log.time)
-    log = replace(log, time=time)
     reference, smooth = _reference(log, time, update, step)
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
     place, interval = numbered(time, kept)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
-    channels = replace(channels_of(log), rate=smooth, time=time, heading=_heading(time, log, smooth))
+    channels = replace(channels_of(replace(log, time=time)), rate=smooth, time=time, heading=_heading(time, log, smooth))
     rounded = step if log.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
-    plain = Replay(replace(channels, output=log.output), reference, kept, place, interval, every, filling, rounded, _known(log),
+    output = log.output - _rounding(log.output, smooth, kept, codes) if codes else log.output
+    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log),
                    np.zeros(len(time)))
     plain = replace(plain, every=every * _smoothed(plain))
     return plain if model is None else _simulated(plain, model)
@@ -170,6 +171,25 @@ def _smoothed(plain: Replay) -> int:
         if last < _SMOOTHED * second:
             found = more
     return found
+
+
+def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
+    """
+    Return what rounding adds to the output on average, rad/s, shape (n,).
+
+    Where steps are not small beside the noise, this depends on the rate, and would pass for an effect of it. It is the Fourier series of
+    a saw, smoothed by the noise before the rounding (Widrow, Kollar and Liu 1996).
+
+    """
+    scale, bias = np.polyfit(rate[kept], output[kept], 1) if np.ptp(rate[kept]) > 0.0 else (1.0, float(output[kept].mean()))
+    expected = scale * rate + bias
+    variance = max(float(np.var((output - expected)[kept])) - step ** 2 / 12.0, 0.0)
+    wave = 2.0 * math.pi / step
+    total = np.zeros(len(output))
+    for order in wave * np.arange(1.0, 8.0):
+        sign = -1.0 if round(order / wave) % 2 else 1.0
+        total += sign * 2.0 / order * math.exp(-0.5 * order ** 2 * variance) * np.sin(order * expected)
+    return total
 
 
 def _reference(log: Log, time: Array, update: float | None, step: float) -> tuple[Array, Array]:

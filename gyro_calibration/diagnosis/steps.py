@@ -62,7 +62,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         refuse(log, model)
     hygiene = [inspect(log, model) for log in logs]
     say('replay')
-    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, model)
+    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, clean.step, model)
                for log, clean in zip(logs, hygiene)]
     say('search')
     search = begin(replays, generator, _OF_SEARCH * rate)
