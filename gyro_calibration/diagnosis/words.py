@@ -77,10 +77,15 @@ def sizes(found: Finding) -> dict[str, Quantity]:
 
 def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
     where = listed([spoken(each.along) for each in unexplained[:_NAMED]])
-    share = number(100.0 * max(each.share_of_variance for each in unexplained), 2)
+    share = _share(max(each.share_of_variance for each in unexplained))
     what = 'by something' if beside else 'by structure'
-    most = 'up to ' if len(unexplained) > 1 else ''
-    return f'along {where} {what} that no cause in the catalogue explains ({most}{share} % of the variance of the residual)'
+    most = 'up to ' if len(unexplained) > 1 and max(each.share_of_variance for each in unexplained) >= 1e-3 else ''
+    return f'along {where} {what} that no cause in the catalogue explains ({most}{share} of the variance of the residual)'
+
+
+def _share(share: float) -> str:
+    """Return a part of the whole in percent; the smallest are alike for a person, and none is nothing."""
+    return 'less than 0.1 %' if share < 1e-3 else f'{number(100.0 * share, 2)} %'
 
 
 def offered(diagnosis: Diagnosis) -> bool:
@@ -137,8 +142,8 @@ def smallest(found: Finding) -> str:
 
 def unknown(each: Unexplained) -> str:
     """Return what is known of structure without a name."""
-    share = number(100.0 * each.share_of_variance, 2)
-    return f'Along {spoken(each.along)}: {share} % of the variance of the residual; by noise alone {chance(each.p_value)}.'
+    share = _share(each.share_of_variance)
+    return f'Along {spoken(each.along)}: {share} of the variance of the residual; by noise alone {chance(each.p_value)}.'
 
 
 def noise_figures(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
