@@ -24,6 +24,7 @@ from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.search import MOST_OF, Search, alternatives, begin, evidence_of, polished, pruned, searched
+from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
@@ -247,9 +248,10 @@ def _of_noise(figures: NoiseFigures, expected: Noise, rate: float, replays: Sequ
     for name in NAMES[1:] if any(each.rounded for each in replays) else NAMES:  # the steps of an encoder hide white noise
         if figures.chance.get(name, 1.0) < _OF_NOISE * rate:
             cause, value = CAUSES[name], getattr(figures.noise, name)
-            found.append(Finding(name, cause.sentence, {name: Estimate(value, figures.interval[name], next(iter(cause.units.values())))},
-                                 figures.chance[name], None, evidence=f'the model says {getattr(expected, name):.3g}, the log {value:.3g}',
-                                 along=cause.along))
+            unit = next(iter(cause.units.values()))
+            said = f'the model says {amount(getattr(expected, name), unit, name)}, the log {amount(value, unit, name)}'
+            found.append(Finding(name, cause.sentence, {name: Estimate(value, figures.interval[name], unit)}, figures.chance[name], None,
+                                 evidence=said, along=cause.along))
     return found
 
 
