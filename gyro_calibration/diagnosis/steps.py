@@ -294,6 +294,7 @@ def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusio
         where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
     for name in dict.fromkeys(each.candidate.cause for each in known.unnamed if is_named(each.candidate)):
-        yield f'What looks like {name.replace("_", " ")} is not named: it differs from log to log, or is not alone.'
+        why = 'it is at many frequencies' if name == 'interference_tone' else 'it differs from log to log, or is not alone'
+        yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     if not offered:
         yield 'On the parts held out, the extended model was worse than the one before; it is not offered.'
