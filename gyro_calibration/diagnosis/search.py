@@ -296,7 +296,9 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if chosen else -np.inf)
+    # As many as are looked for at most, and there would be more: that is no slips, but something that goes on all the time.
+    some = 0 < len(chosen) < MOST_SLIPS
+    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if some else -np.inf)
 
 
 def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
