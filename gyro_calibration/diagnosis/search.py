@@ -272,7 +272,10 @@ def slips(done: Work) -> list[_First]:
         acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            found += [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step)) for width in WIDTHS]
+            tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step)) for width in WIDTHS]
+            # As many as are looked for at most, and there would be more: those are no slips, but something that goes on all the time.
+            if max(len(one.candidate.shapes) - 1 for one in tried) < MOST_SLIPS:
+                found += tried
     return [max(found, key=lambda one: one.mean)] if found else []
 
 
@@ -296,9 +299,7 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    # As many as are looked for at most, and there would be more: that is no slips, but something that goes on all the time.
-    some = 0 < len(chosen) < MOST_SLIPS
-    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if some else -np.inf)
+    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if chosen else -np.inf)
 
 
 def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
