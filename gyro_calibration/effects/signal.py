@@ -18,7 +18,7 @@ _FAST_REVERSALS = 'reverse quickly: a delay leaves the size of the swing as it i
 
 def _at(when: Array, time: Array, signal: Array) -> Array:
     """Return a signal at other times; beyond its ends it stays. Straight lines between samples would look like a delay in quick motion."""
-    return CubicSpline(time, signal)(np.clip(when, time[0], time[-1]))
+    return np.asarray(CubicSpline(time, signal)(np.clip(when, time[0], time[-1])))
 
 
 def _earlier(time: Number, offset: float) -> Number:
@@ -26,7 +26,7 @@ def _earlier(time: Number, offset: float) -> Number:
 
 
 def _delayed(signal: Array, time: Array, offset: float) -> Array:
-    return np.asarray(np.interp(_earlier(time, offset), time, signal))
+    return _at(_earlier(time, offset), time, signal)
 
 
 TIME_OFFSET = Effect(
@@ -41,7 +41,7 @@ def _stretched(time: Number, clock_rate: float) -> Number:
 
 
 def _hastened(signal: Array, time: Array, clock_rate: float) -> Array:
-    return np.asarray(np.interp(_stretched(time, clock_rate), time, signal))
+    return _at(_stretched(time, clock_rate), time, signal)
 
 
 CLOCK_RATE = Effect(
