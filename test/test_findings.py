@@ -1,0 +1,95 @@
+"""
+What docs/findings.md says of measured recordings is what the program finds in them.
+
+The tables of the document are read, and its commands are run. A size may differ by half of its interval, for noise that is drawn to fill
+lost samples differs from one release of numpy to the next.
+
+"""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from gyro_calibration.diagnosis.finding import Estimate
+from gyro_calibration.diagnosis.units import amount, quantity
+
+TEXT = (Path(__file__).parents[1] / 'docs/findings.md').read_text()
+COMMANDS = re.findall(r'^ +gyro_calibration (.+)$', TEXT, re.MULTILINE)
+NUMBER = re.compile(r'−?\d+(?:\.\d+)?(?:e[+-]\d+)?')
+
+
+def table(title):
+    """Return the rows of a table of the document, by the recording that is in their first cell."""
+    part = TEXT.split(f'\n## {title}\n')[1].split('\n## ')[0]
+    rows = [[cell.strip() for cell in line.strip('|').split('|')] for line in part.splitlines() if line.startswith('| `')]
+    found = {}
+    for name, *cells in rows:
+        found.setdefault(name.strip('`'), []).append(cells)
+    return found
+
+
+CAUSES, LEFT, GAINS = table('Causes'), table('What is left'), table('Gains')
+RECORDINGS = [shlex.split(command)[shlex.split(command).index('--out') + 1] for command in COMMANDS if command.startswith('diagnose')]
+
+
+def numbers(text):
+    """Return the numbers in a text, and the rest of it."""
+    return [float(each.replace('−', '-')) for each in NUMBER.findall(text)], NUMBER.sub('#', text)
+
+
+def agree(written, found):
+    """Tell whether a quantity is what is written, within half of its interval, or within 3 % where it has none."""
+    (mine, form), (theirs, other) = numbers(written), numbers(found)
+    half = 0.5 * (mine[2] - mine[1]) if len(mine) == 3 else 0.03 * abs(mine[0])
+    return form == other and abs(mine[0] - theirs[0]) <= half
+
+
+def shown(finding):
+    """Return the size of a cause as the program prints it."""
+    name, size = next(iter(finding['parameters'].items()))
+    return str(quantity(Estimate(size['estimate'], tuple(size['ci95']), size['unit']), name))
+
+
+@pytest.fixture
+def diagnosed(data, run, tmp_path, monkeypatch):
+    """Return a function that runs the commands of a recording, and gives what was found."""
+    def diagnosed(recording):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / 'data').symlink_to(data)
+        (tmp_path / 'none.yaml').write_text(re.search(r'```yaml\n(.*?)```', TEXT, re.DOTALL).group(1))
+        place = next(place for place, each in enumerate(COMMANDS) if each.endswith(f'--out {recording}'))
+        needed = [each for each in COMMANDS[:place] if each.split('--out ')[1] in COMMANDS[place].split()]
+        for command in (*needed, COMMANDS[place]):
+            code, _, error = run(*shlex.split(command))
+            assert code == 0, error
+        return json.loads((tmp_path / recording / 'diagnosis.json').read_text())
+    return diagnosed
+
+
+def test_the_tables_are_of_the_recordings_that_are_diagnosed():
+    assert RECORDINGS and set(CAUSES) | set(LEFT) | set(GAINS) <= set(RECORDINGS)
+
+
+@pytest.mark.parametrize('recording', RECORDINGS)
+def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
+    found = diagnosed(recording)
+    causes = {each['effect']: each for each in found['findings']}
+    written = {cause.strip('`'): cells for cause, *cells in CAUSES.get(recording, [])}
+    assert set(causes) == set(written)
+    for name, (size, instead) in written.items():
+        assert agree(size, shown(causes[name])), (name, size, shown(causes[name]))
+        assert re.findall(r'`(\w+)`', instead) == causes[name]['ambiguous_with']
+    left, parts = {each['along']: 100.0 * each['share_of_variance'] for each in found['unexplained']}, dict(LEFT.get(recording, []))
+    assert set(left) == set(parts)
+    for along, part in parts.items():
+        (size,), _ = numbers(part)
+        assert left[along] < size if part.startswith('less') else left[along] == pytest.approx(size, rel=0.1), along
+    gain = found['gain']
+    errors = {} if gain is None else {what: gain[f'{what}_rms'] for what in ('rate', 'heading') if gain[f'{what}_rms']}
+    assert set(errors) == {what for what, *_ in GAINS.get(recording, [])}
+    for what, before, after, _ in GAINS.get(recording, []):
+        for size, moment in ((before, 'before'), (after, 'after')):
+            assert agree(size, amount(errors[what][moment], {'rate': 'rad/s', 'heading': 'rad'}[what])), (what, moment)
