@@ -291,7 +291,8 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
     chosen: list[float] = []
     total = 0.0
     for place in np.argsort(-value)[:200]:
-        if _is_single(white, int(moments[place]), width / each.step) and not _of_the_reference(each, float(time[moments[place]])):
+        single = _single(each, int(moments[place]), width)
+        if single is not None and not _of_the_reference(each, float(time[single])):
             continue
         if (value[place] <= 0.0 and chosen) or len(chosen) == MOST_SLIPS:
             break
@@ -308,11 +309,14 @@ def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Ar
     return correlate(white, kernel, 'same') / (kernel @ kernel), float(1.0 / np.sqrt(kernel @ kernel))
 
 
-def _is_single(white: Array, at: int, width: float) -> bool:
-    """Tell whether one sample has most of what is off about a moment."""
-    reach = max(3, round(2.0 * width))
-    near = white[max(at - reach, 0):at + reach + 1] ** 2
-    return bool(near.max() > max(25.0, 0.4 * near.sum()))
+def _single(each: Replay, at: int, width: float) -> int | None:
+    """Return the one point that has most of what is off about a point of the grid; None where it is not one alone."""
+    left = each.on_grid(each.channels.output - each.channels.rate)
+    reach = max(3, round(2.0 * width / each.step))
+    begin = max(at - reach, 0)
+    near = left[begin:at + reach + 1]
+    off = (near - np.median(near)) ** 2
+    return begin + int(off.argmax()) if off.max() > max(40.0 * np.median(off), 0.4 * off.sum()) else None
 
 
 def _of_the_reference(each: Replay, moment: float) -> bool:
