@@ -90,9 +90,9 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
     relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / deviation[chosen] ** 2, first_of)
                          for shape in shapes]) / [len(part) for part in few]
-    # A part of the noise is there or not, with even chances; that it is there with one of many sizes must not outweigh that it is not.
-    rare = [(np.log(sum(bool(each.walk) for each in shapes)) if shape.walk else 0.0)
-            + (np.log(sum(bool(each.strength) for each in shapes if not each.walk)) if shape.strength else 0.0) for shape in shapes]
+    # Each combination of parts has an even chance; that parts come in many sizes must not outweigh that they may not be there.
+    kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
+    rare = [np.log(kinds.count(kind)) for kind in kinds]
     noises = Noises(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
     return Field(replays, first, deviation, starts, tuple(shapes), noises)
 

@@ -257,10 +257,10 @@ def tones(done: Work) -> list[_First]:
 
 
 def _of_the_gyro(each: Replay, frequency: float) -> bool:
-    """Tell whether a tone stays when the reference is smooth: the steps of an encoder make tones of their own."""
+    """Tell whether a tone is in the output, and not in the reference alone: the steps of an encoder make tones of their own."""
     wave = np.exp(-2.0j * np.pi * frequency * each.channels.time[each.kept])
-    rough, smooth = (np.abs(np.mean((each.channels.output - rate)[each.kept] * wave)) for rate in (each.reference, each.channels.rate))
-    return bool(smooth > 0.5 * rough)
+    output, reference = (np.abs(np.mean(values[each.kept] * wave)) for values in (each.channels.output, each.reference))
+    return bool(output > 0.7 * reference)
 
 
 def slips(done: Work) -> list[_First]:

@@ -17,8 +17,8 @@ from scipy.fft import dct, idct
 
 from gyro_calibration.log import Array
 
-#: Ratios of random walk to white noise, of Gauss-Markov to white noise, and correlation times that are tried: see `noise_grid`.
-_WALKS, _STRENGTHS, _TIMES = 14, 7, 7
+#: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corners of flicker that are tried: see `noise_grid`.
+_WALKS, _STRENGTHS, _TIMES, _CORNERS = 14, 7, 7, 14
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Shape:
     strength : variance of the Gauss-Markov part over the spectral density of the white one, 1/s
     correlation_time : of the Gauss-Markov part, s
     reference : variance of the reference's rounding over the interval squared, relative to that of a white sample
+    flicker : frequency at which the spectral density of flicker, B² / (2 pi f), is that of the white part, Hz
 
     """
 
@@ -39,6 +40,7 @@ class Shape:
     strength: float = 0.0
     correlation_time: float = 1.0
     reference: float = 0.0
+    flicker: float = 0.0
 
     def variance(self, angle: Array, interval: Array | float) -> Array:
         """
@@ -54,6 +56,8 @@ class Shape:
         total = 1.0 + self.reference * differentiated(angle)
         if self.walk:
             total = total + self.walk * interval ** 2 / wave
+        if self.flicker:
+            total = total + self.flicker * 2.0 * math.pi * interval / angle
         if self.strength:
             kept = np.exp(-interval / self.correlation_time)
             total = total + self.strength * interval * (1.0 - kept ** 2) / ((1.0 - kept) ** 2 + kept * wave)
@@ -93,7 +97,7 @@ def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list
     Return noises that a residual may have, coarse enough to try all.
 
     A random walk shows where it is stronger than white noise over the log; a Gauss-Markov part where its correlation time lies between
-    some samples and the log.
+    some samples and the log. Flicker takes the place of a Gauss-Markov part.
 
     """
     lowest = 0.02 / duration ** 2
@@ -102,4 +106,6 @@ def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list
     times = np.geomspace(max(4.0 * interval, duration / 2000.0), duration / 3.0, _TIMES)
     # By their density at frequency 0 over the white one, from hardly seen to a hundred times.
     strong = [(ratio / (2.0 * time), time) for time in times for ratio in np.geomspace(0.3, 1000.0, _STRENGTHS)]
-    return [Shape(walk, strength, time, reference) for walk in walks for strength, time in [(0.0, 1.0), *strong]]
+    plain = [Shape(walk, strength, time, reference) for walk in walks for strength, time in [(0.0, 1.0), *strong]]
+    corners = np.geomspace(0.1 / duration, 0.3 / interval, _CORNERS)
+    return plain + [Shape(walk, reference=reference, flicker=corner) for walk in walks[::4] for corner in corners]
