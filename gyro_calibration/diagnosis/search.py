@@ -335,6 +335,7 @@ def _stock(search: Search, named: Sequence[Named]) -> Bank:
     if not changes:
         return search.bank
     if key not in search.banks:
+        search.banks.clear()  # one is hundreds of megabytes
         search.banks[key] = bank(search.field, search.candidates, changes)
     return search.banks[key]
 
