@@ -486,15 +486,14 @@ def searched(search: Search) -> tuple[Named, ...]:
     Return the causes that the data support, with values.
 
     Several causes along one variable together may look like none of them. So where something without a name is found, the search is done
-    without such things too; its list is taken if it is the likelier one, and leaves nothing.
+    without such things too, and the likelier list is taken.
 
     """
     everything = _grown(search)
     if all(is_named(each.candidate) for each in everything):
         return everything
     named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates if is_named(each)]), banks={}, looked={}))
-    scores = [work(search.field, each).score - sum(_price(search, known) for known in each) for each in (everything, named)]
-    return named if scores[1] > scores[0] and strongest(search, named)[0] is None else everything
+    return max((everything, named), key=lambda each: work(search.field, each).score - sum(_price(search, known) for known in each))
 
 
 def _price(search: Search, known: Named) -> float:
