@@ -31,6 +31,8 @@ from gyro_calibration.noise import Noise
 
 #: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of bias and of scale factor error.
 _OF_SEARCH, _OF_NOISE, _OF_BIAS = 0.6, 0.03, 0.05
+#: An effect along the rate that is larger than this part of it is not named.
+_LARGEST = 0.5
 #: A cause that differs between logs beyond this chance does not repeat.
 _REPEATS = 1e-3
 #: Causes named from a temperature must repeat.
@@ -121,7 +123,7 @@ def _parted(search: Search, everything: tuple[Named, ...]) -> tuple[tuple[Named,
     if len(tones) >= MOST_OF['interference_tone']:
         beyond.add('frequency')
     kept = tuple(each for each in everything if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in beyond)
-    kept = tuple(each for each in kept if _repeats(search, everything, each))
+    kept = tuple(each for each in kept if _repeats(search, everything, each) and _is_small(search, each))
     unnamed = tuple(each for each in everything if each not in kept)
     if not unnamed:
         return kept, ()
@@ -129,6 +131,14 @@ def _parted(search: Search, everything: tuple[Named, ...]) -> tuple[tuple[Named,
                  {along(other.candidate) for other in unnamed if not is_named(other.candidate)})
     left = pruned(search, polished(search, (*kept, *rest)))
     return tuple(each for each in left if any(_same(each, one) for one in kept)), rest
+
+
+def _is_small(search: Search, known: Named) -> bool:
+    """Tell whether an effect along the rate is small beside it, as those of a gyro are: another one has only its shape."""
+    if CAUSES[known.candidate.cause].along != 'rate' or known.candidate.amplitude is not None:
+        return True
+    most = [float(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)), 1)).max()) for each in search.field.replays]
+    return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max()) for each in search.field.replays)
 
 
 def _same(one: Named, other: Named) -> bool:
