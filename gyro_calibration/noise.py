@@ -35,7 +35,7 @@ class Noise:
         """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
         return self.angle_random_walk ** 2 / interval
 
-    def allan_variance(self, duration: float) -> float:
+    def allan_variance(self, duration: Number) -> Number:
         """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of neighbours' difference."""
         return (self.angle_random_walk ** 2 / duration + (ALLAN_FLOOR * self.bias_instability) ** 2
                 + self.rate_random_walk ** 2 * duration / 3.0)

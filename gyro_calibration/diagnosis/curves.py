@@ -12,9 +12,9 @@ import numpy as np
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.finding import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.outcome import Outcome, joined
-from gyro_calibration.diagnosis.replay import Replay
+from gyro_calibration.diagnosis.replay import Replay, white_deviation
 from gyro_calibration.log import Array
-from gyro_calibration.noise import ALLAN_FLOOR, Noise
+from gyro_calibration.noise import Noise
 
 #: Bins of a curve, and points of a line over time.
 BINS, POINTS = 40, 600
@@ -28,7 +28,7 @@ def curves(before: Outcome, after: Outcome) -> list[Curve]:
     kept = [each.kept for each in replays]
     left = [joined([residual[mask] - bias for residual, mask, bias in zip(found.residuals, kept, found.biases)])
             for found in (before, after)]
-    white = joined([np.full(int(mask.sum()), _white(residual[mask])) for residual, mask in zip(after.residuals, kept)])
+    white = joined([np.full(int(mask.sum()), white_deviation(residual[mask])) for residual, mask in zip(after.residuals, kept)])
     added = joined([each.added[mask] + bias for each, mask, bias in zip(replays, kept, before.biases)])
     found = [_curve(name, unit, joined([of(each)[each.kept] for each in replays]), left, white, added)
              for name, unit, of in _variables(replays)]
@@ -51,10 +51,6 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
         yield 'vibration', '(m/s²)²', lambda each: each.lagged('vibration', 1.0)
     if 'supply' in has:
         yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
-
-
-def _white(residual: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(np.diff(residual, 2)))) / np.sqrt(6.0) if len(residual) > 2 else 0.0
 
 
 def _curve(name: str, unit: str, at: Array, left: Sequence[Array], white: Array, added: Array) -> Curve:
@@ -98,10 +94,5 @@ def noise_curve(after: Outcome, fitted: Noise, expected: Noise) -> NoiseCurve:
     each = after.replays[0]
     chart = allan_deviation(each.on_grid(after.residuals[0])[:_ALLAN_SAMPLES], each.step)
     times = chart.time
-    return NoiseCurve(times, chart.deviation, _allan(fitted, times), _allan(expected, times) if expected.angle_random_walk else None)
-
-
-def _allan(noise: Noise, times: Array) -> Array:
-    """Return the Allan deviation of noise figures at averaging times (IEEE Std 952, C.1)."""
-    return np.sqrt(noise.angle_random_walk ** 2 / times + (ALLAN_FLOOR * noise.bias_instability) ** 2
-                   + noise.rate_random_walk ** 2 * times / 3.0)
+    return NoiseCurve(times, chart.deviation, np.sqrt(fitted.allan_variance(times)),
+                      np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk else None)

@@ -242,12 +242,16 @@ def _limited(limit: Limit | None, at_limit: Mask, seen: Compared, model: GyroMod
                   f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}')
 
 
+def _count_and_first(samples: Mask, log: Log) -> tuple[int, float]:
+    """Return how many samples are marked, and the stamp of the first of them, s."""
+    assert log.time is not None
+    return int(np.count_nonzero(samples)), float(log.time[int(np.argmax(samples))])
+
+
 def _stuck(stuck: Stuck | None, log: Log) -> Iterator[Finding]:
     if stuck is None:
         return
-    assert log.time is not None
-    count = int(np.count_nonzero(stuck.repeats))
-    first = log.time[int(np.argmax(stuck.repeats))]
+    count, first = _count_and_first(stuck.repeats, log)
     yield _counted('stuck_samples', count, stuck.p_value, f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
                    f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the whole log')
 
@@ -255,9 +259,7 @@ def _stuck(stuck: Stuck | None, log: Log) -> Iterator[Finding]:
 def _wild(wild: Wild | None, log: Log) -> Iterator[Finding]:
     if wild is None:
         return
-    assert log.time is not None
-    count = int(np.count_nonzero(wild.samples))
-    first = log.time[int(np.argmax(wild.samples))]
+    count, first = _count_and_first(wild.samples, log)
     yield _counted('outliers', count, wild.p_value, f'{count} single samples are up to {wild.largest:.0f} standard deviations off their '
                    f'neighbours, the first at {first:.3f} s')
 

@@ -130,11 +130,6 @@ class Outcome:
         return float(np.mean([part[each.kept].mean() for part, each in zip(parts, self.replays)]))
 
 
-def rms(values: Array) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0
-
-
 def joined(parts: Sequence[Array]) -> Array:
     """Return the values of all logs in one array."""
     return np.concatenate(list(parts))

@@ -99,9 +99,7 @@ class Replay:
 
     def noisy(self, values: Array) -> Array:
         """Return the cosine transform of a residual, whose bridges get the white noise that the rest has."""
-        known = values[self.kept]
-        white = 1.4826 * float(np.median(np.abs(np.diff(known, 2)))) / math.sqrt(6.0)
-        return transform(self.on_grid(values, white))
+        return transform(self.on_grid(values, white_deviation(values[self.kept])))
 
     def coefficients(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -110,6 +108,11 @@ class Replay:
     def with_rate(self, rate: Array) -> Replay:
         """Return it with another rate that the effects look at."""
         return replace(self, channels=replace(self.channels, rate=rate))
+
+
+def white_deviation(residual: Array) -> float:
+    """Return the standard deviation of the white noise of a residual, by the median of its second differences."""
+    return 1.4826 * float(np.median(np.abs(np.diff(residual, 2)))) / math.sqrt(6.0) if len(residual) > 2 else 0.0
 
 
 def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, step: float = 0.0,
