@@ -12,17 +12,21 @@ import gzip
 import io
 import itertools
 import math
+import os
+import reprlib
+import stat
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_calibration.files import replacing
+from gyro_calibration.files import LARGEST, replacing
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -36,6 +40,16 @@ DEGREE = math.pi / 180.0
 CACHED = 1 << 14
 #: Rows of a block of a log that is read piece by piece.
 ROWS = 1 << 16
+#: No gyro gives samples closer than this, s.
+SHORTEST = 1e-9
+#: A heading that changes by full turns to this part of one, and faster than anything that bears a gyro turns, rad/s, is wrapped.
+_FULL, _FASTEST = 0.1, 35.0
+#: Characters of a line, of what is before the rows, and of a block of lines, or of one row that goes over several.
+_LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
+#: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
+_WHOLE, _TEXT = 1 << 29, 10
+#: A compressed log is a tenth as large as its text; where it is less than a hundredth, the text is there to fill memory or disk.
+_UNFOLDED = 100
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -53,6 +67,8 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
     'moving': ('moving', 1.0),
 }
 QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
+#: Of a temperature, degC; a value of any other quantity is at most `LARGEST`, in its unit.
+_HOTTEST = 1e5
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
 
 
@@ -86,7 +102,7 @@ class Log:
     supply : V
     moving : 1 or 0
     notes : the lines before the header, without their '#'
-    others : columns of the file that are not ours, as text, in their order
+    others : columns of the file that are not ours, as text, in their order; of one name, the second is called `name.1`
 
     """
 
@@ -122,12 +138,21 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     LogError : the file cannot be read, or is not a log; names file, row and column
 
     """
-    blocks = list(read_log_blocks(path, sensitivity, rate))
+    blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate)))
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
     arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks]) for quantity in present}
     others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks)) for name in first.others}
     return Log(**arrays, notes=first.notes, others=others)
+
+
+def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
+    numbers = 0
+    for block in blocks:
+        numbers += len(block) * (sum(getattr(block, quantity) is not None for quantity in QUANTITIES) + _TEXT * len(block.others))
+        if numbers > _WHOLE:
+            raise LogError(f'{path}: holds more than {_WHOLE} numbers, which are too many to look at at once; cut it into pieces')
+        yield block
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None, rows: int = ROWS,
@@ -146,12 +171,18 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     LogError : as `read_log`, when the row is reached
 
     """
-    count, last = 0, -math.inf
-    with _refusing(path), open(path, 'rb') as file, _reading(file, str(path).endswith('.gz')) as text:
-        lines = _without_empty_end(text)
-        notes, header, first_line = _head(path, lines)
-        named = _named_columns(path, header)
-        while block := list(itertools.islice(lines, rows)):
+    count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
+    with _refusing(path), _opened(path) as file, _reading(file, compressed) as text:
+        lines = _lines(text)
+        notes, header, first_line = _head(path, _bounded(lines, _HEAD))
+        named, unfolded = _named_columns(path, header), 0
+        if rate is not None:
+            named.pop('time', None)
+        while block := _block(lines, rows):
+            unfolded += sum(map(len, block))
+            if compressed and file.seekable() and unfolded > _BLOCK + _UNFOLDED * file.tell():
+                raise LogError(f'{path}: unfolds to more than {_UNFOLDED} times its size, as no log does; unpack it if that is what was '
+                               'recorded')
             places, arrays, others = _quickly(block, first_line, header, named) or _carefully(path, block, lines, first_line, header, named)
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
@@ -175,19 +206,49 @@ def _refusing(path: str | Path) -> Iterator[None]:
         raise LogError(f'{path}: cannot be read as a log ({error}); wanted a CSV file, .csv or .csv.gz') from error
 
 
+def _opened(path: str | Path) -> BinaryIO:
+    """Open a file or a pipe; a device may never end."""
+    if not (stat.S_ISREG(mode := os.stat(path).st_mode) or stat.S_ISFIFO(mode)):
+        raise OSError('it is neither a file nor a pipe')
+    return open(path, 'rb')
+
+
 def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
     data: Any = gzip.GzipFile(fileobj=file) if compressed else file
     return io.TextIOWrapper(data, encoding='utf-8-sig', newline='')
 
 
-def _without_empty_end(lines: Iterable[str]) -> Iterator[str]:
-    empty = []
-    for line in lines:
-        if len(line) < 3 and not line.strip('\r\n'):
+def _lines(text: io.TextIOWrapper) -> Iterator[str]:
+    """Give the lines of a file, but for empty ones at its end."""
+    empty: list[str] = []
+    for line in iter(partial(text.readline, _LINE + 1), ''):
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _BLOCK:
             empty.append(line)
             continue
+        if len(line) > _LINE:
+            raise csv.Error(f'a line has more than {_LINE} characters')
         yield from empty
         empty.clear()
+        yield line
+
+
+def _block(lines: Iterator[str], rows: int) -> list[str]:
+    """Return the next lines: so many, or fewer where they are long."""
+    block: list[str] = []
+    length = 0
+    while length < _BLOCK and (more := list(itertools.islice(lines, min(rows - len(block), 256)))):
+        block += more
+        length += sum(map(len, more))
+    return block
+
+
+def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
+    """Give the lines of one row, or of what is before the rows, up to so many characters."""
+    left = most
+    for line in lines:
+        left -= len(line)
+        if left < 0:
+            raise csv.Error(f'a row, or what is before the first, has more than {most} characters')
         yield line
 
 
@@ -198,7 +259,7 @@ def _head(path: str | Path, lines: Iterator[str]) -> tuple[tuple[str, ...], list
         notes.append(line[1:].strip())
         line = next(lines, '')
     rows = csv.reader(itertools.chain([line], lines))
-    header = [name.strip() for name in next(rows, [])]
+    header = [_unix(name.strip()) for name in next(rows, [])]
     if not any(name in COLUMNS for name in header):
         raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, such as time_s,gyro_dps,temperature_degc')
     return tuple(notes), header, len(notes) + rows.line_num + 1
@@ -214,13 +275,22 @@ def _named_columns(path: str | Path, header: list[str]) -> Named:
             raise LogError(f'{path}: columns {header[named[quantity][0]]} and {name} both give the {quantity}; keep one of them')
         named[quantity] = (index, factor)
     if not {'output', 'counts'} & set(named):
-        raise LogError(f'{path}: no gyro column among {",".join(header)}; wanted gyro_dps, gyro_rad_s or gyro_counts')
+        raise LogError(f'{path}: no gyro column among {shown(",".join(header))}; wanted gyro_dps, gyro_rad_s or gyro_counts')
     return named
+
+
+def _distinct(header: list[str]) -> list[str]:
+    """Return the names of columns, each once: a second x is x.1."""
+    names: list[str] = []
+    for name in header:
+        tried = itertools.chain([name], (f'{name}.{number}' for number in itertools.count(1)))
+        names.append(next(each for each in tried if each not in names and (each == name or each not in header)))
+    return names
 
 
 def _quickly(lines: list[str], first_line: int, header: list[str], named: Named) -> Parsed | None:
     """Parse rows of numbers by numpy; None where there is anything else in them, which wants a closer look."""
-    if len(named) < len(header):
+    if not all(name in COLUMNS for name in header):
         return None
     try:
         table = np.loadtxt(lines, delimiter=',', comments=None, ndmin=2)
@@ -239,7 +309,7 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     A text in quotes may go on in the next line, and so take lines of the rest.
 
     """
-    reader = csv.reader(itertools.chain(lines, rest))
+    reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)))
     places, rows = [first_line], []
     for row in reader:
         if len(row) != len(header):
@@ -251,8 +321,7 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     columns = list(zip(*rows))
     arrays = {quantity: _numbers(path, places, header[index], columns[index], quantity) * factor
               for quantity, (index, factor) in named.items()}
-    ours = {index for index, _ in named.values()}
-    return places, arrays, {name: columns[index] for index, name in enumerate(header) if index not in ours}
+    return places, arrays, {name: columns[index] for index, name in enumerate(_distinct(header)) if header[index] not in COLUMNS}
 
 
 def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...], quantity: str) -> Array:
@@ -260,16 +329,27 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
         values = np.array(texts, dtype=np.float64)
     except ValueError:
         row = next(number for number, text in enumerate(texts) if not _is_number(text))
-        raise LogError(f'{path}: line {places[row]}, column {name}: {texts[row]!r} is not a number') from None
+        raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} is not a number') from None
     wrong = _wrong(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise LogError(f'{path}: line {places[row]}, column {name}: {texts[row]} is not a finite number; remove the row')
+        fault = f'beyond {_most(quantity):g}, which no gyro means' if np.isfinite(values[row]) else 'not a finite number'
+        raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} is {fault}; remove the row')
     return values
 
 
 def _wrong(values: Array, quantity: str) -> Mask:
-    return np.isinf(values) if quantity in _MAY_BE_LOST else ~np.isfinite(values)
+    size = np.abs(values)
+    return size > LARGEST if quantity in _MAY_BE_LOST else ~(size <= _most(quantity))
+
+
+def _most(quantity: str) -> float:
+    return _HOTTEST if quantity == 'temperature' else LARGEST
+
+
+def shown(text: str) -> str:
+    """Return a text of a file for a message: not more than a line, and nothing that a terminal would obey."""
+    return ''.join(letter if letter.isprintable() else ' ' for letter in text[:100])
 
 
 def _is_number(text: str) -> bool:
@@ -284,12 +364,33 @@ def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None, be
     """Refuse time that does not increase, from the block before on, and return the last one."""
     if time is None:
         return before
-    late = np.diff(time, prepend=before) <= 0
+    late = ~(np.diff(time, prepend=before) >= SHORTEST)
     if late.any():
         row = int(np.argmax(late))
         raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come after '
                        f'{time[row - 1] if row else before:g} s; sort the rows, or give --rate where the stamps are no use')
     return float(time[-1])
+
+
+def refuse_wrapped(log: Log) -> None:
+    """
+    Refuse a reference heading that jumps by full turns, as one that is wrapped does.
+
+    Raises
+    ------
+    DataRefused : it does, faster than anything turns
+
+    """
+    if log.time is None or log.reference_heading is None:
+        return
+    known = np.isfinite(log.reference_heading)
+    time, change = log.time[known], np.diff(log.reference_heading[known])
+    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL
+    jumps = np.flatnonzero(turns & (np.abs(change) > _FASTEST * np.diff(time)))
+    if len(jumps):
+        raise DataRefused(f'the reference heading jumps by a full turn from one sample to the next, the first time at '
+                          f'{time[jumps[0] + 1]:.3f} s; it must be continuous: add or take off 360 deg from each jump on, as numpy.unwrap '
+                          'does with rad')
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
@@ -310,7 +411,7 @@ def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, 
     """Write a log that comes in blocks, each with more named columns, as `write_log` does; the first block has the notes."""
     with replacing(path) as file, _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data:
         for number, (log, more) in enumerate(blocks):
-            data.write(_text(log, more, headed=number == 0).encode())
+            data.write(_text(log, more, headed=number == 0).encode('utf-8', 'backslashreplace'))
 
 
 def _compressing(file: BinaryIO) -> gzip.GzipFile:
@@ -324,12 +425,17 @@ def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
         values = getattr(log, quantity)
         if factor == 1.0 and values is not None:
             columns[name] = values.tolist()
-    columns.update(log.others)
+    columns.update({name: list(map(_unix, texts)) for name, texts in log.others.items()})
     columns.update({name: np.asarray(values, dtype=float).tolist() for name, values in more.items()})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     if headed:
-        text.writelines(f'# {note}\n' for note in log.notes)
+        text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
         writer.writerow(columns)
     writer.writerows(zip(*columns.values()))
     return text.getvalue()
+
+
+def _unix(text: str) -> str:
+    """Return a text with the ends of lines that a writer of CSV puts in quotes."""
+    return text.replace('\r\n', '\n').replace('\r', '\n') if '\r' in text else text

@@ -60,7 +60,7 @@ class SelfCalibration:
     covariance : of (s, b), shape (2, 2); None where it is not known
     time : when, ISO 8601
     temperature : at which, degC; None where it was not known
-    method : likelihood, heading, rate or rest
+    method : likelihood, heading, rate, turns or rest
 
     """
 
@@ -196,7 +196,8 @@ class GyroModel:
 
     def true_time(self, time: Number) -> Number:
         """Return when a sample was taken, s since power-on, that has a stamp of `time`, s since power-on."""
-        for term in self.terms:
+        # As `distorted` has it: the last effect changed the signal that the ones before it had moved already.
+        for term in reversed(self.terms):
             if term.effect.moved is not None:
                 time = term.effect.moved(time, *term.values)
         return time
@@ -228,7 +229,8 @@ def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Numb
     Solve x = g(x) for a slope of g well below one.
 
     The plain repetition wins a factor of the slope a pass; along the secant each pass wins more than the one before, and a slope that is
-    constant is solved at once. The number of passes is fixed, so that a sample and a whole log take the same steps.
+    constant is solved at once. The number of passes is fixed, so that a sample and a whole log take the same steps; of a single sample
+    those are left out that would change nothing.
 
     """
     a, b = start, g(start)
@@ -237,6 +239,8 @@ def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Numb
     g_a = b
     for _ in range(6):
         g_b = g(b)
+        if not isinstance(b, np.ndarray) and g_b == b:
+            break
         step = b - a
         slope = (g_b - g_a) / (step + (step == 0.0))
         slope = slope * (abs(slope) < 0.9)

@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import math
-import re
 import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from gyro_calibration.effects import CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial
-from gyro_calibration.files import write_atomically
-from gyro_calibration.log import Array
+from gyro_calibration.files import LARGEST, write_atomically
+from gyro_calibration.log import Array, shown
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise
+from gyro_calibration.settings_file import read_settings, settings_text
 
 FORMAT = 'gyro_calibration/model'
 VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads numbers as people write them: YAML 1.1 takes 1e-4, without a point, for a text."""
-
-
-_Loader.add_implicit_resolver('tag:yaml.org,2002:float', re.compile(r'[-+]?[0-9]+[eE][-+]?[0-9]+$'), list('-+0123456789'))
+#: Highest order of a polynomial.
+_HIGHEST = 20
 
 
 class ModelError(ValueError):
@@ -44,26 +38,24 @@ def read_model(path: str | Path) -> GyroModel:
 
     """
     try:
-        content = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
+        content = read_settings(path)
     except FileNotFoundError:
         raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        place = f'line {mark.line + 1}: ' if mark else ''
-        raise ModelError(f'{path}: {place}cannot be read as YAML; restore the file or calibrate again') from error
+    except (OSError, ValueError) as error:
+        raise ModelError(f'{path}: cannot be read as YAML ({error}); restore the file or calibrate again') from error
     try:
         return _from_content(content)
     except _PlaceError as error:
         raise ModelError(f'{path}: {error}') from None
 
 
-_SHORT = reprlib.Repr()  # a few lines of YAML can unfold to gigabytes
+_SHORT = reprlib.Repr()
 _SHORT.maxlevel = 3
 
 
 class _PlaceError(ValueError):
     def __init__(self, place: str, given: Any, wanted: str):
-        super().__init__(f'{place} is {_SHORT.repr(given)}; wanted {wanted}')
+        super().__init__(f'{shown(place)} is {_SHORT.repr(given)}; wanted {wanted}')
 
 
 def _from_content(content: Any) -> GyroModel:
@@ -85,7 +77,7 @@ def _from_content(content: Any) -> GyroModel:
         terms, _covariance(top.get('covariance'), sum(len(term.fitted) for term in terms)),
         _range('valid.rate', valid.get('rate')), temperature_range,
         _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
-        {str(key): _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
+        {key: _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
         _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')))
 
 
@@ -95,18 +87,14 @@ def _mapping(place: str, value: Any) -> dict[str, Any]:
     return value
 
 
-#: Beyond this no value of a gyro lies, and its square still is a number.
-_LARGEST = 1e100
-
-
 def _text(place: str, value: Any) -> str:
-    if isinstance(value, (list, dict, set)):
+    if isinstance(value, (list, dict)):
         raise _PlaceError(place, value, 'a text')
     return str(value)
 
 
 def _number(place: str, value: Any, low: float = -math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST or value < low:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST or value < low:
         least = f' of at least {low:g}' if low > -math.inf else ''
         raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
     return float(value)
@@ -134,8 +122,9 @@ def _matrix(place: str, value: Any, size: int) -> Array:
         raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a fitted value')
     numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
     matrix = np.array(numbers).reshape(size, size)
-    smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + 1e-9 * np.abs(matrix).max(initial=0.0))], default=0.0)
-    if not np.allclose(matrix, matrix.T) or smallest < 0.0:
+    rounding = 1e-9 * np.abs(matrix).max(initial=0.0)
+    smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + rounding)], default=0.0)
+    if not np.allclose(matrix, matrix.T, atol=rounding) or smallest < 0.0:
         raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
     return matrix
 
@@ -172,15 +161,15 @@ def _polynomial(place: str, given: Mapping[str, Any]) -> Term:
         _only(place, given, ['matrix_dps'])
         return _polynomial_from_matrix(f'{place}.matrix_dps', given['matrix_dps'])
     orders = given.get('orders')
-    if not isinstance(orders, list) or len(orders) != 2 or not all(type(order) is int and 0 <= order <= 20 for order in orders):
+    if not isinstance(orders, list) or len(orders) != 2 or not all(type(order) is int and 0 <= order <= _HIGHEST for order in orders):
         raise _PlaceError(f'{place}.orders', orders, 'the orders in rate and temperature, such as [3, 2], or matrix_dps')
     effect = rate_temperature_polynomial(*orders)
     return Term(effect, _values(place, effect, {name: value for name, value in given.items() if name != 'orders'}))
 
 
 def _polynomial_from_matrix(place: str, rows: Any) -> Term:
-    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        raise _PlaceError(place, rows, 'rows of finite numbers')
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows) or max(map(len, [rows, *rows])) > _HIGHEST + 1:
+        raise _PlaceError(place, rows, f'rows of finite numbers, up to order {_HIGHEST}')
     numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(rows)]
     try:
         return Term(*polynomial_from_matrix(numbers))
@@ -217,14 +206,14 @@ def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple
     return (s * s, 0.0), (0.0, b * b)
 
 
-def write_model(path: str | Path, model: GyroModel) -> None:
-    """Write a model file; it is complete or not there."""
-    write_atomically(path, model_text(model).encode())
+def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
+    """Write a model file, which is complete or not there, and return its version, as `files.write_atomically` does."""
+    return write_atomically(path, model_text(model).encode())
 
 
 def model_text(model: GyroModel) -> str:
     """Return what a model file holds."""
-    return yaml.safe_dump(_to_content(model), sort_keys=False, allow_unicode=True)
+    return settings_text(_to_content(model))
 
 
 def _to_content(model: GyroModel) -> dict[str, Any]:

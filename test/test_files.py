@@ -1,7 +1,4 @@
-"""
-A file is complete or not there: also after a kill at any moment, and after a write that fails.
-
-"""
+"""A file is complete or not there: also after a kill at any moment, and after a write that fails."""
 
 import os
 import random
@@ -12,7 +9,7 @@ import time
 
 import pytest
 
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import read_bytes, write_atomically
 
 _WRITER = """
 import sys
@@ -48,6 +45,15 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     with pytest.raises(OSError, match='No space left'):
         write_atomically(path, b'new')
     assert path.read_bytes() == b'old' and os.listdir(tmp_path) == ['model.yaml']
+
+
+@pytest.mark.parametrize('kind', ['folder', 'pipe'])
+def test_what_is_no_regular_file_is_refused_and_not_left_open(tmp_path, kind):
+    (os.mkdir if kind == 'folder' else os.mkfifo)(tmp_path / 'a')
+    before = os.listdir('/proc/self/fd')
+    with pytest.raises(ValueError, match='^it is no regular file$'):
+        read_bytes(tmp_path / 'a', 10)
+    assert len(os.listdir('/proc/self/fd')) == len(before)
 
 
 def test_the_folder_is_made(tmp_path):

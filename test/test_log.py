@@ -1,7 +1,4 @@
-"""
-Logs as files: what comes in, in which unit, and what is refused. The claims are those of the log format.
-
-"""
+"""Logs as files: what comes in, in which unit, and what is refused. The claims are those of the log format."""
 
 import gzip
 import math
@@ -52,6 +49,7 @@ REFUSED = {
     'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n', 'line 4, column time_s: 1 s does not come after 1 s'),
     'goes back': ('time_s,gyro_dps\n0,1\n1,1\n0.5,1\n', 'line 4, column time_s: 0.5 s does not come after 1 s'),
     'lost time': ('time_s,gyro_dps\n0,1\nnan,1\n2,1\n', 'line 3, column time_s: nan is not a finite number'),
+    'lost temperature': ('gyro_dps,temperature_degc\n0,20\n1,nan\n', 'line 3, column temperature_degc: nan is not a finite number'),
     'infinite': ('time_s,gyro_dps\n0,1\n1,-inf\n', 'line 3, column gyro_dps: -inf is not a finite number'),
     'infinite reference': ('gyro_dps,reference_heading_deg\n0,1\n1,inf\n', 'line 3, column reference_heading_deg'),
     'one row': ('gyro_dps\n0\n', '1 rows of data'),
@@ -60,6 +58,14 @@ REFUSED = {
     'text after a text': ('gyro_dps,place\n0,"a\nb"\n1,c\nfast,d\n', "line 5, column gyro_dps: 'fast' is not a number"),
     'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000, 'cannot be read as a log'),
     'binary': (bytes(range(256)), 'cannot be read as a log'),
+    'beyond a gyro': ('time_s,gyro_dps\n0,1\n1,1e300\n', 'line 3, column gyro_dps: 1e300 is beyond 1e+20, which no gyro means; remove the'),
+    'no time between': ('time_s,gyro_dps\n0,1\n1e-300,1\n', 'line 3, column time_s: 1e-300 s does not come after 0 s'),
+    'a text of lines': ('gyro_dps,place\n1,a\n"1\n\n2",b\n', "'1\\n\\n2' is not a number"),
+    'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a b,time_s;'),
+    'a header of 30 000 columns': ('time_s,' + 'x,' * 30000 + '\n1,1\n', 'no gyro column among time_s,x'),
+    'an endless line': ('gyro_dps\n' + '1,' * 40000 + '\n1\n', 'a line has more than 65536 characters'),
+    'an endless row': ('gyro_dps,place\n1,"' + 'a\nb","' * 3_500_000 + '\n', 'has more than 16777216 characters'),
+    'endless notes': ('#\n' * 600_000 + 'gyro_dps\n1\n2\n', 'before the first, has more than 1048576 characters'),
     'one endless field': ('gyro_dps\n' + '1' * 200000 + '\n1\n', 'cannot be read as a log'),
 }
 
@@ -81,6 +87,39 @@ def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, text, mess
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(LogError, match='nothing.csv'):
         read_log(tmp_path / 'nothing.csv')
+
+
+@pytest.mark.parametrize('read', [read_log, read_in_pairs])
+@pytest.mark.parametrize('path', ['/dev/zero', '/dev/null', '.'])
+def test_a_device_or_a_folder_is_no_log(path, read):
+    with pytest.raises(LogError, match='neither a file nor a pipe'):
+        read(path)
+
+
+def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr('gyro_calibration.log._BLOCK', 1 << 16)
+    path = tmp_path / 'log.csv.gz'
+    with gzip.open(path, 'wb') as file:
+        file.write(b'gyro_dps\n')
+        file.write(b'0\n' * 1_000_000)
+    with pytest.raises(LogError, match='unfolds to more than 100 times its size.*; unpack it'):
+        list(read_log_blocks(path))
+
+
+def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr('gyro_calibration.log._WHOLE', 100)
+    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
+    with pytest.raises(LogError, match='more than 100 numbers.*; cut it into pieces'):
+        read_log(path)
+    assert len(list(read_log_blocks(path))[0]) == 51
+
+
+def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
+    path = written(tmp_path, '# a\ngyro_dps,place,"a\rb"\n1,"a\rb",c\n2,"a\r\nb","d"\n')
+    log = read_log(path)
+    write_log(path, Log(log.output, notes=('one\rtwo\nthree',), others=log.others))
+    again = read_log(path)
+    assert again.notes == ('one two three',) and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')}
 
 
 @pytest.mark.parametrize('cut', [0, 5, -3])
@@ -144,6 +183,22 @@ def test_samples_at_a_rate_go_on_from_block_to_block(tmp_path):
     blocks = list(read_log_blocks(path, sensitivity=0.5, rate=100.0, rows=3))
     assert np.concatenate([block.time for block in blocks]).tolist() == (np.arange(7) / 100.0).tolist()
     assert [block.output.tolist() for block in blocks] == [[0.5] * 3, [0.5] * 3, [0.5]]
+
+
+def test_of_strangers_with_one_name_none_is_lost(tmp_path):
+    log = read_log(written(tmp_path, 'gyro_dps,lap,lap,lap.1,,\n0,a,b,c,d,e\n1,f,g,h,i,j\n'))
+    assert log.others == {'lap': ('a', 'f'), 'lap.2': ('b', 'g'), 'lap.1': ('c', 'h'), '': ('d', 'i'), '.1': ('e', 'j')}
+    write_log(tmp_path / 'again.csv', log)
+    assert read_log(tmp_path / 'again.csv').others == log.others
+
+
+@pytest.mark.parametrize('stamps', [['nan', 'nan', 'nan'], ['', '', ''], ['12:01', '12:01', '12:00'], ['2', '1', '0']], ids=','.join)
+def test_at_a_rate_the_stamps_may_be_broken(tmp_path, stamps):
+    path = written(tmp_path, 'time_s,gyro_rad_s\n' + ''.join(f'{stamp},{row}\n' for row, stamp in enumerate(stamps)))
+    log = read_log(path, rate=10.0)
+    assert log.time.tolist() == [0.0, 0.1, 0.2] and log.output.tolist() == [0.0, 1.0, 2.0] and not log.others
+    with pytest.raises(LogError, match='column time_s'):
+        read_log(path)
 
 
 def test_numbers_are_the_same_whether_other_columns_stand_beside_them_or_not(tmp_path):

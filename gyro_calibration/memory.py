@@ -1,0 +1,110 @@
+"""What a robot keeps in files: the model of its gyro, the last self-calibration, and the biases that rests have shown."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+from gyro_calibration.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
+from gyro_calibration.files import remove_leftovers, version
+from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, with_self_calibration
+from gyro_calibration.model_file import ModelError, read_model, write_model
+
+
+class Memory:
+    """
+    The files of one gyro.
+
+    Attributes
+    ----------
+    model : with its self-calibration; an empty one where it cannot be read
+    table : of biases at rest
+    problem : why the rates are uncalibrated, in a sentence; '' where they are not
+    hint : what else is wrong with a file; ''
+    table_hint : what is wrong with the bias table; ''
+    shared_hint : that somebody else has written to a file since; ''
+    written : when the bias table was written last, s since 1970; None before
+
+    """
+
+    def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior):
+        """Read them; what is wrong with them is told, and the rest is used. What a killed run left half written is removed."""
+        for file in (calibration_file, bias_file):
+            remove_leftovers(file)
+        self._calibration_file, self._bias_file = calibration_file, bias_file
+        self.problem = self.hint = ''
+        self.written: float | None = None
+        self.model = self._stored(model_file)
+        self.table, self.table_hint = BiasTable(self.model, prior), ''
+        if not self.problem:
+            self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
+        self.shared_hint, self._seen = '', {file: _version(file) for file in (calibration_file, bias_file)}
+
+    def look(self) -> None:
+        """Look whether somebody else has written to the files, as another node does that was given the same; to be called now and then."""
+        for file, seen in self._seen.items():
+            found = _version(file)
+            if found is not None and found != seen:
+                self.shared_hint = (f'{file} was written by somebody else, and whoever writes next replaces that: give each node a '
+                                    'calibration_file of its own, or restart this one to use what is there')
+
+    def _written(self, file: Path, version: tuple[int, int]) -> None:
+        self.shared_hint, self._seen[file] = '', version
+
+    def _stored(self, model_file: str) -> GyroModel:
+        model = GyroModel()
+        if model_file:
+            try:
+                model = read_model(Path(model_file).expanduser())
+            except ModelError as error:
+                self.problem = f'uncalibrated: {error}'
+                return model
+        if not self._calibration_file.exists():
+            return model
+        try:
+            stored = read_model(self._calibration_file)
+        except ModelError as error:
+            self.hint = f'the last self-calibration is not used: {error}'
+            return model
+        if not same_effects(stored, model):
+            self.hint = f'the self-calibration in {self._calibration_file} is not used: it belongs to another model; calibrate again'
+            return model
+        if all(numbers := [each.gyro.get('serial_number', '') for each in (stored, model)]) and numbers[0] != numbers[1]:
+            self.hint = (f'the self-calibration in {self._calibration_file} is not used: it belongs to the gyro with the serial number '
+                         f'{numbers[0]}, and the model to {numbers[1]}; calibrate again')
+            return model
+        return with_self_calibration(model, stored.self_calibration)
+
+    def keep(self, calibration: SelfCalibration) -> str:
+        """Keep a calibration, and return what went wrong with that."""
+        self.model, self.hint = with_self_calibration(self.model, calibration), ''
+        try:
+            self._written(self._calibration_file, write_model(self._calibration_file, self.model))
+        except OSError as error:
+            self.hint = f'the calibration is in use but NOT STORED ({error}): {_remedy(error, self._calibration_file)} and calibrate again'
+        return self.hint
+
+    def keep_table(self, now: float, ending: bool = False) -> None:
+        """Write the table if it learned something, but seldom, and at the end; `now` in s since 1970."""
+        if self.problem or not self.table.due(now, ending):
+            return
+        try:
+            self.table_hint, written = write_bias_table(self._bias_file, self.table, now)
+            self.written = now
+            self._written(self._bias_file, written)
+        except OSError as error:
+            self.table.not_kept(now)
+            self.table_hint = f'the bias table cannot be written ({error}): {_remedy(error, self._bias_file)}'
+
+
+def _remedy(error: OSError, file: Path) -> str:
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return f'make room in {file.parent}' if full else f'make {file} writable'
+
+
+def _version(file: Path) -> tuple[int, int] | None:
+    """Return the version of a file; None where there is none."""
+    try:
+        return version(file)
+    except OSError:
+        return None

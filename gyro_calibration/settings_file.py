@@ -1,0 +1,130 @@
+"""
+Files of settings: models, bias tables, limits. They are YAML as people write it, and data alone: nothing in them is run or names a file.
+
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gyro_calibration.files import read_bytes
+
+#: Bytes of such a file: a model with the covariance of 150 values has half of it.
+BYTES = 1_000_000
+#: How deep lists and names may be nested, and how many there may be, since YAML takes 30 us for each.
+_DEEPEST, _MOST = 10, 50_000
+
+
+def read_settings(path: str | Path, most: int = BYTES) -> Any:
+    """
+    Read a YAML file of names, texts, numbers, true, false, null and lists.
+
+    Dates are texts, and 1e-4, which YAML 1.1 takes for a text, is a number.
+
+    Raises
+    ------
+    OSError : it cannot be opened
+    ValueError : it is none; the message is a part of a sentence, with the line where it is known
+
+    """
+    try:
+        return yaml.load(read_bytes(path, most).decode('utf-8-sig'), _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f'line {mark.line + 1}: ' if mark else ''
+        raise ValueError(f'{place}{_line(error.problem or error.context)}') from error
+    except yaml.YAMLError as error:
+        raise ValueError(_line(error)) from error
+
+
+def _line(text: object) -> str:
+    """Return a message as one line, and not all of it where it repeats the file."""
+    return ' '.join(str(text).split())[:200]
+
+
+def settings_text(content: Any) -> str:
+    """Return names, texts, numbers and lists as YAML, which `read_settings` reads as they were."""
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+class _Loader(yaml.SafeLoader):
+    """
+    Reads what files of settings are made of, and refuses the rest of YAML: aliases, tags, names that are given twice.
+
+    A few lines with aliases unfold to gigabytes; a deep nest is more than the stack of Python holds.
+
+    """
+
+    yaml_constructors: dict[Any, Any] = {}
+    yaml_implicit_resolvers: dict[Any, Any] = {}
+    _depth = _count = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event: Any = self.peek_event()
+        if event.anchor is not None:
+            _refuse('an anchor or alias is not read; write out what it stands for', event)
+        if event.tag is not None:
+            _refuse('a tag is not read; leave it out', event)
+        if self._depth == _DEEPEST:
+            _refuse(f'more than {_DEEPEST} levels are nested', event)
+        if self._count == _MOST:
+            _refuse(f'there are more than {_MOST} values', event)
+        self._depth, self._count = self._depth + 1, self._count + 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
+        names: dict[str, Any] = {}
+        for name, value in node.value:
+            if not isinstance(name, yaml.ScalarNode):
+                _refuse('a name is a list, or holds names', name)
+            if name.value in names:
+                _refuse(f'{name.value[:50]!r} is given twice; keep one of them', name)
+            names[name.value] = self.construct_object(value, deep)
+        return names
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts a text in quotes that would be read as a number."""
+
+    yaml_implicit_resolvers: dict[Any, Any] = {first: list(each) for first, each in yaml.SafeDumper.yaml_implicit_resolvers.items()}
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_str(self, data: str) -> Any:
+        # Outside of double quotes these would be read as ends of lines.
+        return self.represent_scalar('tag:yaml.org,2002:str', data, '"' if re.search('[\x85\u2028\u2029]', data) else None)
+
+
+def _refuse(problem: str, at: Any) -> None:
+    raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
+
+
+def _float(loader: Any, node: Any) -> float:
+    return float(node.value.lower().replace('.inf', 'inf').replace('.nan', 'nan'))
+
+
+#: Name -> (pattern, first characters, constructor). A number of more than 400 digits is none, and would take long to read.
+_KINDS: dict[str, tuple[str, list[str], Any]] = {
+    'null': ('~|null|Null|NULL|', ['~', 'n', 'N', ''], lambda loader, node: None),
+    'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'), lambda loader, node: node.value.lower() == 'true'),
+    'int': ('[-+]?[0-9]{1,400}', list('-+0123456789'), lambda loader, node: int(node.value)),
+    'float': (r'[-+]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][-+]?[0-9]{1,9})?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)',
+              list('-+.0123456789'), _float),
+    'str': ('', [], lambda loader, node: node.value),
+    'seq': ('', [], yaml.SafeLoader.construct_yaml_seq),
+    'map': ('', [], yaml.SafeLoader.construct_yaml_map),
+}
+_Dumper.add_representer(str, _Dumper.represent_str)
+for _name, (_pattern, _first, _constructor) in _KINDS.items():
+    _tag = f'tag:yaml.org,2002:{_name}'
+    _Loader.add_constructor(_tag, _constructor)
+    if _first:
+        _Loader.add_implicit_resolver(_tag, re.compile(rf'(?:{_pattern})\Z'), _first)
+        _Dumper.add_implicit_resolver(_tag, re.compile(rf'(?:{_pattern})\Z'), _first)

@@ -1,0 +1,86 @@
+"""Files of settings: what a person writes is read, what only an attacker or an accident writes is refused at once, in one sentence."""
+
+import math
+import os
+import time
+
+import pytest
+
+from gyro_calibration.files import read_bytes
+from gyro_calibration.settings_file import read_settings, settings_text
+
+LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n' for i in range(40))
+
+REFUSED = {
+    'ten to the nineteenth laughs': (LAUGHS, 'line 1: an anchor or alias is not read'),
+    'a list that holds itself': ('a: &a [*a]', 'anchor or alias'),
+    'a call': ('a: !!python/object/apply:os.getcwd []', 'line 1: a tag is not read'),
+    'an empty integer': ('a: !!int ""', 'a tag is not read'),
+    'no boolean': ('a: !!bool maybe', 'a tag is not read'),
+    'twice the same': ('a: 1\nb: 2\na: 3', "line 3: 'a' is given twice; keep one of them"),
+    'twice nearly the same': ('1: 1\n"1": 2', "line 2: '1' is given twice"),
+    'a list as name': ('? [1]\n: 2', 'a name is a list'),
+    'deep': ('[' * 100_000, 'more than 10 levels'),
+    'deep in names': ('{a: ' * 100_000, 'more than 10 levels'),
+    'deep in blocks': ('- ' * 100_000, 'more than 10 levels'),
+    'many values': ('- 1\n' * 60_000, 'more than 50000 values'),
+    'many in a row': ('[' + '1,' * 60_000 + ']', 'more than 50000 values'),
+    'large': ('#' * 1_000_001, 'more than 1000000 bytes'),
+    'two documents': ('a: 1\n---\nb: 1', 'another document'),
+    'a zero byte': ('a: \0', 'not allowed'),
+    'UTF-16': ('a: 1'.encode('utf-16'), 'utf-8'),
+    'Latin-1': ('a: größe'.encode('latin-1'), 'utf-8'),
+    'half a line': ('a: {b: 1', 'line 1: '),
+    'a tab': ('a:\n\tb: 1', 'line 2: '),
+}
+
+
+def written(folder, content):
+    path = folder / 'settings.yaml'
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize('content, message', REFUSED.values(), ids=REFUSED)
+def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(tmp_path, content, message):
+    path, before = written(tmp_path, content), time.process_time()
+    with pytest.raises(ValueError) as refused:
+        read_settings(path)
+    assert message in str(refused.value) and '\n' not in str(refused.value) and len(str(refused.value)) < 300
+    assert time.process_time() - before < 5.0
+
+
+@pytest.mark.parametrize('text, value', [
+    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10), ('-.inf', -math.inf), ('true', True), ('', None), ('~', None),
+    ('yes', 'yes'), ('2026-11-21', '2026-11-21'), ('2024-13-45', '2024-13-45'), ('0x10', '0x10'), ('1_0', '1_0'), ('1:30', '1:30'),
+    ('<<', '<<'), ('"1"', '1'), ('9' * 401, '9' * 401), ('9' * 400, 10 ** 400 - 1)])
+def test_a_value_is_what_a_person_takes_it_for(tmp_path, text, value):
+    found = read_settings(written(tmp_path, f'a: {text}'))['a']
+    assert found == value and type(found) is type(value)
+
+
+def test_a_byte_order_mark_hides_no_name(tmp_path):
+    assert read_settings(written(tmp_path, '\ufeffa: 1')) == {'a': 1}
+
+
+def test_texts_are_read_back_whatever_they_look_like(tmp_path):
+    content = {'texts': ['1e4', '010', '09', '1.5e3', 'null', '', 'true', 'yes', '<<', '=', '*a', '&a', '!!int', 'a\nb', '\x85',
+                         '\u2028', '😀', ' x ', '#', '1:30', '2026-11-21', "it's", '9' * 500],
+               '010': 1e-7, 'yes': [[], {}, None, True, -1, 1e22]}
+    content['again'] = content['texts']
+    assert read_settings(written(tmp_path, settings_text(content))) == content
+
+
+@pytest.mark.parametrize('path', ['pipe', '/dev/zero', '/dev/null', '/dev/tty', '.', 'missing'])
+def test_what_might_never_end_is_no_file(tmp_path, monkeypatch, path):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo('pipe')
+    with pytest.raises((OSError, ValueError)):
+        read_settings(path)
+
+
+def test_a_file_of_the_largest_size_is_read(tmp_path):
+    path = written(tmp_path, b'x' * 100)
+    assert read_bytes(path, 100) == b'x' * 100
+    with pytest.raises(ValueError, match='more than 99 bytes'):
+        read_bytes(path, 99)
