@@ -1,0 +1,415 @@
+"""
+What a ROS 2 recording holds: the messages of a folder, of an .mcap file or of a .db3 file.
+
+A recording whose program was killed lacks its closing part and the index, so neither is looked at: the records are gone through from the
+beginning, up to the end or the tear. Nothing in a file is believed that could take more memory than `LARGEST`.
+
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import re
+import shutil
+import sqlite3
+import struct
+import sys
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+from gyro_calibration.log import LogError, shown
+from gyro_calibration.messages import LAYOUTS
+
+#: Bytes of a record or of a chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
+LARGEST = 1 << 28
+#: Times that a compressed file may grow; sensor data shrink to a tenth.
+GROWTH = 200
+_PIECE = 1 << 20
+
+_MAGIC = b'\x89MCAP0\r\n'
+_ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 2, 3, 4, 5, 6, 12, 15
+_READ = _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA
+#: Closing part of an MCAP file that has no index and no checksum: the end of the data, a footer of zeros.
+MCAP_END = struct.pack('<BQ4x', _DATA_END, 4) + struct.pack('<BQ20x', _FOOTER, 20) + _MAGIC
+#: Name of what a recorder of this program says of a recording; and how many characters of a text are told.
+ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
+
+#: SQLite tells of a damaged file in its words, which need not be text.
+_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+
+#: Is told how many bytes of all files are read.
+Heard = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message as it was recorded: its topic, its kind, when it was received, in ns, and its bytes."""
+
+    topic: str
+    kind: str
+    received: int
+    data: bytes
+
+
+@dataclass
+class Contents:
+    """What turned out of a recording while it was read: topic -> kind, what its recorder says of it, and remarks for people."""
+
+    topics: dict[str, str] = field(default_factory=dict)
+    about: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    left_out: int = 0
+
+
+def said(text: object) -> str:
+    """Return a text of a file as it may stand in a sentence: in one line, not too long, and without what a terminal would obey."""
+    return ''.join(each if each.isprintable() else '?' for each in ' '.join(str(text).split()))[:_MOST_CHARACTERS]
+
+
+def is_recording(path: str | Path) -> bool:
+    """Return whether a path is that of a recording, by its name."""
+    path = Path(path)
+    return path.is_dir() or _kind_of(path) is not None
+
+
+def files_of(path: str | Path) -> list[Path]:
+    """
+    Return the files of a recording, in their order.
+
+    The list in metadata.yaml is not asked for: a recorder that was killed leaves none.
+
+    Raises
+    ------
+    LogError : a folder without any
+
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
+    if not found:
+        raise LogError(f'{path}: a folder without an .mcap or .db3 file; name the folder of a ROS 2 recording, or a log file')
+    return sorted(found, key=_natural)
+
+
+def read_messages(path: str | Path, contents: Contents, heard: Heard = lambda place: None) -> Iterator[Message]:
+    """
+    Give the messages of a recording that may be of use for a gyro, and fill in its contents meanwhile.
+
+    Parameters
+    ----------
+    path : a folder, or a file .mcap or .db3, each perhaps with .zstd
+    contents : is filled in
+    heard : is told how far it is
+
+    Raises
+    ------
+    LogError : a file is no recording
+
+    """
+    done = 0
+    for file in files_of(path):
+        try:
+            with _plain(file) as plain:
+                read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
+                yield from read(plain, file, contents, partial(_shifted, heard, done))
+            done += file.stat().st_size
+        except OSError as error:
+            raise LogError(f'{file}: cannot be read ({error.strerror or error})') from error
+    if contents.left_out:
+        parts = 'part of the recording was' if contents.left_out == 1 else 'parts of the recording were'
+        contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
+
+
+def _shifted(heard: Heard, done: int, place: int) -> None:
+    heard(done + place)
+
+
+def _kind_of(path: Path) -> str | None:
+    name = path.name.removesuffix('.zstd')
+    return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+
+
+@contextmanager
+def _plain(path: Path) -> Iterator[Path]:
+    """Give a file without its compression."""
+    if path.suffix != '.zstd':
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder, open(path, 'rb') as packed:
+        plain, left = Path(folder) / path.stem, GROWTH * path.stat().st_size + LARGEST
+        with open(plain, 'wb') as file:
+            for piece in _unpacked(packed):
+                left -= len(piece)
+                if left < 0:
+                    raise LogError(f'{path}: grows to more than {GROWTH} times its size; it is not a recording')
+                file.write(piece)
+        yield plain
+
+
+def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
+    """Give what Zstandard made smaller piece by piece, up to a tear or damage."""
+    zstandard = _library('zstandard')
+    reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(packed, read_across_frames=True)
+    try:
+        while piece := reader.read(_PIECE):
+            yield piece
+    except zstandard.ZstdError:
+        return
+
+
+def _library(name: str) -> Any:
+    """Return a library that compresses; only compressed recordings need one."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition('.')[0]
+        raise LogError(f'the recording is compressed, which needs the Python package {package}: pip install {package}') from None
+
+
+# MCAP
+
+
+def _from_mcap(plain: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+    with open(plain, 'rb') as file:
+        end = plain.stat().st_size
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
+        reader, told = _McapReader(contents), 0
+        for code, body in _records(file, end, contents):
+            if code == _DATA_END:
+                return
+            yield from reader.read(code, body, torn=file.tell() == end)
+            if file.tell() - told > _PIECE:
+                told = file.tell()
+                heard(told)
+        contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, and was read up to there')
+
+
+def _records(stream: BinaryIO, end: int, contents: Contents) -> Iterator[tuple[int, bytes]]:
+    """Give code and content of each record of a file or of a chunk; what is torn is given as far as it goes if it is a chunk."""
+    while len(head := stream.read(9)) == 9:
+        code, length = struct.unpack('<BQ', head)
+        left = end - stream.tell()
+        if code == _CHUNK and left < length <= LARGEST:
+            yield code, stream.read()
+            return
+        if length > left or code == 0:
+            stream.seek(-9, io.SEEK_CUR)
+            return
+        if code in _READ and length <= LARGEST:
+            yield code, stream.read(length)
+            continue
+        contents.left_out += code in _READ
+        stream.seek(length, io.SEEK_CUR)
+        if code == _DATA_END:
+            yield code, b''
+            return
+
+
+class _McapReader:
+    """Reads the records of one file; it remembers channels and their schemas."""
+
+    def __init__(self, contents: Contents):
+        self._contents = contents
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+
+    def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
+        """Give the messages in a record; a torn chunk is read as far as it goes."""
+        try:
+            if code == _CHUNK:
+                data = _chunk_data(body, torn)
+                for inner, content in _records(io.BytesIO(data), len(data), self._contents):
+                    yield from self.read(inner, content) if inner != _CHUNK else ()
+            elif code == _MESSAGE:
+                yield from self._message(body)
+            elif code == _SCHEMA:
+                self._schemas[struct.unpack_from('<H', body)[0]] = _text(body, 2)[0]
+            elif code == _CHANNEL:
+                self._add_channel(body)
+            elif code == _METADATA:
+                self._contents.about += _about(body)
+        except (_Damaged, struct.error):
+            self._contents.left_out += 1
+
+    def _add_channel(self, body: bytes) -> None:
+        number, schema = struct.unpack_from('<HH', body)
+        topic, place = _text(body, 4)
+        topic = shown(topic)
+        encoding, _ = _text(body, place)
+        kind = shown(self._schemas.get(schema, 'unknown'))
+        self._contents.topics[topic] = kind
+        if kind in LAYOUTS and encoding == 'cdr':
+            self._channels[number] = topic, kind
+
+    def _message(self, body: bytes) -> Iterator[Message]:
+        number, _, received, _ = struct.unpack_from('<HIQQ', body)
+        if number in self._channels:
+            yield Message(*self._channels[number], received, body[22:])
+
+
+class _Damaged(ValueError):
+    """A part of a recording is not what it should be."""
+
+
+def _text(body: bytes, place: int) -> tuple[str, int]:
+    end = place + 4 + struct.unpack_from('<I', body, place)[0]
+    if end > len(body):
+        raise _Damaged
+    return body[place + 4:end].decode(errors='replace'), end
+
+
+def _about(body: bytes) -> list[str]:
+    """Return what a recorder of this program says of a recording, as notes."""
+    name, place = _text(body, 0)
+    notes, place = [], place + 4
+    while name == ABOUT and place < len(body):
+        key, place = _text(body, place)
+        value, place = _text(body, place)
+        notes.append(said(f'{key}: {value}'))
+    return notes
+
+
+def _chunk_data(body: bytes, torn: bool) -> bytes:
+    """Return the records of a chunk as bytes, and of a torn one those that are there."""
+    _, _, size, check = struct.unpack_from('<QQQI', body)
+    compression, place = _text(body, 28)
+    if size > LARGEST:
+        raise _Damaged
+    data = _expanded(compression, body[place + 8:], size)
+    if not torn and (len(data) != size or check and zlib.crc32(data) != check):
+        raise _Damaged
+    return data
+
+
+def _expanded(compression: str, data: bytes, size: int) -> bytes:
+    """Return what is in compressed data, and not more than the size that it should have."""
+    if compression == '':
+        return data[:size]
+    if compression == 'zstd':
+        pieces, length = [], 0
+        for piece in _unpacked(io.BytesIO(data)):
+            pieces.append(piece)
+            length += len(piece)
+            if length > size:
+                break
+        return b''.join(pieces)[:size]
+    if compression == 'lz4':
+        try:
+            expanded: bytes = _library('lz4.frame').LZ4FrameDecompressor().decompress(data, max_length=size)
+        except (RuntimeError, EOFError) as error:
+            raise _Damaged from error
+        return expanded
+    raise _Damaged
+
+
+# SQLite
+
+
+def _from_database(plain: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+    with _database(plain, path, contents) as database:
+        channels = _topics(database, path, contents)
+        size, last, count = path.stat().st_size, _last_row(database), 0
+        try:
+            for row, topic, received, data in _rows(database):
+                count += 1
+                if count % 4096 == 0:
+                    heard(int(size * row / last))
+                if topic not in channels:
+                    continue
+                if not (isinstance(received, int) and isinstance(data, bytes)):
+                    contents.left_out += 1
+                    continue
+                yield Message(*channels[topic], received, _message_data(data))
+        except _DATABASE_ERRORS as error:
+            contents.notes.append(f'{path.name} is damaged after {count} messages ({said(error)}), and was read up to there')
+
+
+@contextmanager
+def _database(plain: Path, path: Path, contents: Contents) -> Iterator[sqlite3.Connection]:
+    """Open a database for reading only: with what a killed writer left beside it, without, and at last as much as is there of it."""
+    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+        reason: Exception | None = None
+        ways = ('mode=ro', lambda: plain), ('mode=ro&immutable=1', lambda: plain), ('mode=ro', lambda: _shortened(plain, Path(folder)))
+        for how, file in ways:
+            try:
+                database, tables = _opened(file(), how)
+            except _DATABASE_ERRORS as error:
+                reason = error
+                continue
+            with closing(database):
+                if not {'topics', 'messages'} <= tables:
+                    raise LogError(f'{path}: is a database, but not a ROS 2 recording; name a recording')
+                yield database
+                return
+    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({said(reason)}); name a recording, or record again')
+
+
+def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
+    """Return a database and the names of its tables, which show whether it can be read."""
+    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
+    try:
+        database.text_factory = partial(str, encoding='utf-8', errors='replace')
+        # A view could go on for ever, a table cannot.
+        return database, {name for name, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except BaseException:
+        database.close()
+        raise
+
+
+def _shortened(plain: Path, folder: Path) -> Path:
+    """Return a copy of a torn database that says itself how long it is, for none is opened that is shorter than it says."""
+    copy = Path(shutil.copy(plain, folder))
+    with open(copy, 'r+b') as file:
+        head = file.read(100)
+        if len(head) == 100:
+            size = int.from_bytes(head[16:18], 'big')
+            size = 1 << 16 if size == 1 else max(size, 1)
+            file.seek(28)
+            file.write((copy.stat().st_size // size).to_bytes(4, 'big'))
+    return copy
+
+
+def _topics(database: sqlite3.Connection, path: Path, contents: Contents) -> dict[int, tuple[str, str]]:
+    channels = {}
+    try:
+        for number, topic, kind, encoding in database.execute('SELECT id, name, type, serialization_format FROM topics'):
+            topic, kind = shown(str(topic)), shown(str(kind))
+            contents.topics[topic] = kind
+            if kind in LAYOUTS and encoding == 'cdr':
+                channels[number] = topic, kind
+    except _DATABASE_ERRORS as error:
+        raise LogError(f'{path}: its list of topics cannot be read ({said(error)}); record again') from error
+    return channels
+
+
+def _last_row(database: sqlite3.Connection) -> int:
+    """Return the number of the last message, only to show how far the reading is."""
+    try:
+        return int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
+    except _DATABASE_ERRORS:
+        return sys.maxsize
+
+
+def _rows(database: sqlite3.Connection) -> Iterator[Any]:
+    """Give row, topic, time and data of the messages; none of those that are wanted here is large."""
+    return database.execute('SELECT rowid, topic_id, timestamp, CASE WHEN length(data) < 65536 THEN data END FROM messages')
+
+
+def _message_data(data: bytes) -> bytes:
+    """Return the bytes of a message that may be compressed by itself."""
+    return _expanded('zstd', data, 1 << 16) if data.startswith(_ZSTANDARD_MAGIC) else data
