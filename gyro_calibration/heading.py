@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gyro_calibration.compensation import quadratic_form
+from gyro_calibration.gaps import Gaps
 from gyro_calibration.log import CACHED, DEGREE, Array
 from gyro_calibration.noise import Noise
 
@@ -76,90 +77,6 @@ class ThresholdFilter:
         return 0.0 < 9.0 * explained < variance * lasts
 
 
-class HeadingIntegrator:
-    """
-    Integrate rates by the trapezoid rule on their stamps, with the variance of the heading.
-
-    Attributes
-    ----------
-    heading : rad, continuous, not wrapped
-    deleted : heading that the threshold filter took away, rad
-
-    """
-
-    def __init__(self, maximum_gap: float = 1.0):
-        """Begin at heading zero; over a gap longer than `maximum_gap`, s, nothing is integrated."""
-        self.heading = 0.0
-        self.deleted = 0.0
-        self._noise = Noise()
-        self._maximum_gap = maximum_gap
-        self._covariance = np.zeros((0, 0))
-        self._settled = 0.0
-        self._last: tuple[float, float, float, np.ndarray] | None = None
-        self._begin_variance()
-
-    def _begin_variance(self) -> None:
-        self._moving_time = 0.0
-        self._sensitivity = np.zeros(len(self._covariance))
-
-    def reset(self) -> None:
-        """Call this direction zero, known exactly."""
-        self.heading = self.deleted = self._settled = 0.0
-        self._begin_variance()
-
-    def use(self, noise: Noise, covariance: np.ndarray) -> None:
-        """Go on with other noise figures and another covariance of the calibration; the heading does not jump."""
-        self._settled = self.variance
-        self._noise, self._covariance = noise, covariance
-        if self._last is not None:
-            self._last = (*self._last[:3], np.zeros(len(covariance)))
-        self._begin_variance()
-
-    @property
-    def variance(self) -> float:
-        """Return the variance of the heading, rad²."""
-        calibration = self._sensitivity @ self._covariance @ self._sensitivity
-        return self._settled + float(calibration) + self._noise.heading_variance(self._moving_time)
-
-    def add(self, time: float, rate: float, filtered: float, sensitivity: np.ndarray) -> str:
-        """
-        Take one sample.
-
-        Parameters
-        ----------
-        time : stamp, s
-        rate, filtered : before and after the threshold filter, rad/s
-        sensitivity : of the rate to the values of the calibration, shape (m,), as in `compensation`
-
-        Returns
-        -------
-        '', or why the integration began anew with this sample
-
-        """
-        last, self._last = self._last, (time, rate, filtered, sensitivity)
-        if last is None:
-            return ''
-        before, last_rate, last_filtered, last_sensitivity = last
-        interval = time - before
-        if interval < 0.0 or interval > self._maximum_gap:
-            return self._restart(interval, max(abs(rate), abs(last_rate)))
-        half = 0.5 * interval
-        self.heading += half * (filtered + last_filtered)
-        self.deleted += half * (rate - filtered + last_rate - last_filtered)
-        kept, last_kept = float(filtered == rate), float(last_filtered == last_rate)
-        self._moving_time += half * (kept + last_kept)
-        if len(sensitivity):
-            self._sensitivity += half * (kept * sensitivity + last_kept * last_sensitivity)
-        return ''
-
-    def _restart(self, interval: float, fastest: float) -> str:
-        """Begin anew after a gap or a jump back; what may have been turned meanwhile goes into the variance."""
-        if interval < 0.0:
-            return f'the stamp jumps back by {-interval:.3f} s'
-        self._settled += (fastest * interval) ** 2
-        return f'no samples for {interval:.3f} s'
-
-
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
     """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at `begin`."""
     heading = np.empty(len(time))
@@ -193,7 +110,12 @@ class BlockIntegrator:
     """
     Filter and integrate the rates of a log that comes block by block, with the same result as in one piece.
 
-    It gives what `ThresholdFilter` and `HeadingIntegrator` give sample by sample for a log without gaps.
+    It gives what a `tracking.HeadingTracker` that looks for no rests gives sample by sample, for a log in which no gap is longer than that
+    one bridges.
+
+    Attributes
+    ----------
+    intervals : of the samples, and how many are lost
 
     """
 
@@ -203,6 +125,8 @@ class BlockIntegrator:
         self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self._last: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
         self._grown: Array = np.zeros(2 + len(covariance))
+        self._gaps, self._unseen, self._last_rate = Gaps(noise), 0.0, 0.0
+        self.intervals = self._gaps.intervals
 
     def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
         """
@@ -222,9 +146,22 @@ class BlockIntegrator:
             return rate, rate, rate
         filtered = self._filtered(time, rate)
         kept = (filtered == rate).astype(float)
+        unseen = self._unseen_at(time, rate, kept)
         heading, moving_time, *grown = self._integrated(time, np.vstack([filtered, kept, kept * sensitivity]))
         calibration = quadratic_form(self._covariance, np.reshape(grown, (len(self._covariance), len(time))))
-        return filtered, heading, np.sqrt(calibration + self._noise.heading_variance(moving_time))
+        return filtered, heading, np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen)
+
+    def _unseen_at(self, time: Array, rate: Array, kept: Array) -> Array:
+        """Return the variance by what was lost in gaps so far, rad², shape (n,)."""
+        unseen, (last_time, last_rows) = np.zeros(len(time)), self._last
+        before = (float(last_time[0]), self._last_rate, bool(last_rows[1, 0])) if len(last_time) else None
+        for index, sample in enumerate(zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())):
+            gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
+            if gap is not None and before is not None and (sample[2] or before[2]):
+                self._unseen += gap.variance
+            unseen[index], before = self._unseen, sample
+        self._last_rate = float(rate[-1])
+        return unseen
 
     def _filtered(self, time: Array, rate: Array) -> Array:
         carried = len(self._window[0])

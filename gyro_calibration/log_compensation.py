@@ -17,15 +17,21 @@ from gyro_calibration.model import GyroModel
 
 #: An effect of the heading that is found meanwhile is found over so long at once, s: over longer, more passes would be needed.
 _AT_ONCE = 60.0
+#: A reference heading that is lost for no longer is interpolated, s.
+_BRIDGED = 1.0
 #: Passes end where the heading changes by less, rad, or after so many.
 _SETTLED, _PASSES = 1e-10, 50
 
 
 class LogCompensation:
     """
-    Compensate a log that comes block by block, with the same result as in one piece.
+    Compensate a log that comes block by block, with the same result as in one piece; where a reference heading is lost, see below.
 
     The heading that effects look at is that of the reference. Without one it is what the compensated rates come to, from 0 on.
+
+    Where a reference is lost, the heading goes on from its last value by the compensated rates. Up to `_BRIDGED` s inside a block are
+    interpolated instead; over the border of blocks the next value is not known, which differs by little. Before the first value of a
+    reference its heading is that value; in blocks before the one with that it is found from 0 on.
 
     """
 
@@ -33,13 +39,11 @@ class LogCompensation:
         """Begin with nothing known of the past."""
         self._model, self._history = model, model.history()
         self._begin: float | None = None
+        self._referred = False
         self._turned: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
 
     def add(self, log: Log) -> tuple[Compensated, Array]:
-        """
-        Take the next rows, in each of which the output is known, and return them with their `rate_sensitivity`.
-
-        """
+        """Take the next rows, in each of which the output is known, and return them with their `rate_sensitivity`."""
         if not self._model.looks_around or not len(log):
             return self._compensated(log, None)
         compensated, sensitivities = zip(*(self._around(part) for part in self._parts(log)))
@@ -60,23 +64,38 @@ class LogCompensation:
         return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature, around)
 
     def _parts(self, log: Log) -> Iterator[Log]:
-        """Give the rows in parts for which a heading is soon found, or all at once where none is sought."""
-        if log.time is None or not self._seeks_heading(log):
+        """Give the rows in parts that have a reference or none, those without one so short that a heading is soon found."""
+        if log.time is None or not self._model.looks_at('heading'):
             yield log
             return
-        part = ((log.time - log.time[0]) // _AT_ONCE).astype(int)
+        part = np.where(self._referenced(log.time, log.reference_heading), -1, (log.time - log.time[0]) // _AT_ONCE)
         for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
             yield rows_of(log, rows)
 
+    def _referenced(self, time: Array, heading: Array | None) -> Mask:
+        """Return for which rows there is a reference heading, or one to interpolate, shape (n,)."""
+        known = np.flatnonzero(np.isfinite(heading)) if heading is not None else np.zeros(0, int)
+        if not len(known):
+            return np.zeros(len(time), bool)
+        rows, earlier = np.arange(len(time)), self._referred
+        before, after = np.searchsorted(known, rows, 'right') - 1, np.searchsorted(known, rows, 'left')
+        self._referred, inside = True, (before >= 0) & (after < len(known))
+        lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
+        return (inside & (lost <= _BRIDGED)) | ((before < 0) & (not earlier))
+
     def _seeks_heading(self, log: Log) -> bool:
-        return self._model.looks_at('heading') and (log.reference_heading is None or not np.isfinite(log.reference_heading).any())
+        return log.reference_heading is None or not np.isfinite(log.reference_heading).any()
 
     def _around(self, log: Log) -> tuple[Compensated, Array]:
         time = np.zeros(len(log)) if log.time is None else log.time
         around = self._history.follow(time, log.temperature, log.specific_force, log.supply, _bridged(time, log.reference_heading))
-        if self._model.looks_at('heading') and log.time is not None:
-            around = self._found_heading(log, around) if self._seeks_heading(log) else around
-        return self._compensated(log, around)
+        if not self._model.looks_at('heading') or log.time is None:
+            return self._compensated(log, around)
+        if self._seeks_heading(log):
+            return self._compensated(log, self._found_heading(log, around))
+        result, sensitivity = self._compensated(log, around)
+        self._turned = self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:], float(np.asarray(around.heading)[-1])
+        return result, sensitivity
 
     def _found_heading(self, log: Log, around: Channels) -> Channels:
         """Repeat: compensate with a heading, and integrate to the next one; it gains about the effect times the time with each pass."""
@@ -95,10 +114,7 @@ class LogCompensation:
 
 
 def compensate_log(model: GyroModel, log: Log) -> Array:
-    """
-    Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is.
-
-    """
+    """Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is."""
     assert log.output is not None
     known = np.isfinite(log.output)
     rate = np.full(len(log), np.nan)

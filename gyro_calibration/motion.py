@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.files import LARGEST, read_bytes
+from gyro_calibration.log import DEGREE, SHORTEST, Array, shown
+
+#: Bytes of a motion profile: an hour at 100 Hz has half of it.
+BYTES = 16_000_000
 
 
 class MotionError(ValueError):
@@ -103,31 +110,54 @@ def read_motion(path: str | Path) -> Motion:
     """
     Read a motion profile, a CSV file with time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s.
 
+    The reference of a log is one too: its heading where it has both, and without the rows where it was lost.
+
     Raises
     ------
     MotionError : the file cannot be read, has other columns, a value that is no finite number, or times that do not increase
 
     """
     try:
-        lines = [line for line in Path(path).read_text(encoding='utf-8-sig').splitlines() if line.strip() and not line.startswith('#')]
-        rows = list(csv.DictReader(lines))
+        rows = csv.reader(line for line in _lines(path) if line.strip() and not line.startswith('#'))
+        header = [name.strip() for name in next(rows, [])]
+        name = _moving_column(path, header)
+        columns = {each: header.index(each) for each in ('time_s', name)}
+        time, values = np.fromiter(_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MotionError(f'{path}: cannot be read as a motion profile ({error}); wanted a CSV file with time_s and heading_deg') from error
-    found = [name for name in _WORDS if rows and name in rows[0]]
-    if not rows or 'time_s' not in rows[0] or len(found) != 1:
-        given = lines[0] if lines else 'nothing'
-        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s')
-    time, values = _column(path, rows, 'time_s'), _column(path, rows, found[0]) * _WORDS[found[0]]
-    if len(time) < 2 or (np.diff(time) <= 0).any():
+    known = np.isfinite(values)
+    time, values = time[known], values[known] * _WORDS[name]
+    if len(time) < 2 or not (np.diff(time) >= SHORTEST).all():
         raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
-    return from_rates(time, values) if 'rate' in found[0] else from_headings(time, values)
+    return from_rates(time, values) if 'rate' in name else from_headings(time, values)
 
 
-def _column(path: str | Path, rows: list[dict[str, str]], name: str) -> Array:
+def _moving_column(path: str | Path, header: list[str]) -> str:
+    """Return the name of the column that holds the motion."""
+    found = [name for name in _WORDS if name in header]
+    both = len(found) == 2 and found[0].startswith('reference_heading') and found[1].startswith('reference_rate')
+    if 'time_s' not in header or not (len(found) == 1 or both):
+        given = shown(','.join(header)) or 'nothing'
+        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s')
+    return found[0]
+
+
+def _lines(path: str | Path) -> io.StringIO:
     try:
-        values = np.array([float(row[name]) for row in rows])
-    except (TypeError, ValueError):
-        values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        raise MotionError(f'{path}: column {name} holds something that is not a finite number; mend or remove the row')
-    return values
+        data = read_bytes(path, BYTES)
+    except ValueError as error:
+        raise OSError(str(error)) from error
+    return io.StringIO(data.decode('utf-8-sig'), newline=None)
+
+
+def _numbers(path: str | Path, rows: Iterable[list[str]], columns: dict[str, int]) -> Iterator[float]:
+    """Give time and value of one row after the other, nan where a reference was lost."""
+    for row in rows:
+        for name, place in columns.items():
+            try:
+                value = float(row[place])
+            except (IndexError, ValueError):
+                value = math.inf
+            if not (abs(value) <= LARGEST or math.isnan(value) and name.startswith('reference_')):
+                raise MotionError(f'{path}: column {name} holds something that is not a finite number; mend or remove the row')
+            yield value

@@ -12,6 +12,10 @@ from gyro_calibration.log import Array, Number
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
+#: A bias is known as the mean over so long, s, as a self-calibration takes.
+CALIBRATED = 20.0
+#: Time constants, s, a factor of 10 apart, of the processes that stand for flicker from a second to some hours.
+_FLICKER = np.array([3.0, 30.0, 300.0, 3000.0])
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,17 @@ class Noise:
         """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
         return self.angle_random_walk ** 2 / interval
 
+    @property
+    def floor(self) -> float:
+        """Return the floor of the Allan deviation that the flicker makes, rad/s."""
+        return ALLAN_FLOOR * self.bias_instability
+
     def allan_variance(self, duration: Number) -> Number:
         """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of neighbours' difference."""
-        return (self.angle_random_walk ** 2 / duration + (ALLAN_FLOOR * self.bias_instability) ** 2
+        return (self.angle_random_walk ** 2 / duration + self.floor ** 2
                 + self.rate_random_walk ** 2 * duration / 3.0)
 
-    def wander(self, age: float, duration: float) -> float:
+    def wander(self, age: Number, duration: float) -> Number:
         """
         Return the variance of how far a mean over `duration` s is from one `age` s before, (rad/s)², but for the white noise.
 
@@ -48,18 +57,45 @@ class Noise:
         time t apart that gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
 
         """
-        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (math.log(max(age / duration, 1.0)) + 1.5)
-        return flicker + self.rate_random_walk ** 2 * max(age, duration)
+        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (np.log(np.maximum(age / duration, 1.0)) + 1.5)
+        return flicker + self.rate_random_walk ** 2 * np.maximum(age, duration)
+
+    def flicker(self) -> tuple[Array, float]:
+        """
+        Return time constants, s, shape (k,), and the variance, (rad/s)², of each of k Gauss-Markov processes that sum up to the flicker.
+
+        With time constants a factor r apart, and B² ln(r) / pi each, the spectrum between them is B² / (2 pi f) on both sides of zero.
+
+        """
+        constants = _FLICKER if self.bias_instability else _FLICKER[:0]
+        return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
+
+    def drift_variance(self, duration: Number) -> Number:
+        """
+        Return the variance, rad², of a heading after `duration` s from the mean bias of the `CALIBRATED` s before, but for the white noise.
+
+        """
+        variance = self.rate_random_walk ** 2 * (duration ** 3 + CALIBRATED * duration ** 2) / 3.0
+        constants, of_each = self.flicker()
+        for constant in constants:
+            within, shared = known_mean(constant)
+            gone = constant * (1.0 - np.exp(-duration / constant))
+            variance = variance + of_each * (2.0 * constant * (duration - gone) + duration ** 2 * within - 2.0 * duration * gone * shared)
+        return variance
 
     def heading_variance(self, duration: Number) -> Number:
-        """
-        Return the variance, rad², of a heading that was integrated for `duration` s from a bias known at its start.
+        """Return the variance, rad², of a heading after `duration` s from the mean bias of the `CALIBRATED` s before."""
+        return self.angle_random_walk ** 2 * duration + self.drift_variance(duration)
 
-        Flicker is counted by its Allan floor as if it were a constant bias, which is what it looks like for a while.
 
-        """
-        return (self.angle_random_walk ** 2 * duration + (ALLAN_FLOOR * self.bias_instability * duration) ** 2
-                + self.rate_random_walk ** 2 * duration ** 3 / 3.0)
+def known_mean(constant: Number) -> tuple[Number, Number]:
+    """
+    Return the variance of the mean of a Gauss-Markov process of unit variance over `CALIBRATED` s, and its covariance with the value after.
+
+    """
+    ratio = CALIBRATED / constant
+    gone = 1.0 - np.exp(-ratio)
+    return 2.0 * (ratio - gone) / ratio ** 2, gone / ratio
 
 
 def simulate_noise(noise: Noise, count: int, interval: float, generator: np.random.Generator) -> Array:

@@ -15,7 +15,7 @@ from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.turn import TurnErrors
 
-_STYLES = ('-', '--', '-.', ':')
+_STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)))
 #: Grey shades from light to dark; neither end vanishes on paper or in ink.
 _GREYS = ('0.78', '0.0')
 
@@ -35,8 +35,8 @@ def draw_headings(path: str | Path, time: Array, true: Array, headings: Mapping[
     figure, ((above,), (below,)) = _panels(2, 1, (9, 7), sharex=True, height_ratios=(1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
     for (name, heading), style in zip(headings.items(), _STYLES * len(headings)):
-        above.plot(time, heading / DEGREE, style, linewidth=1)
-        below.plot(time, (heading - true) / DEGREE, style, label=name)
+        above.plot(time, heading / DEGREE, linestyle=style, linewidth=1)
+        below.plot(time, (heading - true) / DEGREE, linestyle=style, label=name)
     above.set(ylabel='heading [deg]', title='Heading of the robot by its gyro')
     above.legend(loc='upper right')
     below.axhline(0.0, color='black', linewidth=0.5)
@@ -119,7 +119,8 @@ def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[flo
         axes.plot(dwells.output / DEGREE, (dwells.output - dwells.rate) / DEGREE, '.', color='0.6', markersize=3, label='measured')
     for temperature, style in zip(temperatures, _STYLES):
         error = output - model.rate(output, np.full(len(output), temperature))
-        axes.plot(output / DEGREE, error / DEGREE, style, color='black', label=f'model at {temperature:.1f} °C' if thermal else 'model')
+        name = f'model at {temperature:.1f} °C' if thermal else 'model'
+        axes.plot(output / DEGREE, error / DEGREE, linestyle=style, color='black', label=name)
     axes.set(xlabel='gyro output [deg/s]', ylabel='error: output less rate [deg/s]', title='Error over the output')
     axes.legend(loc='best')
     axes.grid(alpha=0.3)

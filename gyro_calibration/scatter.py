@@ -19,7 +19,7 @@ from scipy.stats import t as student
 
 from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.likelihood import robust_residual
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.log import Array, DataRefused, Mask
 
 #: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
 OUTLYING = 6.0
@@ -162,6 +162,8 @@ def not_outlying(dwells: Dwells) -> Mask:
 
 def _surface(dwells: Dwells) -> Array:
     """Return orthonormal columns that span a smooth surface over rate and temperature, one for three dwells at most, shape (n, m)."""
+    if len(dwells) < 2:
+        raise DataRefused('a single dwell shows no effect: turn at more rates, and rest between them')
     rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
     temperature = np.zeros(len(rate)) if dwells.temperature is None else dwells.temperature - dwells.temperature.mean()
     temperature = temperature / max(float(np.abs(temperature).max()), 0.5 * SMALLEST_TEMPERATURE_SPREAD)
@@ -170,6 +172,11 @@ def _surface(dwells: Dwells) -> Array:
     columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, sizes > 1e-4 * sizes[0]]
+
+
+def freedom_beside_surface(dwells: Dwells) -> int:
+    """Return how many dwells there are beyond the columns of the surface that their scatter was found about."""
+    return len(dwells) - _surface(dwells).shape[1]
 
 
 def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, columns: Array) -> float:

@@ -18,11 +18,14 @@ from gyro_calibration.log import Array, DataRefused
 
 Integers = NDArray[np.integer[Any]]
 
-#: Share of intervals below half of the usual one from which on the stamps are taken to come in bursts.
-_BURSTS = 0.02
+#: Samples that come within this part of the usual interval were waiting; from such a share of them on, stamps are taken to come in bursts.
+_WAITING, _BURSTS = 0.5, 0.02
 
 #: Share of intervals that are alike from which on stamps are not taken to come in bursts.
 _STEADY = 0.9
+
+#: Share of steps that are whole multiples of the middle one, to so much of it, from which on samples are lost where they are not one.
+_WHOLE, _EXACT = 0.9, 0.3
 
 #: Samples over which delayed stamps catch up again: for single late ones, and for bursts of packets on their way through a host.
 _CATCH_UP, _CATCH_UP_BURSTS = 10, 300
@@ -95,7 +98,7 @@ def number_stamps(time: Array) -> Stamps:
     """
     steps = np.diff(time)
     usual = _usual_interval(time, steps)
-    bursts = float((steps < 0.5 * usual).mean()) > _BURSTS
+    bursts = float((steps < _WAITING * usual).mean()) > _BURSTS
     lost = _lost_samples(time, steps, usual, bursts)
     interval, wander = _line(time, _numbers(lost))
     uneven = not bursts and float((np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
@@ -103,6 +106,18 @@ def number_stamps(time: Array) -> Stamps:
         raise DataRefused(f'the stamps belong to no even interval (about {usual:g} s; up to {wander:g} s off); if the samples are even, '
                           'say with --rate how many there are a second')
     return Stamps(time, lost, _numbers(np.minimum(lost, _longest_gap(time))), interval, wander, bursts)
+
+
+def even_times(time: Array) -> Array:
+    """Return the places on the even grid that stamps jitter about by less than an interval, or come in bursts on; else the stamps."""
+    try:
+        stamps = number_stamps(time)
+    except DataRefused:
+        return time
+    if stamps.wander > stamps.interval and not stamps.bursts:
+        return time
+    number = _numbers(stamps.lost)
+    return np.polynomial.Polynomial.fit(number, time, 1)(number)
 
 
 def lost_samples(time: Array) -> Integers | None:
@@ -118,26 +133,35 @@ def _longest_gap(time: Array) -> int:
 
 
 def _usual_interval(time: Array, steps: Array) -> float:
-    """Return the interval as most stretches of 100 samples have it, s."""
+    """Return the interval as most stretches of 100 samples have it, s; where losses leave most steps whole multiples of one, that one."""
     lag = min(100, len(time) // 4)
     interval = float(np.median(time[lag:] - time[:-lag])) / lag
     usual = float(np.median(steps))
-    if not 0.8 < interval / usual < 1.25 and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > _STEADY:
+    alike = 0.8 < interval / usual < 1.25
+    if not alike and float((np.abs(steps / usual - 1.0) < 0.5).mean()) > _STEADY:
         raise DataRefused(f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take {100 * interval:.4g} s: either most samples '
                           'are lost, or they come in long bursts; say with --rate how many there are a second, or record again')
-    return interval
+    whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < _EXACT
+    return float(steps[whole & (steps < 1.5 * usual)].mean()) if alike and float(whole.mean()) > _WHOLE else interval
 
 
 def _lost_samples(time: Array, steps: Array, interval: float, bursts: bool) -> Integers:
-    """Return how many samples are lost in each step: those by which the stamps are late before they have caught up."""
+    """
+    Return how many samples are lost in each step: those by which the stamps are late before they have caught up.
+
+    What waited at a host comes all at once, however much it is; the time to catch up begins after it.
+
+    """
     lost: Integers = np.zeros(len(steps), dtype=np.int64)
     shift, done = 0, 0
     span, least = (_CATCH_UP_BURSTS, _SURELY_LOST) if bursts else (_CATCH_UP, 1)
     late = (time - time[0]) / interval - np.arange(len(time))
+    due = np.append(np.flatnonzero(steps >= _WAITING * interval), len(steps))
     for step in np.nonzero(steps > (least + 0.5) * interval)[0].tolist():
         late[done:step + 1] -= shift
         done = step + 1
-        missing = round(late[done:done + span].min() - shift - late[max(done - span, 0):done].min())
+        waited = int(due[np.searchsorted(due, done)])
+        missing = round(late[done:waited + span].min() - shift - late[max(done - span, 0):done].min())
         if missing >= least:
             lost[step] = missing
             shift += missing

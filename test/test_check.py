@@ -1,7 +1,4 @@
-"""
-The live check against simulated gyros: as few false alarms as it states, over hours at rest, and none missed that matter.
-
-"""
+"""The live check against simulated gyros: as few false alarms as it states, over hours at rest, and none missed that matter."""
 
 import math
 from dataclasses import replace

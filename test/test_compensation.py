@@ -1,7 +1,4 @@
-"""
-Compensation: the model, then its self-calibration; what lies outside the calibrated range; and what the rate owes to each value.
-
-"""
+"""Compensation: the model, then its self-calibration; what lies outside the calibrated range; and what the rate owes to each value."""
 
 import math
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""
-From rates to a heading: the trapezoid rule, the threshold filter, and a variance that Monte Carlo runs with known truth confirm.
-
-"""
+"""From rates to a heading: the trapezoid rule, the threshold filter, and a variance that Monte Carlo runs with known truth confirm."""
 
 import math
 
@@ -9,13 +6,13 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
-from gyro_calibration.heading import BlockIntegrator, HeadingIntegrator, Threshold, ThresholdFilter, filter_rates, integrate
+from gyro_calibration.heading import BlockIntegrator, Threshold, ThresholdFilter, filter_rates, integrate
 from gyro_calibration.log import CACHED, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.tracking import HeadingTracker, Settings
 
-NONE = np.zeros(0)
 INTERVAL = 0.01
 XV3500 = Noise(2.5 * DEGREE / 60)
 
@@ -32,16 +29,6 @@ def filtered_singly(settings, time, rate):
     return np.array([threshold.filter(*sample) for sample in zip(time.tolist(), rate.tolist())])
 
 
-def added(integrator, time, rate, filtered=None, sensitivity=None):
-    """Add samples to the integrator and return what it said, and its headings."""
-    said, headings = [], []
-    for index, (stamp, value) in enumerate(zip(time, rate)):
-        kept = value if filtered is None else filtered[index]
-        said.append(integrator.add(stamp, value, kept, NONE if sensitivity is None else sensitivity[:, index]))
-        headings.append(integrator.heading)
-    return said, np.array(headings)
-
-
 def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
     time = np.concatenate([[0.0], np.cumsum(np.random.default_rng(0).uniform(0.001, 0.1, 500))])
     heading = integrate(time, 0.3 - 0.02 * time)
@@ -51,14 +38,6 @@ def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
 def test_the_calibration_comes_back_to_its_first_heading():
     time = np.arange(2001) * INTERVAL
     assert integrate(time, CALIBRATION.rate_at(time)) == pytest.approx(CALIBRATION.heading_at(time), abs=1e-12)
-
-
-@pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
-def test_the_integrator_does_as_the_batch(offset):
-    time, rate = noisy_robot()
-    said, headings = added(HeadingIntegrator(), time + offset, rate)
-    assert not any(said)
-    assert headings == pytest.approx(integrate(time, rate), abs=1e-9 if not offset else 1e-5)  # 1e9 s has steps of 0.1 us
 
 
 SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(), 'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
@@ -137,20 +116,6 @@ def test_a_cleared_window_knows_nothing_of_before():
     assert threshold.filter(0.6, 0.001) == 0.0
 
 
-def test_what_the_filter_takes_away_is_counted():
-    integrator, time = HeadingIntegrator(), np.arange(1001) * INTERVAL
-    slow = np.full(1001, 0.2 * DEGREE)
-    added(integrator, time, slow, filter_rates(Threshold(), time, slow))
-    assert integrator.heading == 0.0 and integrator.deleted == pytest.approx(2.0 * DEGREE)
-
-
-def test_rest_adds_no_variance():
-    integrator = HeadingIntegrator()
-    integrator.use(XV3500, np.zeros((0, 0)))
-    added(integrator, np.arange(1001) * INTERVAL, np.full(1001, 1e-4), np.zeros(1001))
-    assert integrator.variance == 0.0
-
-
 S, B = 0.02, 0.002
 UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
 
@@ -170,48 +135,19 @@ def test_the_variance_is_that_of_many_runs_with_known_truth():
     assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)  # to first order in s, 2 % here
 
 
-def test_the_integrator_gives_the_variance_of_the_batch():
+@pytest.mark.parametrize('settings', [Threshold(), Threshold(0.0)], ids=['threshold', 'pure'])
+@pytest.mark.parametrize('offset', [0.0, 1.7e9], ids=['from zero', 'stamps since 1970'])
+def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, rate = (values[:3000] for values in noisy_robot())
-    kept = filter_rates(Threshold(), time, rate)
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    integrator = HeadingIntegrator()
-    integrator.use(XV3500, covariance(model))
-    _, headings = added(integrator, time, rate, kept, sensitivity)
-    _, heading, deviation = BlockIntegrator(Threshold(), XV3500, covariance(model)).add(time, rate, sensitivity)
-    assert headings == pytest.approx(heading, abs=1e-12)
-    assert math.sqrt(integrator.variance) == pytest.approx(deviation[-1], rel=1e-9)
-
-
-def test_nothing_is_integrated_over_a_gap_and_the_variance_says_so():
-    integrator = HeadingIntegrator(maximum_gap=1.0)
-    said, _ = added(integrator, [0.0, 1.0, 4.0, 5.0], [0.1, 0.1, 0.2, 0.2])
-    assert said == ['', '', 'no samples for 3.000 s', '']
-    assert integrator.heading == pytest.approx(0.3) and integrator.variance == pytest.approx((0.2 * 3.0) ** 2)
-
-
-def test_a_stamp_that_jumps_back_begins_anew():
-    integrator = HeadingIntegrator()
-    said, _ = added(integrator, [5.0, 5.5, 2.0, 2.5], [0.1] * 4)
-    assert said == ['', '', 'the stamp jumps back by 3.500 s', ''] and integrator.heading == pytest.approx(0.1)
-
-
-def test_a_new_calibration_makes_neither_heading_nor_variance_jump():
-    """REP-105: the heading is continuous."""
-    integrator = HeadingIntegrator()
-    integrator.use(XV3500, np.array(UNCERTAIN))
-    sensitivity = -np.array([np.full(101, 0.5), np.ones(101)])
-    added(integrator, np.arange(101) * INTERVAL, np.full(101, 0.5), None, sensitivity)
-    before = integrator.heading, integrator.variance
-    integrator.use(Noise(1e-3), np.zeros((0, 0)))
-    assert (integrator.heading, integrator.variance) == pytest.approx(before)
-    integrator.add(1.01, 0.5, 0.5, NONE)
-    assert integrator.variance == pytest.approx(before[1] + 1e-6 * INTERVAL)
-
-
-def test_a_reset_knows_the_direction_exactly():
-    integrator = HeadingIntegrator()
-    integrator.use(XV3500, np.zeros((0, 0)))
-    added(integrator, np.arange(101) * INTERVAL, np.ones(101))
-    integrator.reset()
-    assert (integrator.heading, integrator.variance, integrator.deleted) == (0.0, 0.0, 0.0)
+    tracker = HeadingTracker(XV3500, covariance(model), Settings(false_alarms=0.0, threshold=settings))
+    headings = []
+    for index in range(len(time)):
+        assert not tracker.add(float(time[index]) + offset, float(rate[index]), sensitivity[:, index])
+        headings.append(tracker.heading)
+    _, heading, deviation = BlockIntegrator(settings, XV3500, covariance(model)).add(time, rate, sensitivity)
+    assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)  # 1e9 s has steps of 0.1 us
+    tracker.finish()
+    assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
+    assert tracker.deleted == pytest.approx(integrate(time, rate)[-1] - heading[-1], abs=1e-5)

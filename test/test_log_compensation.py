@@ -1,7 +1,4 @@
-"""
-A log with its surroundings through the compensation: in one piece, in blocks, as a stream; with a heading, and without one.
-
-"""
+"""A log with its surroundings through the compensation: in one piece, in blocks, as a stream; with a heading, and without one."""
 
 from dataclasses import replace
 
@@ -76,6 +73,28 @@ def test_a_reference_heading_that_is_lost_for_a_while_is_bridged():
     log = drive(model)
     torn = replace(log, reference_heading=np.where((TIME > 100.0) & (TIME < 100.5), np.nan, log.reference_heading))
     assert compensate_log(model, torn) == pytest.approx(log.reference_rate, abs=1e-5)
+
+
+@pytest.mark.parametrize('size', [500, 700, 5000, 18000])
+def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_blocks_as_in_one_piece(size):
+    model = model_of(HEADING | {'scale_factor_error': (0.01,)})
+    log = drive(model)
+    turned = replace(log, reference_heading=1.5 + log.reference_heading)
+    output = respond(model, TIME, channels_of(turned).moving(log.reference_rate, log.reference_rate))
+    lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
+    log = replace(turned, output=output, reference_heading=np.where(lost, np.nan, turned.reference_heading))
+    compensation = LogCompensation(model)
+    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate for first in range(0, len(log), size)]
+    assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-6)
+
+
+def test_before_its_first_value_a_reference_heading_is_that_value():
+    model = model_of(HEADING)
+    log = drive(model, lambda time: 0.0 * time)
+    heading = np.full(len(TIME), 1.5)
+    output = respond(model, TIME, channels_of(replace(log, reference_heading=heading)).moving(log.reference_rate, log.reference_rate))
+    late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
+    assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
 
 def test_rows_without_output_are_left_out(tmp_path, run):

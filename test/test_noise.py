@@ -1,14 +1,11 @@
-"""
-Simulated noise has the Allan deviation of IEEE Std 952: N / sqrt(tau), 0.664 B, K sqrt(tau / 3).
-
-"""
+"""Simulated noise has the Allan deviation of IEEE Std 952: N / sqrt(tau), 0.664 B, K sqrt(tau / 3)."""
 
 import math
 
 import numpy as np
 import pytest
 
-from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
+from gyro_calibration.noise import ALLAN_FLOOR, CALIBRATED, Noise, simulate_noise
 
 INTERVAL = 0.01
 
@@ -75,15 +72,22 @@ def test_the_three_add_up_and_none_is_silence():
 
 
 def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_so():
-    """Their introduction: 2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 minutes; the floor of 18 deg/h alone gives 6."""
+    """Their introduction: 2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 minutes, which is about what comes after 20 s of rest."""
     degree = math.pi / 180.0
     assert math.sqrt(Noise(2.5 * degree / 60).heading_variance(3600.0)) / degree == pytest.approx(2.5)
     both = math.sqrt(Noise(2.5 * degree / 60, 18 * degree / 3600).heading_variance(1800.0)) / degree
-    assert both == pytest.approx(math.hypot(2.5 * math.sqrt(0.5), 0.664 * 9.0), rel=1e-3) and both < 11.0
+    assert both == pytest.approx(11.0, abs=1.0)
 
 
-@pytest.mark.parametrize('noise', [Noise(7e-4), Noise(rate_random_walk=1e-4)], ids=['angle random walk', 'rate random walk'])
+@pytest.mark.parametrize('noise', [Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)],
+                         ids=['angle random walk', 'bias instability', 'rate random walk'])
 def test_the_heading_varies_as_foretold(noise):
-    generator, runs, count = np.random.default_rng(3), 2000, 500
-    ends = [simulate_noise(noise, count, INTERVAL, generator).sum() * INTERVAL for _ in range(runs)]
-    assert np.mean(np.square(ends)) / noise.heading_variance(count * INTERVAL) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / runs) + 0.01)
+    """Flicker is stood for by four processes a decade apart, which is within a tenth; white noise is not counted in the mean before."""
+    generator, runs, interval, ends = np.random.default_rng(3), 1500, 0.5, []
+    known, count = round(CALIBRATED / interval), 400
+    for _ in range(runs):
+        rate = simulate_noise(noise, 400 + known + count, interval, generator)[400:]
+        before = 0.0 if noise.angle_random_walk else rate[:known].mean()
+        ends.append((rate[known:] - before).sum() * interval)
+    allowed = 4.0 * math.sqrt(2.0 / runs) + (0.1 if noise.bias_instability else 0.01)
+    assert np.mean(np.square(ends)) / noise.heading_variance(count * interval) == pytest.approx(1.0, abs=allowed)

@@ -1,7 +1,4 @@
-"""
-A simulated log is what the model says of the motion, and says so itself.
-
-"""
+"""A simulated log is what the model says of the motion, and says so itself."""
 
 import numpy as np
 import pytest

@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from gyro_calibration.compensation import covariance, quadratic_form
+from gyro_calibration.assumptions import Assumptions, assumed
+from gyro_calibration.compensation import Compensated, covariance, quadratic_form, rate_sensitivity
+from gyro_calibration.gaps import Intervals
 from gyro_calibration.heading import BlockIntegrator, Threshold
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask, write_log_blocks
 from gyro_calibration.log_compensation import LogCompensation, rows_of
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
-from gyro_calibration.verbs.verb import Answer, add_log, not_negative, output_of, read_blocks, verb
+from gyro_calibration.tracking import Settings, Track, track
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, not_negative, output_of, read, read_blocks, verb
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -28,11 +31,16 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--threshold', type=not_negative, default=0.0, metavar='DPS',
                         help='a robot that turns slower stands, as 0.3 in the node; default: 0, off')
     parser.add_argument('--window', type=not_negative, default=0.2, metavar='S', help='of the threshold filter; 0 is single samples')
+    parser.add_argument('--rest', action='store_true',
+                        help='look for rests, as the node does: the heading stands there, and the bias is learned')
+    parser.add_argument('--hindsight', action='store_true', help='alike, and let all that came later speak too')
     return parser
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Found()
+    if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
+        raise UsageError('--rest and --hindsight go without --threshold, and with an angle random walk in the model, which allan finds')
     write_log_blocks(given.out, _compensated(given, model, found))
     return _answer(given, model, found)
 
@@ -57,8 +65,12 @@ class _Found:
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
+    lost_samples: int = 0
+    longest_gap_s: float = 0.0
 
-    def add(self, log: Log, columns: dict[str, Array]) -> None:
+    def add(self, piece: _Piece) -> None:
+        log, columns = piece.log, piece.columns
+        self.lost_samples, self.longest_gap_s = piece.intervals.lost, piece.intervals.longest
         self.rows += len(log)
         self.rows_without_output += len(log) - len(columns['rate_rad_s'])
         self.temperature_clipped += int(columns['temperature_clipped'].sum())
@@ -71,18 +83,19 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Piece:
-    """A block of a log, the rows in which the output is known, and the new columns there."""
+    """A block of a log, the rows in which the output is known, the new columns there, and the intervals of the samples so far."""
 
     log: Log
     known: Mask
     columns: dict[str, Array]
+    intervals: Intervals
 
 
 def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and count what is found in it."""
-    pieces = _pieces(given, model)
+    pieces = _followed(given, model) if given.rest or given.hindsight else _pieces(given, model)
     for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
-        found.add(piece.log, piece.columns)
+        found.add(piece)
         yield piece.log, {name: _at(piece.known, values) for name, values in piece.columns.items()}
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
@@ -94,11 +107,41 @@ def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
     variance: float | None = None
     for log in read_blocks(given):
         log = replace(log, output=output_of(given, log))
+        known = np.isfinite(np.asarray(log.output))
         if variance is None:
             # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
-            variance = 0.0 if log.time is None else model.noise.rate_variance(float(np.median(np.diff(log.time))))
-        known = np.isfinite(np.asarray(log.output))
-        yield _Piece(log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)))
+            variance = 0.0 if log.time is None else model.noise.rate_variance(_interval(log.time, known))
+        yield _Piece(log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)), integrator.intervals)
+
+
+def _interval(time: Array, known: Mask) -> float:
+    """Return the time between samples, s; rows without output may stand between them."""
+    return float(np.median(np.diff(time[known] if known.sum() > 1 else time)))
+
+
+def _followed(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
+    """Give the whole log as one piece, followed from rest to rest."""
+    log = read(given)
+    log = replace(log, output=output_of(given, log))
+    known, supposed = np.isfinite(np.asarray(log.output)), assumed(model, Assumptions())
+    if log.time is None or known.sum() < 2:
+        raise DataRefused(f'{given.log}: rests show in samples over time; give a log with time_s, or say --rate')
+    rows, compensation = rows_of(log, known), LogCompensation(supposed)
+    result, sensitivity = compensation.add(rows)
+    tracked = _tracked(given, supposed, rows, compensation.true_time(np.asarray(rows.time)), result, sensitivity)
+    yield _Piece(log, known, {
+        'rate_rad_s': tracked.rate, 'heading_rad': tracked.heading, 'heading_std_rad': np.sqrt(tracked.variance),
+        'rate_std_rad_s': np.sqrt(tracked.rate_variance), 'resting': tracked.resting.astype(float),
+        'temperature_clipped': result.temperature_clipped, 'beyond_range': result.beyond_range}, tracked.intervals)
+
+
+def _tracked(given: argparse.Namespace, model: GyroModel, log: Log, time: Array, result: Compensated, sensitivity: Array) -> Track:
+    """Return the heading of a log from rest to rest; the column `moving` tells what the wheels did."""
+    wheels: list[bool | None] | None = None if log.moving is None else [bool(moving) for moving in log.moving]
+    middle = float(np.median(np.asarray(log.output))), 0.0, float(np.median(result.temperature))
+    still = None if model.looks_around else rate_sensitivity(model, *middle)
+    return track(time, np.asarray(result.rate), sensitivity, model.noise, covariance(model), Settings(), wheels, given.hindsight,
+                 0.0 if model.self_calibration else None, still)
 
 
 def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator, variance: float, log: Log) -> dict[str, Array]:
@@ -150,14 +193,17 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
     heading, deviation, _ = (data.pop(name) for name in ('heading', 'deviation', 'unknown'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
-        data.update(heading_rad=heading, heading_std_rad=None if math.isnan(deviation) else deviation)
-        known = '' if math.isnan(deviation) else f' +- {deviation / DEGREE:.2f}'
+        # A deviation of zero only shows that the model says nothing of noise and covariance.
+        sure = deviation if deviation > 0.0 else None
+        data.update(heading_rad=heading, heading_std_rad=sure)
+        known = '' if sure is None else f' +- {sure / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if not found.temperature_known:
         lines.append('The log holds no temperature: the model was used at its reference temperature.')
     lines += [words for quantity, (channel, words) in _WORDS.items() if quantity in found.unknown and model.looks_at(channel)]
     lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms if term.effect.undone]
     for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
+                        ('lost_samples', 'samples are lost; the heading goes on over the true intervals, and the deviation allows for it.'),
                         ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),
                         ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated.')):
         if data[name]:

@@ -14,13 +14,16 @@ from gyro_calibration.log import Log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import NAMED, read_motion
 from gyro_calibration.simulation import simulate
-from gyro_calibration.verbs.verb import Answer, UsageError, positive, time_of, verb, whole
+from gyro_calibration.verbs.verb import Answer, UsageError, degrees_celsius, positive, time_of, verb, whole
+
+#: Samples of a simulation, which takes 100 bytes for each.
+MOST = 20_000_000
 
 
 def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
     parser.add_argument('--motion', metavar='FILE|NAME', help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
     parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ', help='default: 100')
-    parser.add_argument('--temperature', type=float, metavar='DEGC', help='default: the reference temperature of the model')
+    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC', help='default: the reference temperature of the model')
     parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
 
 
@@ -46,4 +49,10 @@ def simulated(given: argparse.Namespace) -> tuple[Log, int]:
     if given.motion not in NAMED and not Path(given.motion).exists():
         raise UsageError(f'{given.motion}: there is no such motion; name a file, or one of {", ".join(NAMED)}')
     motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
+    if motion.duration * given.sample_rate > MOST:
+        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than {MOST:g} samples; give a lower rate or a '
+                         'shorter motion')
+    if round(motion.duration * given.sample_rate) < 1:
+        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has less than two samples; give a higher rate or a longer '
+                         'motion')
     return simulate(read_model(given.model), motion, given.sample_rate, np.random.default_rng(seed), given.temperature), seed

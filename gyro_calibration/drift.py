@@ -1,0 +1,258 @@
+"""
+What a heading is off by, as a Kalman filter: the error of each calibrated value, the wander of the bias, and the heading itself.
+
+The state is the heading, the rate random walk w, the parts f of the flicker, and the errors e of the values of the calibration. While the
+robot turns, the heading goes on by what the compensated rate came to, less what the state explains of it::
+
+    turned = true turn + T w + sum of tau (1 - exp(-T / tau)) f - sensitivity e + white noise
+
+At rest the true turn is zero, and the same line is a measurement (d of Hong and Park, eq. 11, with the noise figures of the model): it
+teaches the bias, and by its correlation with the heading also what the heading has been off by.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.linalg import pinvh
+
+from gyro_calibration.log import Array
+from gyro_calibration.noise import CALIBRATED, Noise, known_mean
+
+#: Places of the heading and the random walk in the state; the flicker begins after them.
+HEADING, WALK, _FLICKER = 0, 1, 2
+
+
+@dataclass(slots=True)
+class Turn:
+    """
+    What the rates of some time came to.
+
+    Attributes
+    ----------
+    duration : s
+    turned : integral of the compensated rate, rad
+    sensitivity : integral of what the rate changes by for each value of the calibration, shape (m,)
+    lost : variance of what was turned unseen, rad²
+    noise : what the variance of the noise is beyond that of as long a time with all samples, rad²
+    unseen : there were no rates: the heading goes on by nothing, and what rates are off by does not concern it; not to be added to others
+
+    """
+
+    duration: float
+    turned: float
+    sensitivity: Array
+    lost: float = 0.0
+    noise: float = 0.0
+    unseen: bool = False
+
+    def __add__(self, other: Turn) -> Turn:
+        """Return both after each other."""
+        return Turn(self.duration + other.duration, self.turned + other.turned, self.sensitivity + other.sensitivity,
+                    self.lost + other.lost, self.noise + other.noise)
+
+    def add(self, duration: float, turned: float, sensitivity: Array) -> None:
+        """Take in what the next sample brings."""
+        self.duration += duration
+        self.turned += turned
+        self.sensitivity += sensitivity
+
+    def __sub__(self, other: Turn) -> Turn:
+        """Return what is left of this one behind another with which it begins."""
+        return Turn(self.duration - other.duration, self.turned - other.turned, self.sensitivity - other.sensitivity,
+                    self.lost - other.lost, self.noise - other.noise)
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    How the state changes over some time, but for what the heading turned through.
+
+    Attributes
+    ----------
+    seen : what each part of the state adds to the integral of the compensated rate, shape (n,)
+    kept : what stays of each part, shape (n,)
+    grown : covariance of what comes in new, shape (n, n); its first row and column tell of the integral of the rate, with a minus
+
+    """
+
+    seen: Array
+    kept: Array
+    grown: Array
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Mean and covariance of the state, shape (n,) and (n, n), with n = 2 + parts of the flicker + values of the calibration."""
+
+    noise: Noise
+    mean: Array
+    covariance: Array
+
+    @property
+    def calibrated(self) -> int:
+        """Return the place of the first value of the calibration in the state."""
+        return _FLICKER + len(self.noise.flicker()[0])
+
+    def step(self, turn: Turn) -> Step:
+        """Return how the state changes over a turn."""
+        wander, kept, grown = (_unseen if turn.unseen else _wander)(self.noise, round(turn.duration, 6))
+        values = len(self.mean) - len(kept)
+        whole = np.zeros((len(self.mean), len(self.mean)))
+        whole[:len(kept), :len(kept)] = grown
+        white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
+        whole[HEADING, HEADING] += white + turn.lost + turn.noise
+        return Step(np.concatenate([wander, -turn.sensitivity]), np.concatenate([kept, np.ones(values)]), whole)
+
+    def moved(self, turn: Turn) -> Drift:
+        """Return the state after a turn."""
+        step = self.step(turn)
+        transition = np.diag(step.kept)
+        transition[HEADING] -= step.seen
+        mean = step.kept * self.mean
+        mean[HEADING] += turn.turned - step.seen @ self.mean
+        return replace(self, mean=mean, covariance=transition @ self.covariance @ transition.T + step.grown)
+
+    def rested(self, turn: Turn) -> Drift:
+        """Return the state after a time in which the true rate was zero."""
+        return self.measured(turn).carried(turn)
+
+    def measured(self, turn: Turn) -> Drift:
+        """Return the state at the begin of a time of rest, with what it shows."""
+        seen, (expected, variance) = self.step(turn).seen, self.expected(turn)
+        gain = self.covariance @ seen / variance
+        return replace(self, mean=self.mean + gain * (turn.turned - expected),
+                       covariance=self.covariance - variance * np.outer(gain, gain))
+
+    def carried(self, turn: Turn) -> Drift:
+        """Return the state at the end of a time in which the heading stood, as far as was seen, and nothing was measured."""
+        step = self.step(turn)
+        grown = step.grown.copy()
+        grown[HEADING] = grown[:, HEADING] = 0.0
+        grown[HEADING, HEADING] = turn.lost
+        return replace(self, mean=step.kept * self.mean, covariance=step.kept[:, None] * self.covariance * step.kept + grown)
+
+    def expected(self, turn: Turn) -> tuple[float, float]:
+        """Return what the integral of the compensated rate is at rest, rad, and its variance, rad²."""
+        step = self.step(turn)
+        return float(step.seen @ self.mean), float(step.seen @ self.covariance @ step.seen + step.grown[HEADING, HEADING])
+
+    @cached_property
+    def offset(self) -> tuple[float, float]:
+        """Return the sum of random walk and flicker, rad/s, and its variance."""
+        parts = slice(WALK, self.calibrated)
+        return float(self.mean[parts].sum()), float(self.covariance[parts, parts].sum())
+
+    @cached_property
+    def values(self) -> tuple[Array, Array, Array]:
+        """Return the errors of the values of the calibration, their covariance, and that with the `offset`."""
+        first = self.calibrated
+        return self.mean[first:], self.covariance[first:, first:], self.covariance[WALK:first, first:].sum(axis=0)
+
+    def bias(self, sensitivity: Array) -> tuple[float, float]:
+        """Return what the compensated rate is off by, rad/s, and the variance of that, for a sensitivity of shape (m,)."""
+        (offset, variance), (values, covariance, shared) = self.offset, self.values
+        return offset - float(sensitivity @ values), variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared))
+
+    def uncertain(self, place: int, variance: float) -> Drift:
+        """Return the state with one part less well known."""
+        covariance = self.covariance.copy()
+        covariance[place, place] += variance
+        return replace(self, covariance=covariance)
+
+    def turned_to(self, heading: float) -> Drift:
+        """Return the state with the heading known exactly."""
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[HEADING] = heading
+        covariance[HEADING] = covariance[:, HEADING] = 0.0
+        return replace(self, mean=mean, covariance=covariance)
+
+
+def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0, age: float | None = None) -> Drift:
+    """
+    Return the state some time after a calibration.
+
+    Parameters
+    ----------
+    noise : of the model
+    covariance : of the values of the calibration, shape (m, m), as `compensation.covariance` gives it
+    heading, variance : rad and rad²
+    age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None where there is none. Its variance holds
+        the floor of the Allan deviation for the flicker, which here is counted part by part instead
+
+    """
+    constants, of_each = noise.flicker()
+    first = _FLICKER + len(constants)
+    mean, whole = np.zeros(first + len(covariance)), np.zeros((first + len(covariance),) * 2)
+    mean[HEADING], whole[HEADING, HEADING] = heading, variance
+    whole[first:, first:] = covariance
+    flicker = np.arange(_FLICKER, first)
+    whole[flicker, flicker] = of_each
+    if age is not None:
+        within, shared = known_mean(constants)
+        whole[WALK, WALK] = noise.rate_random_walk ** 2 * (age + CALIBRATED / 3.0)
+        whole[-1, -1] = max(whole[-1, -1] - noise.floor ** 2, 0.0) + of_each * np.sum(within)
+        whole[-1, flicker] = whole[flicker, -1] = -of_each * shared * np.exp(-age / constants)
+    return Drift(noise, mean, whole)
+
+
+@lru_cache(maxsize=4096)
+def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+    """Return of heading, walk and flicker: what they add to the integral, what stays, and what comes in new, without white noise."""
+    constants, variance = noise.flicker()
+    left = np.exp(-duration / constants)
+    kept, seen = np.concatenate([[1.0, 1.0], left]), np.concatenate([[0.0, duration], constants * (1.0 - left)])
+    walk = noise.rate_random_walk ** 2
+    grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
+    grown[HEADING, WALK] = -0.5 * walk * duration ** 2
+    grown[HEADING, _FLICKER:] = -variance * constants * (1.0 - left) ** 2
+    grown[:, HEADING] = grown[HEADING]
+    ratio = duration / constants
+    grown[HEADING, HEADING] = walk * duration ** 3 / 3.0 + variance * float(np.sum(
+        constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)))
+    return seen, kept, grown
+
+
+def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+    """Return the same where no rates are integrated: walk and flicker go on, and add nothing."""
+    seen, kept, grown = (values.copy() for values in _wander(noise, duration))
+    seen[:] = grown[HEADING] = grown[:, HEADING] = 0.0
+    return seen, kept, grown
+
+
+def smoothed(states: list[Drift], turns: list[Turn], resting: list[bool]) -> list[Drift]:
+    """
+    Return the states with all that came later (Rauch, Tung and Striebel).
+
+    Parameters
+    ----------
+    states : before each turn, and after the last; n + 1 of them
+    turns, resting : n each
+
+    """
+    later = [states[-1]]
+    for state, turn, rest in zip(states[-2::-1], turns[::-1], resting[::-1]):
+        later.append(_with_hindsight(state, turn, rest, later[-1]))
+    return later[::-1]
+
+
+def _with_hindsight(state: Drift, turn: Turn, rest: bool, later: Drift) -> Drift:
+    """Return a state with what the one after it has come to."""
+    step, start = state.step(turn), state.measured(turn) if rest else state
+    after = start.carried(turn) if rest else start.moved(turn)
+    transition = np.diag(step.kept)
+    if not rest:
+        transition[HEADING] -= step.seen
+    back = start.covariance @ transition.T @ _inverse(after.covariance)
+    return replace(start, mean=start.mean + back @ (later.mean - after.mean),
+                   covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)
+
+
+def _inverse(covariance: Array) -> Array:
+    """Return the inverse of a covariance in which some parts may be known exactly."""
+    size = np.sqrt(np.diagonal(covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    return pinvh(covariance / np.outer(size, size)) / np.outer(size, size)

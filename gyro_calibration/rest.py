@@ -1,0 +1,138 @@
+"""
+Whether a gyro rests: the energy of its rate over a short window against the known noise, and how unlikely a mean may be.
+
+Each test has its share of the false alarms that are stated for an hour at rest.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, ndtri
+
+from gyro_calibration.noise import Noise
+
+#: Length of a block of samples, and of the window whose energy is looked at, s.
+BLOCK, WINDOW = 0.1, 0.5
+#: Times, s, over which the mean of the rate is compared with the bias that was known before them.
+LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+#: A window has at least so many samples.
+_SAMPLES = 8
+#: Windows whose noise is remembered, those needed to believe it, and how far it may be from what the model claims, as a factor.
+_REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
+
+
+@dataclass
+class Block:
+    """
+    Samples of a short time, as sums.
+
+    Attributes
+    ----------
+    duration : of what its samples stand for, s; a gap is none of that
+    count : of samples
+    total, squares : of the compensated rate, rad/s and (rad/s)²
+    differences : sum of the squared differences of neighbours, (rad/s)²
+
+    """
+
+    duration: float = 0.0
+    count: int = 0
+    total: float = 0.0
+    squares: float = 0.0
+    differences: float = 0.0
+
+    def add(self, duration: float, rate: float, before: float) -> None:
+        """Take a sample that stands for `duration` s."""
+        self.duration += duration
+        self.count += 1
+        self.total += rate
+        self.squares += rate * rate
+        self.differences += (rate - before) ** 2
+
+
+def sigmas(lag: float, false_alarms: float) -> float:
+    """Return how many standard deviations a mean over `lag` s may be off, so that it alarms in vain `false_alarms` times in an hour."""
+    chances = 3600.0 / lag * _OVERLAPPING
+    return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
+
+
+#: Tests that share the false alarms, and how many more chances windows have that overlap.
+_TESTS, _OVERLAPPING = len(LAGS) + 2, 3.0
+
+
+class Energy:
+    """
+    The energy of the last `WINDOW` s.
+
+    Attributes
+    ----------
+    factor : noise of the samples over what the model claims, as the quietest windows show it; 1 until enough were seen
+
+    """
+
+    def __init__(self, noise: Noise, false_alarms: float):
+        """Begin with an empty window."""
+        self.factor = 1.0
+        self._noise = noise
+        self._level = false_alarms / (_TESTS * 3600.0 / WINDOW * _OVERLAPPING)
+        self._blocks: deque[Block] = deque()
+        self._seen: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
+        self._since, self._interval = 0.0, BLOCK
+        self._sudden: float | None = None
+
+    def clear(self) -> None:
+        """Forget the window, as where rates of another calibration come."""
+        self._blocks.clear()
+
+    def add(self, block: Block) -> bool | None:
+        """Take the next block; tell whether the window holds no more energy than noise has; None until it is full."""
+        self._blocks.append(block)
+        while sum(each.duration for each in self._blocks) - self._blocks[0].duration >= WINDOW + BLOCK - 1e-9 and (
+                sum(each.count for each in self._blocks) - self._blocks[0].count >= _SAMPLES):
+            self._blocks.popleft()
+        duration, count, total, squares, differences = (sum(values) for values in zip(*(vars(each).values() for each in self._blocks)))
+        if duration < WINDOW + BLOCK - 1e-9 or count < _SAMPLES:
+            return None
+        self._interval, self._sudden = duration / count, None
+        claimed = self._noise.rate_variance(self._interval)
+        energy = (squares - total * total / count) / (count - 1)
+        self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
+        if energy >= self.factor ** 2 * claimed * float(chdtri(count - 1, self._level)) / (count - 1):
+            return False
+        # what a robot does is slower than its samples: means over blocks show it far better
+        means = sum(each.total ** 2 / each.count for each in self._blocks) - total * total / count
+        freedom = len(self._blocks) - 1
+        return freedom < 2 or means < self.factor ** 2 * claimed * float(chdtri(freedom, self._level))
+
+    def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
+        """
+        Learn the noise of the samples from the quietest tenth of the windows.
+
+        Vibration of a robot that goes straight is no noise, and shows less in differences of neighbours.
+
+        """
+        self._since += duration
+        if self._since < WINDOW:
+            return
+        self._since = 0.0
+        self._seen.append((energy, differences))
+        if len(self._seen) >= _NEEDED:
+            quietest, rough = np.quantile(self._seen, 0.1, axis=0) / (float(chdtri(count - 1, 0.9)) / (count - 1))
+            self.factor = math.sqrt(min(max(min(quietest, rough), 1.0), _TRUSTED ** 2))
+
+    def sudden(self) -> float:
+        """
+        Return how far a single sample may be off at rest, rad/s.
+
+        Its noise is that of the usual interval: what comes late, or in a burst, was sampled as evenly as any.
+
+        """
+        if self._sudden is None:
+            limit = sigmas(self._interval, _TESTS * self._level * 3600.0 / WINDOW)
+            self._sudden = limit * self.factor * math.sqrt(self._noise.rate_variance(self._interval))
+        return self._sudden

@@ -1,0 +1,600 @@
+"""
+The heading of a robot from compensated rates, with what rests teach of the bias, and with its variance.
+
+At rest the bias is tracked, the rate is zero and the heading stands. In motion the bias stays, with a variance that grows. A turn too slow
+to be seen at once is seen over a longer time, and what was taken for bias meanwhile becomes heading again.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gyro_calibration.drift import HEADING, WALK, Drift, Turn, begin, smoothed
+from gyro_calibration.gaps import Gaps, Intervals
+from gyro_calibration.heading import Threshold, ThresholdFilter, integrate
+from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.noise import Noise
+from gyro_calibration.rest import BLOCK, LAGS, WINDOW, Block, Energy, sigmas
+
+#: A correction of the heading is taken over with this time constant while the robot moves, s.
+SETTLING = 1.0
+#: The state goes on at least so often, s.
+_STEP = 1.0
+#: A sample at rest may be off by so many standard deviations of the bias.
+_FAR = 4.0
+#: A rest that is over sooner was none, s.
+_BRIEF = 2.0
+#: While the wheels stand, nobody turns the robot, and the bias may have moved by so much unseen, rad/s.
+_UNSEEN = 0.2 * DEGREE
+#: Noise of the samples counts for more than the model claims from this factor on, and a mean may be off by so much more, for noise figures
+#: are not better known.
+_ALLOWED = 1.25
+#: A steady turn that is slower than so many times what would just be noticed may be a bias that moved, and is after so long, s.
+_DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
+#: Where rests are looked for anew, a correction that waits for motion waits so much longer, s, until a rest that goes on is found again.
+_RECOGNIZED = 1.0
+#: The slowest turn that is noticed is missed with a probability of 5 %.
+_POWER = 1.645
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How the heading is tracked.
+
+    Attributes
+    ----------
+    false_alarms : rests taken for motion, in an hour at rest, 1/h; 0 looks for no rests, and nor does an unknown noise
+    threshold : of the filter of Hong and Park, eq. 12; used where rests are not looked for
+    maximum_gap : over a longer gap in the stamps nothing is integrated, s
+
+    """
+
+    false_alarms: float = 0.1
+    threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
+    maximum_gap: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Snapshot:
+    """The state at some time of a rest, what the rates came to since the rest began, and what was deleted until then, rad."""
+
+    drift: Drift
+    turn: Turn
+    deleted: float
+    steps: int
+
+
+@dataclass
+class _Doubt:
+    """
+    A turn that was seen late, and is so slow that the bias may have moved instead.
+
+    Attributes
+    ----------
+    before : the state when it began
+    rate : of the turn, rad/s
+    turn : what the rates came to since
+
+    """
+
+    before: _Snapshot
+    rate: float
+    turn: Turn
+
+
+@dataclass(frozen=True)
+class Step:
+    """A part of the way: the state before it, what the rates came to, whether the robot rested, and when it ends, s."""
+
+    before: Drift
+    turn: Turn
+    resting: bool
+    end: float
+
+
+class HeadingTracker:
+    """
+    Follow the heading sample by sample.
+
+    Attributes
+    ----------
+    heading : as it is published, rad, continuous, not wrapped
+    rate : rad/s; zero at rest
+    resting : whether the robot rests
+    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
+    intervals : of the samples, and how many are lost
+    steps : the way so far, where it is kept
+
+    """
+
+    def __init__(self, noise: Noise, covariance: Array, settings: Settings, age: float | None = 0.0, keep: bool = False):
+        """
+        Begin at heading zero.
+
+        Parameters
+        ----------
+        noise : of the model
+        covariance : of the values of the calibration, shape (m, m), as `compensation.covariance` gives it
+        age : of the self-calibration, whose s and b are the last values, s; None where there is none
+        keep : the `steps`, for `smoothed`
+
+        """
+        self.heading = self.rate = self.deleted = 0.0
+        self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
+        self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
+        self._known: float | None = None
+        self._doubt: _Doubt | None = None
+        self._last: tuple[float, float, float, Array] | None = None
+        self._reached = self._hesitates = 0.0
+        self._seen: Array | None = None
+        self._biased: Array | None = None
+        self._seen_off, self._bias_seen = 0.0, (0.0, 0.0)
+        self._still: Array | None = None
+        self._gaps, self._energy, self._tested = Gaps(noise), Energy(noise, settings.false_alarms), (noise, settings.false_alarms)
+        self.intervals = self._gaps.intervals
+        self._begin(noise, covariance, 0.0, 0.0, age)
+        self.set(settings)
+
+    def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float, age: float | None) -> None:
+        self._claimed, self._drift = noise, begin(noise, covariance, heading, variance, age if len(covariance) else None)
+        self._nothing, self._part = self._none(), self._none()
+        self._open = self._nothing
+
+    def _none(self) -> Turn:
+        return Turn(0.0, 0.0, np.zeros(len(self._drift.mean) - self._drift.calibrated))
+
+    def set(self, settings: Settings) -> None:
+        """Go on with other settings."""
+        self._settings = settings
+        self._seeks = settings.false_alarms > 0.0 and self._claimed.angle_random_walk > 0.0
+        rests = self.resting and self._seeks and self._tested == (self._claimed, settings.false_alarms)
+        if self._tested != (self._claimed, settings.false_alarms):
+            self._tested = self._claimed, settings.false_alarms
+            self._energy = Energy(*self._tested)
+        self._block, self._driven = Block(), False
+        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._seeks else settings.threshold)
+        self._sigmas = {
+            lag: _ALLOWED * sigmas(lag, settings.false_alarms) for lag in (WINDOW, *LAGS)} if self._seeks else {}
+        if rests:
+            self._rest()
+        else:
+            self._recognize()
+        self._take()
+
+    def use(self, noise: Noise, covariance: Array, age: float | None = 0.0) -> None:
+        """
+        Go on with other noise figures and another calibration.
+
+        The heading does not jump. What rests taught of the bias is forgotten, but not what they have shown of the turn before.
+
+        """
+        heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
+        self._still = None
+        if self._last is not None:
+            self._last = (*self._last[:3], np.zeros(len(covariance)))
+        self._energy.clear()
+        self._begin(noise, covariance, heading, variance, age)
+        self.set(self._settings)
+
+    def reset(self) -> None:
+        """Call this direction zero, known exactly."""
+        self._settle()
+        self.heading = self.deleted = 0.0
+        self._drift = self._drift.turned_to(0.0)
+        if self._doubt:
+            # if the robot has stood since, it had this direction then
+            self._doubt.before = replace(self._doubt.before, drift=self._doubt.before.drift.turned_to(0.0), deleted=0.0)
+        self._take()
+        if self.resting:
+            self._rest()
+
+    @property
+    def variance(self) -> float:
+        """Return the variance of the heading, rad²; what is still to be taken over counts too."""
+        if self.resting:
+            return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
+        if self._known is None:
+            self._known = float(self._drift.moved(self._open).covariance[HEADING, HEADING])
+        part = self._part
+        return self._known + self._drift.noise.angle_random_walk ** 2 * part.duration + part.lost + part.noise + self._pending ** 2
+
+    # Samples
+
+    def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None, still: Array | None = None) -> str:
+        """
+        Take one sample.
+
+        Parameters
+        ----------
+        time : stamp, s
+        rate : compensated, rad/s
+        sensitivity : of the rate to the values of the calibration, shape (m,), as in `compensation`
+        wheels : whether wheels or commands move the robot; None where nobody says so
+        still : the sensitivity if the true rate is zero; else that of the samples serves at rest too, whose noise in the place of the rate
+            is then taken for a scale factor error, which is harmless only where that is well known
+
+        Returns
+        -------
+        '', or why the integration began anew with this sample
+
+        """
+        self._still = still
+        filtered = self._filter.filter(time, rate)
+        last, self._last = self._last, (time, rate, filtered, sensitivity)
+        if last is None:
+            self._reached, self.rate = time, rate - self._off(sensitivity)
+            return ''
+        interval = time - last[0]
+        if interval < 0.0 or interval > self._settings.maximum_gap:
+            said = self._restart(interval, max(abs(rate), abs(last[1])))
+            self.rate = rate - self._off(sensitivity)
+            return said
+        self._interval, self._reached = interval, time
+        self._integrate(interval, last)
+        gap = self._gaps.add(interval, rate, last[1])
+        if gap is not None and (filtered == rate or last[2] == last[1]):
+            self._part.lost += gap.motion
+            self._part.noise += gap.noise
+        if self._seeks:
+            self._look(interval if gap is None else interval - gap.duration, last[1], wheels)
+        elif self._part.duration >= _STEP:
+            self._settle()
+        self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
+        return ''
+
+    def _off(self, sensitivity: Array) -> float:
+        """Return what rests have taught that a rate is off by, rad/s; many samples in a row have the same sensitivity."""
+        if sensitivity is not self._seen:
+            self._seen, self._seen_off = sensitivity, self._offset - float(sensitivity @ self._values)
+        return self._seen_off
+
+    def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
+        """Take the heading on to the last sample."""
+        assert self._last is not None
+        (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = self._last, last
+        half = 0.5 * interval
+        kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
+        duration, turned = kept + last_kept, half * (filtered + last_filtered)
+        if sensitivity is last_sensitivity:
+            self._part.add(duration, turned, duration * sensitivity)
+            turned -= duration * self._off(sensitivity)
+        else:
+            seen = kept * sensitivity + last_kept * last_sensitivity
+            self._part.add(duration, turned, seen)
+            turned += float(seen @ self._values) - duration * self._offset
+        if self.resting:
+            self.deleted += turned
+            return
+        self.deleted += half * (rate - filtered + last_rate - last_filtered)
+        if self._hesitates > 0.0:
+            self._hesitates -= interval
+            settled = 0.0
+        else:
+            settled = self._pending * duration / SETTLING
+            self._pending -= settled
+        self.heading += turned + settled
+
+    def _look(self, duration: float, before: float, wheels: bool | None) -> None:
+        """Look for rest and motion: at each sample, which stands for some time, for a sudden one; at the end of each block for any."""
+        assert self._last is not None
+        _, rate, _, sensitivity = self._last
+        self._block.add(duration, rate, before)
+        if self.resting and (wheels or abs(rate - self._off(sensitivity)) > math.hypot(self._energy.sudden(), self._unsure)):
+            self._notice(0.0)
+        self._driven = self._driven or bool(wheels)
+        if self._block.duration >= BLOCK - 1e-9:
+            quiet = self._energy.add(self._block)
+            self._judge(False if self._driven else quiet, self._driven or wheels)
+            self._block, self._driven = Block(), False
+
+    def _judge(self, quiet: bool | None, wheels: bool | None) -> None:
+        """Decide at the end of a block; one that cannot yet be told from a rest ends none."""
+        part, self._part, self._known = self._part, self._none(), None
+        self._open += part
+        if self.resting:
+            if quiet is False:
+                self._notice(WINDOW)
+            elif self._open.duration >= _STEP:
+                self._advance()
+                self._compare(wheels)
+            return
+        if not quiet or wheels:
+            self._wanted, self._doubt = WINDOW, None
+        if wheels:
+            # an even turn has no more energy than a rest: what the wheels say is not held back for one
+            self._move(WINDOW)
+        self._hold(part)
+        if self._open.duration >= self._held.duration + _STEP:
+            self._advance(self._held)
+        if quiet and self._stands(wheels):
+            self._advance(self._settled())
+            self._rest()
+
+    def _hold(self, part: Turn) -> None:
+        """Hold the last blocks back that may turn out to be the begin of a rest."""
+        self._recent.append(part)
+        self._held += part
+        while len(self._recent) > 2 and self._held.duration - self._recent[0].duration >= self._wanted - 1e-9:
+            self._held -= self._recent.popleft()
+
+    def _settled(self) -> Turn:
+        """Return what is held back but for its first block: that begins at the sample before the window, in which the robot may move."""
+        return self._held - self._recent[0]
+
+    def _stands(self, wheels: bool | None) -> bool:
+        """Tell whether the mean of a quiet time that is long enough may be one of a robot that stands."""
+        if self._held.duration < self._wanted - 1e-9 or len(self._recent) < 2:
+            return False
+        most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
+        stands = abs(self._surprise(self._drift, self._at_rest(self._settled()), _UNSEEN if wheels is False else 0.0)) < most
+        if not stands and self._wanted > WINDOW and not self._drifted():
+            self._move(self._wanted)
+        return stands
+
+    def _drifted(self) -> bool:
+        """
+        Take a slow turn that stays as it is for a bias that moved, and the robot for standing since it was seen; tell whether so.
+
+        No robot turns as evenly for minutes, but a bias that wanders by more than the model says would otherwise make a heading drift at
+        rest for ever.
+
+        """
+        doubt, held = self._doubt, self._at_rest(self._held)
+        if doubt is None:
+            return False
+        start = doubt.before.drift.uncertain(WALK, doubt.rate ** 2)
+        moved = start.rested(self._at_rest(doubt.turn))
+        if doubt.turn.duration + held.duration < _DECIDED or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]:
+            doubt.turn += held
+            return False
+        if self._keep:
+            assert self._last is not None
+            del self.steps[doubt.before.steps:]
+            self.steps.append(Step(start, self._at_rest(doubt.turn), True, self._last[0] - self._part.duration - held.duration))
+        self._drift, self._open, self._doubt = moved, self._held, None
+        self._rest()
+        self._take()
+        return True
+
+    def _surprise(self, drift: Drift, turn: Turn, unseen: float = 0.0) -> float:
+        """Return how far the rates came to something else than at rest, in standard deviations."""
+        expected, variance = drift.expected(turn)
+        return (turn.turned - expected) / math.sqrt(variance + (unseen * turn.duration) ** 2)
+
+    def _compare(self, wheels: bool | None) -> None:
+        """Compare the means over the longer times with the bias that was known before them."""
+        for lag in LAGS:
+            before = self._before(lag)
+            if before is None:
+                return
+            turn = self._rested - before.turn
+            surprise = self._surprise(before.drift, turn)
+            if abs(surprise) > self._sigmas[lag]:
+                if wheels is False:
+                    expected, _ = before.drift.expected(turn)
+                    self._drift = self._drift.uncertain(WALK, ((turn.turned - expected) / turn.duration) ** 2)
+                    self._rest()
+                else:
+                    self._notice(lag)
+                return
+
+    def _before(self, lag: float) -> _Snapshot | None:
+        """Return the state `lag` s before the last step of this rest; None where that is before it began."""
+        until = self._rested.duration - lag + 1e-6
+        return next((each for each in reversed(self._snapshots) if each.turn.duration <= until), None)
+
+    # From rest to motion and back
+
+    def _rest(self) -> None:
+        """Take the robot for standing from here on."""
+        self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
+        self._snapshots = deque([_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))], maxlen=round(LAGS[-1] / _STEP) + 8)
+
+    def _move(self, wanted: float) -> None:
+        """Take the robot for moving, until it is quiet for `wanted` s."""
+        self.resting, self._wanted, self._recent, self._held = False, wanted, deque[Turn](), self._nothing
+
+    def _recognize(self) -> None:
+        """Look for a rest anew; if there was one, it may go on."""
+        if self.resting:
+            self._hesitates = _RECOGNIZED
+        self._move(WINDOW)
+
+    def _notice(self, lag: float) -> None:
+        """Take the robot for moving since `lag` s before the last block."""
+        self._advance()
+        before = self._before(lag) or self._snapshots[0]
+        if self._rested.duration < _BRIEF:
+            before = self._snapshots[0]
+        turn = self._rested - before.turn
+        self._doubt = self._doubtful(before, turn) if lag >= LAGS[0] else None
+        self._drift, self.deleted, self._open = before.drift, before.deleted, turn
+        del self.steps[before.steps:]
+        self._move(max(lag, WINDOW))
+        self._advance()
+
+    def _doubtful(self, before: _Snapshot, turn: Turn) -> _Doubt | None:
+        """Return what was noticed, where it is so slow that the bias may have moved."""
+        longest = replace(self._nothing, duration=LAGS[-1])
+        least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
+        rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
+        return _Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least else None
+
+    def _restart(self, interval: float, fastest: float) -> str:
+        """
+        Begin anew after a gap or a jump back.
+
+        Over a gap nothing is integrated, and what may have been turned meanwhile goes into the variance. How much time a jump back hides,
+        the stamps do not tell, so nothing is known of a turn in it.
+
+        """
+        self._settle()
+        self._reached += interval
+        self._block, self._driven = Block(), False
+        self._energy.clear()
+        self._filter.clear()
+        self._gaps.clear()
+        self._recognize()
+        if interval < 0.0:
+            return f'the stamp jumps back by {-interval:.3f} s'
+        self._go_on(replace(self._nothing, duration=interval, lost=(fastest * interval) ** 2, unseen=True), self._reached)
+        self._take()
+        return f'no samples for {interval:.3f} s'
+
+    def _settle(self) -> None:
+        """Take the state on to the last sample."""
+        self._open, self._part = self._open + self._part, self._none()
+        if not self.resting:
+            self._move(self._wanted)
+        self._advance()
+
+    def _advance(self, left: Turn | None = None) -> None:
+        """Take the state on over what is open, but for what is left open."""
+        left = left or self._nothing
+        turn, self._open = self._open - left, left
+        if self.resting:
+            turn = self._at_rest(turn)
+        if turn.duration > 1e-9:
+            self._go_on(turn, self._reached - self._part.duration - left.duration)
+            if self.resting:
+                self._rested += turn
+                deleted = self.deleted - self._corrected(self._part)
+                self._snapshots.append(_Snapshot(self._drift, self._rested, deleted, len(self.steps)))
+        self._take()
+
+    def _go_on(self, turn: Turn, end: float) -> None:
+        """Take the state on over a turn that ends at a time, s."""
+        if self._keep:
+            self.steps.append(Step(self._drift, turn, self.resting, end))
+        self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
+
+    def _at_rest(self, turn: Turn) -> Turn:
+        """Return what the rates of a rest came to, without their noise in the sensitivity."""
+        return turn if self._still is None else replace(turn, sensitivity=turn.duration * self._still)
+
+    def _take(self) -> None:
+        """Take on what the state has come to, and how loud the gyro is; the heading does not jump."""
+        loud = self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0
+        if (noise := replace(self._claimed, angle_random_walk=loud * self._claimed.angle_random_walk)) != self._drift.noise:
+            self._drift = replace(self._drift, noise=noise)
+        self._gaps.noise = self._drift.noise
+        self._offset, self._values, self._seen, self._biased = self._drift.offset[0], self._drift.values[0], None, None
+        self._unsure = _FAR * self.bias[1]
+        self._known = None
+        estimate = float(self._drift.mean[HEADING]) + (0.0 if self.resting else self._corrected(self._open + self._part))
+        self._pending = estimate - self.heading
+
+    def _corrected(self, part: Turn) -> float:
+        """Return what the rates of a part came to, less what rests have taught, rad."""
+        return part.turned - part.duration * self._offset + float(part.sensitivity @ self._values)
+
+    # What is known
+
+    def finish(self) -> Drift:
+        """Take the state on to the last sample, and return it."""
+        self._settle()
+        return self._drift
+
+    @property
+    def bias(self) -> tuple[float, float]:
+        """Return what rests have taught of the bias beyond the calibration, and how well the bias is known, rad/s."""
+        return self.bias_by(self._nothing.sensitivity if self._last is None else self._last[3])
+
+    def bias_by(self, sensitivity: Array) -> tuple[float, float]:
+        """Return the same for samples with another sensitivity, shape (m,), as those at another temperature."""
+        if sensitivity is not self._biased:
+            bias, variance = self._drift.bias(sensitivity)
+            self._biased, self._bias_seen = sensitivity, (bias, math.sqrt(variance))
+        return self._bias_seen
+
+    @property
+    def rate_variance(self) -> float:
+        """Return the variance of the last rate, (rad/s)²: of its noise, and of what is known of bias and scale."""
+        interval = min(self._interval, self.intervals.usual)
+        return self.bias[1] ** 2 + self._drift.noise.rate_variance(WINDOW if self.resting else interval)
+
+    @property
+    def slowest_noticed(self) -> float:
+        """Return the slowest turn, rad/s, that is missed in 5 % of cases only, where no wheels tell of it; nan if unknown."""
+        turns = [(lag, replace(self._nothing, duration=lag)) for lag in LAGS] if self._seeks else []
+        return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag for lag, turn in turns), default=math.nan)
+
+
+@dataclass(frozen=True)
+class Track:
+    """
+    A heading over a log.
+
+    Attributes
+    ----------
+    heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
+    resting : shape (n,)
+    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
+    intervals : of the samples, and how many are lost
+
+    """
+
+    heading: Array
+    variance: Array
+    rate: Array
+    rate_variance: Array
+    resting: Mask
+    deleted: float
+    intervals: Intervals
+
+
+def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array, settings: Settings,
+          wheels: list[bool | None] | None = None, hindsight: bool = False, age: float | None = 0.0, still: Array | None = None) -> Track:
+    """
+    Return the heading over a whole log.
+
+    Parameters
+    ----------
+    time, rate : s and rad/s, compensated, shape (n,)
+    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
+    noise, covariance, settings, age : as in `HeadingTracker`
+    wheels : whether wheels or commands move the robot, n of them, or None
+    still : as in `HeadingTracker.add`
+    hindsight : let all that came later speak too
+
+    """
+    tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
+    found = np.empty((len(time), 5))
+    for index, (at, value, seen) in enumerate(zip(time.tolist(), rate.tolist(), np.ascontiguousarray(sensitivity.T))):
+        tracker.add(at, value, seen, None if wheels is None else wheels[index], still)
+        found[index] = tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance, tracker.resting
+    heading, variance, shown, rate_variance, resting = found.T
+    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted, tracker.intervals)
+    if not hindsight:
+        return live
+    later, with_hindsight, rested = in_hindsight(tracker, time, rate)
+    return replace(live, heading=later, variance=with_hindsight, resting=rested)
+
+
+def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
+    """
+    Return heading, rad, its variance, rad², and where the robot rested, shape (n,) each, with all that came later.
+
+    The heading is what the rates came to, with the correction interpolated between the steps.
+
+    Parameters
+    ----------
+    tracker : that kept its steps, and was given the samples
+    time, rate : of the samples, s and rad/s, shape (n,)
+
+    """
+    last, steps = tracker.finish(), tracker.steps
+    states = smoothed([*(step.before for step in steps), last], [step.turn for step in steps], [step.resting for step in steps])
+    ends = np.array([time[0], *(step.end for step in steps)])
+    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING]) for state in states]).T
+    turned = integrate(time, rate)
+    rested = np.array([step.resting for step in steps] or [False])
+    resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
+    moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
+    return np.where(resting, np.interp(time, ends, heading), moved), np.interp(time, ends, variance), resting

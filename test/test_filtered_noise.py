@@ -1,0 +1,85 @@
+"""Noise that a filter or rounding shaped passes for no cause, and hides none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosed import described as told
+from diagnosed import log_of, model_of
+from hidden import hide
+from scipy.signal import butter, lfilter
+
+from gyro_calibration.diagnosis.field import field, filtered, work
+from gyro_calibration.diagnosis.replay import replay
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.effects import QUANTIZATION
+from gyro_calibration.log import Log
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.noise import Noise
+
+#: Numerator and denominator.
+FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]), 'low pass': butter(2, 0.3)}
+ANGLE_RANDOM_WALK = 1e-4
+SHORT = {'duration': 600.0, 'sample_rate': 25.0}
+
+
+def behind(filter, names=(), multiple=0.0, seed=0):
+    """Return what is hidden, and its log with noise that went through a filter."""
+    hidden, = hide(names, multiple, np.random.default_rng(seed), noise='white', **SHORT)
+    noise = hidden.truth.noise
+    log = log_of(hidden)
+    return hidden, replace(log, output=log.output - noise + lfilter(*FILTERS[filter], noise))
+
+
+@pytest.mark.parametrize('filter', FILTERS)
+def test_noise_behind_a_filter_is_no_cause(filter):
+    hidden, log = behind(filter)
+    found = diagnose([log], np.random.default_rng(0), model_of(hidden))
+    assert found.verdict == 'adequate', told(hidden, found)
+
+
+def test_the_angle_random_walk_behind_a_filter_is_that_of_low_frequencies():
+    hidden, log = behind('exponential smoothing')
+    found = diagnose([log], np.random.default_rng(0))
+    assert found.noise.angle_random_walk == pytest.approx(hidden.truth.expected['angle_random_walk'], rel=0.05)
+
+
+@pytest.mark.parametrize('filter, name', list(zip(FILTERS, ['time_offset', 'interference_tone', 'time_offset'])))
+def test_what_is_hidden_in_noise_behind_a_filter_is_found(filter, name):
+    hidden, log = behind(filter, [name], 8.0, 1)
+    found = diagnose([log], np.random.default_rng(0))
+    assert [each.effect for each in found.findings] == [name] and not found.unexplained, told(hidden, found)
+
+
+@pytest.mark.parametrize('seconds', [20.0, 120.0, 900.0])
+def test_white_noise_has_been_through_no_filter(seconds):
+    time = np.arange(0.0, seconds, 0.02)
+    for seed in range(3):
+        generator = np.random.default_rng(seed)
+        log = Log(time=time, output=1e-3 * generator.standard_normal(len(time)))
+        each = replay(log, np.ones(len(time), dtype=bool), generator)
+        assert filtered(work(field([each]), [])) == (each,)
+
+
+# rounding
+
+def rounded(step, known):
+    """Return a log of a gyro whose output comes in steps, so many standard deviations wide, and what is found beside its model."""
+    generator = np.random.default_rng(3)
+    time = np.arange(20_000) / 50.0
+    white = ANGLE_RANDOM_WALK / np.sqrt(0.02)
+    rate = 0.8 * np.sin(0.3 * time) * np.sin(0.041 * time)
+    output = np.round((rate + white * generator.standard_normal(len(time))) / (step * white)) * step * white
+    model = GyroModel((Term(QUANTIZATION, (step * white,)),) if known else (), noise=Noise(ANGLE_RANDOM_WALK))
+    return diagnose([Log(time=time, output=output, reference_rate=rate)], generator, model)
+
+
+@pytest.mark.parametrize('step', [0.6, 1.5, 3.0])
+def test_the_steps_that_a_model_has_are_no_angle_random_walk(step):
+    found = rounded(step, True)
+    assert not found.findings
+    assert found.noise.angle_random_walk == pytest.approx(ANGLE_RANDOM_WALK, rel=0.03)
+
+
+def test_steps_that_a_model_does_not_have_are_one_finding():
+    assert [each.effect for each in rounded(1.5, False).findings] == ['quantization']

@@ -1,0 +1,208 @@
+"""
+Lost samples: how many, what they leave unknown of the heading, and that a rest goes on over them.
+
+What is said of the heading is compared with the difference to the heading with all samples, over many drives.
+
+"""
+
+import math
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyro_calibration.gaps import Gaps, Intervals
+from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
+from gyro_calibration.log import DEGREE, Log, write_log
+from gyro_calibration.model import GyroModel, SelfCalibration
+from gyro_calibration.model_file import write_model
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.tracking import HeadingTracker, Settings, track
+
+#: Of an Epson XV-3500 (Hong and Park, section 1).
+XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)
+WHITE = Noise(XV3500.angle_random_walk)
+INTERVAL = 0.01
+
+
+def kept(count, share, longest, generator):
+    """Return which samples come: a share is lost, in runs of 1 to `longest`; the first ones and the last come all."""
+    begins = np.flatnonzero(generator.random(count) < 2.0 * share / (1 + longest))
+    comes = np.ones(count, bool)
+    for begin, length in zip(begins, generator.integers(1, longest + 1, len(begins))):
+        comes[begin:begin + length] = False
+    comes[:300] = comes[-1] = True
+    return comes
+
+
+def driven(duration, generator):
+    """Return rates of stretches of 0.5 to 5 s, half of them at rest, with flanks of 0.3 s."""
+    rates = np.zeros(0)
+    while len(rates) < duration / INTERVAL:
+        stretch = round(generator.uniform(0.5, 5.0) / INTERVAL)
+        rates = np.append(rates, np.full(stretch, generator.choice([0.0, 1.0]) * generator.uniform(-1.0, 1.0)))
+    return np.convolve(rates, np.ones(30) / 30.0, 'same')[:round(duration / INTERVAL)]
+
+
+def lost_heading(true, comes, generator, noise=WHITE):
+    """Return by how much lost samples change the heading, rad, and the variance that is said of it, rad²."""
+    time = np.arange(len(true)) * INTERVAL
+    rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
+    gaps, said = Gaps(noise), 0.0
+    late, values = time[comes].tolist(), rate[comes].tolist()
+    for index in range(1, len(late)):
+        gap = gaps.add(late[index] - late[index - 1], values[index], values[index - 1])
+        said += gap.variance if gap else 0.0
+    assert gaps.intervals.lost == (~comes).sum()
+    return integrate(time[comes], rate[comes])[-1] - integrate(time, rate)[-1], said
+
+
+# how many
+
+@pytest.mark.parametrize('jitter', [0.0, 0.1])
+@pytest.mark.parametrize('interval', [0.001, 0.01, 0.1])
+def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitter):
+    generator = np.random.default_rng(1)
+    comes = kept(3000, 0.1, 5, generator)
+    stamps = interval * (np.arange(3000) + jitter * generator.uniform(-1.0, 1.0, 3000))[comes]
+    intervals = Intervals()
+    for step in np.diff(stamps).tolist():
+        intervals.add(step)
+    assert intervals.lost == (~comes).sum() and intervals.usual == pytest.approx(interval, rel=0.05 + jitter)
+    assert intervals.longest == pytest.approx(np.diff(stamps).max())
+
+
+def test_samples_that_come_late_or_in_bursts_are_not_lost():
+    late = np.arange(0.0, 10.0, 0.01)
+    late[500:510] = late[509] - np.arange(9, -1, -1) * 2e-4
+    bursts = np.ceil(np.arange(0.0, 10.0, 0.001) / 0.016 + 1e-9) * 0.016 + np.arange(10000) % 16 * 1e-5
+    for stamps in (late, bursts):
+        intervals = Intervals()
+        for step in np.diff(stamps).tolist():
+            intervals.add(step)
+        assert intervals.lost == 0
+
+
+def test_a_gyro_that_is_set_to_another_rate_loses_samples_for_a_while_only():
+    intervals = Intervals()
+    lost = [intervals.add(step) for step in [0.01] * 500 + [0.02] * 1000]
+    assert sum(lost[:500]) == 0 < sum(lost) and not any(lost[-800:]) and intervals.usual == 0.02
+
+
+# what they leave unknown
+
+@pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.1, 85)])
+def test_at_rest_the_noise_of_lost_samples_is_what_is_said(share, longest):
+    squares = []
+    for seed in range(40):
+        generator = np.random.default_rng(seed)
+        off, said = lost_heading(np.zeros(6000), kept(6000, share, longest, generator), generator)
+        squares.append(off * off / said)
+    assert 0.4 < np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 40)
+
+
+@pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.03, 85)])
+def test_what_may_have_been_turned_in_gaps_is_said_and_not_much_more(share, longest):
+    squares, said_squares = [], []
+    for seed in range(24):
+        generator = np.random.default_rng(seed)
+        off, said = lost_heading(driven(60.0, generator), kept(6000, share, longest, generator), generator)
+        squares.append(off * off / said)
+        said_squares.append((off * off, said))
+    actual, said = np.sqrt(np.mean(said_squares, axis=0))
+    assert np.mean(squares) < 1.0 + 4.0 * math.sqrt(2.0 / 24) and said < 3.0 * actual
+
+
+def test_a_turn_that_begins_within_a_gap_may_have_begun_at_any_time_in_it():
+    squares = []
+    for seed in range(100):
+        generator = np.random.default_rng(seed)
+        true, comes, first = np.zeros(1000), np.ones(1000, bool), generator.integers(501, 560)
+        true[first:], comes[501:560] = 1.0, False
+        off, said = lost_heading(true, comes, generator)
+        squares.append(off * off / said)
+    assert 0.5 < np.mean(squares) < 1.5
+
+
+# the heading
+
+def sensitivity_of(rate):
+    return -np.vstack([rate, np.ones(len(rate))])
+
+
+KNOWN = np.diag([1e-10, 1e-10])
+
+
+def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
+    generator, time = np.random.default_rng(3), np.arange(0.0, 60.0, INTERVAL)
+    true = np.where(time > 50.3, 0.5, 0.0)
+    rate, comes = true + simulate_noise(WHITE, len(time), INTERVAL, generator), np.ones(len(time), bool)
+    for begin, gap in ((10.0, 0.2), (20.0, 0.45), (30.0, 0.6), (40.0, 0.9), (50.0, 0.8)):
+        comes[(time > begin) & (time < begin + gap)] = False
+    found = track(time[comes], rate[comes], sensitivity_of(rate[comes]), WHITE, KNOWN, Settings())
+    resting = found.resting[(time[comes] > 2.0) & (time[comes] < 50.0)]
+    assert resting.all() and not found.resting[time[comes] > 51.0].any()
+    assert abs(found.heading[-1] - 0.5 * 9.7) < 3.0 * math.sqrt(found.variance[-1]) < 0.5
+    assert found.intervals.lost == (~comes).sum() and found.intervals.longest == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that_waits():
+    tracker, still = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings()), np.array([0.0, -1.0])
+    generator, headings = np.random.default_rng(4), []
+    outputs = np.concatenate([np.full(1000, 0.1), np.zeros(3000)]) + 0.3 * DEGREE
+    outputs += simulate_noise(WHITE, len(outputs), INTERVAL, generator)
+    for index, output in enumerate(outputs.tolist()):
+        time = INTERVAL * index + (3.0 if index >= 2000 else 0.0)
+        if index == 3000:
+            tracker.set(Settings(maximum_gap=0.9))
+        said = tracker.add(time, output, np.array([-output, -1.0]), None, still)
+        assert bool(said) == (index == 2000)
+        headings.append(tracker.heading)
+    assert tracker.resting and math.sqrt(tracker.variance) > 1.0 * DEGREE, 'a correction waits'
+    assert np.ptp(headings[1500:]) < 0.4 * DEGREE and np.ptp(headings[2900:]) == 0.0
+
+
+def test_a_log_in_blocks_says_the_same_as_sample_by_sample():
+    generator = np.random.default_rng(5)
+    true = driven(30.0, generator)
+    comes = kept(len(true), 0.05, 20, generator)
+    time, rate = (np.arange(len(true)) * INTERVAL)[comes], (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
+    tracked = track(time, rate, sensitivity_of(rate), WHITE, KNOWN, Settings(false_alarms=0.0))
+    integrator, cuts = BlockIntegrator(Threshold(0.0), WHITE, KNOWN), np.array([100, 101, 900])
+    split = np.split(time, cuts), np.split(rate, cuts), np.split(sensitivity_of(rate), cuts, axis=1)
+    parts = [integrator.add(*part) for part in zip(*split)]
+    heading, deviation = (np.concatenate([part[place] for part in parts]) for place in (1, 2))
+    assert heading == pytest.approx(tracked.heading, abs=1e-9)
+    # sample by sample the calibration's part is counted once a second
+    assert deviation ** 2 == pytest.approx(tracked.variance, rel=1e-3) and integrator.intervals.lost == tracked.intervals.lost > 0
+    whole = track(np.arange(len(true)) * INTERVAL, true, sensitivity_of(true), WHITE, KNOWN, Settings(false_alarms=0.0))
+    assert whole.variance[-1] < 0.7 * tracked.variance[-1]
+
+
+@pytest.mark.parametrize('option', [(), ('--rest',)])
+def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp_path):
+    write_model(tmp_path / 'model.yaml', GyroModel(noise=WHITE, self_calibration=SelfCalibration(0.0, 0.0, ((1e-10, 0.0), (0.0, 1e-10)))))
+    deviations = []
+    for lost in (False, True):
+        generator = np.random.default_rng(6)
+        true = driven(30.0, generator)
+        comes = kept(len(true), 0.05, 20, generator) if lost else np.ones(len(true), bool)
+        output = (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
+        write_log(tmp_path / f'{lost}.csv', Log(time=(np.arange(len(true)) * INTERVAL)[comes], output=output))
+        files = tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv'
+        code, said, _ = run('compensate', *files, *option)
+        assert code == 0 and (f'{(~comes).sum()} samples are lost' in said) == lost
+        deviations.append(float(said.partition('+-')[2].split()[0]))
+    assert deviations[1] > 1.2 * deviations[0]
+
+
+def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is(monkeypatch):
+    """A short run of `benchmarks/faulty_heading.py`, which tells by how much of 30 minutes."""
+    folder = Path(__file__).parents[1] / 'benchmarks'
+    monkeypatch.syspath_prepend(folder)
+    one = runpy.run_path(str(folder / 'faulty_heading.py'))['one']
+    faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'
+    drives = [one(('RD2100', INTERVAL, 120.0, seed, faults)) for seed in range(2)]
+    clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives])) for fault in faults)
+    assert stamped < 1.3 * clean < 0.1 * bridged

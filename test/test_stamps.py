@@ -1,0 +1,39 @@
+"""Stamps that a host gives on arrival: what only waited there is not lost, and what is lost is counted beside it."""
+
+import numpy as np
+import pytest
+
+from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.log import Log
+from gyro_calibration.stamps import number_stamps
+
+INTERVAL = 0.01
+
+
+def stalled(seconds, count=6000, begin=20.0):
+    """Return stamps of a host that does nothing for some seconds, and then takes what waited, 0.2 ms a sample."""
+    due = np.arange(count) * INTERVAL
+    late = begin + seconds + 2e-4 * np.arange(count)
+    first = int(np.searchsorted(due, begin))
+    return np.concatenate([due[:first], np.maximum(due[first:], late[:count - first])])
+
+
+@pytest.mark.parametrize('seconds', [0.05, 0.3, 1.0])
+@pytest.mark.parametrize('jitter', [0.0, 1e-3])
+def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
+    time = stalled(seconds) + jitter * np.random.default_rng(1).random(6000) * (np.arange(6000) < 2000)
+    stamps = number_stamps(time)
+    assert not stamps.bursts and not stamps.lost.any()
+    noise = 1e-3 * np.random.default_rng(2).standard_normal(6000)
+    assert not inspect(Log(output=noise, time=time)).findings
+
+
+def test_what_is_lost_while_a_host_stands_is_counted():
+    time = np.delete(stalled(0.3), np.arange(2015, 2027))
+    assert number_stamps(time).lost.sum() == 12
+
+
+@pytest.mark.parametrize('missing', [1, 5, 40])
+def test_samples_are_lost_before_and_after_a_stall(missing):
+    places = np.concatenate([np.arange(500, 500 + missing), np.arange(4000, 4000 + missing)])
+    assert number_stamps(np.delete(stalled(0.3), places)).lost.sum() == 2 * missing
