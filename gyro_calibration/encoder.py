@@ -18,12 +18,16 @@ from scipy.fft import dct
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.log import DEGREE, Array, DataRefused, Log, refuse_wrapped
+from gyro_calibration.mishap import refuse_dead
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import Motion, from_headings
 from gyro_calibration.noise import ALLAN_FLOOR, Noise
-from gyro_calibration.self_calibration import Limits, fit_rate, refuse_dead, refuse_scale
+from gyro_calibration.self_calibration import Limits, fit_rate, refuse_scale
 from gyro_calibration.stamps import lost_samples
+
+#: Of a log, s: three years, or stamps in another unit.
+LONGEST = 1e8
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,7 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
     """Return time and output of the gyro, and the motion by the reference, each without what was lost."""
     if log.time is None or log.output is None or log.reference_heading is None:
         raise DataRefused('the log holds no reference heading over time: it needs the columns time_s, gyro_dps and reference_heading_deg')
+    refuse_wrapped(log)
     heard, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
     for known, name in ((heard, 'gyro'), (seen, 'reference')):
         if known.sum() < max(100, 0.1 * len(log)):
@@ -154,6 +159,8 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
 def _refuse_motion(motion: Motion, limits: Limits) -> None:
     if motion.duration < 10.0:
         raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: record longer')
+    if motion.duration > LONGEST:
+        raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; see whether time_s is in s, or give --rate')
     points = np.arange(0.0, motion.duration, 0.5)
     spread = float(np.std(np.diff(motion.heading_at(points)) / 0.5))
     if spread < limits.rate_spread:

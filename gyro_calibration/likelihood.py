@@ -20,6 +20,37 @@ from gyro_calibration.motion import Motion
 
 
 @dataclass(frozen=True)
+class Goodness:
+    """
+    Whether what a fit leaves is what the known noise explains.
+
+    Attributes
+    ----------
+    chi_square : sum of squares of the residual over the variance that is known
+    freedom : degrees of freedom
+    probability : of as much, or more, by chance
+    noise_ratio : noise that adds up in the heading, over what is known of it; what repeats or averages out is not in it
+
+    """
+
+    chi_square: float
+    freedom: int
+    probability: float
+    noise_ratio: float
+
+    def __str__(self) -> str:
+        """Return a sentence for people."""
+        told = ('what the noise explains' if self.probability > UNLIKELY else
+                'more than the noise explains: the robot follows the profile less well than the gyro measures, or shakes')
+        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with {self.freedom} degrees of freedom, probability '
+                f'{self.probability:.2g}; noise {self.noise_ratio:.2f} times what is known)')
+
+
+#: A residual that is less probable is said to be more than the noise explains.
+UNLIKELY = 1e-3
+
+
+@dataclass(frozen=True)
 class Fit:
     """
     What a method found.
@@ -30,9 +61,15 @@ class Fit:
     covariance : of (s, b), shape (2, 2); nan where the method gives none
     time_offset : the gyro lags the profile by so much, s
     angle_random_walk, reference_noise : as the run shows them, rad/√s and rad in one reading
-    residual : largest stretch that turned otherwise than the profile, rad, and how unlikely it is, in standard deviations
+    residual : how far the unlikeliest stretch turned otherwise than the profile, rad, and how unlikely it is, in standard deviations
     time_offset_deviation : standard deviation of the time offset, s
     influence : what the noise of each block did to (s, b), shape (n, 2), and the times of the blocks, s, shape (n,), as one array (n, 3)
+    stretch : that stretch, from and to, s
+    start_heading, start_heading_deviation : true heading where gyro and reference begin, from the reference's first heading, and its
+        standard deviation, rad; nan against a profile, which says itself where it begins
+    squares, freedom : sum of squares that the fit leaves, in units of what white noise of 1 rad/√s would, and its degrees of freedom
+    goodness : whether that is what the noise explains; None where the noise is not known
+    repeating : the heading is off by so much again and again with the motion, rad, where that spoiled the bias of the blocks
 
     """
 
@@ -45,6 +82,13 @@ class Fit:
     residual: tuple[float, float] = (0.0, 0.0)
     time_offset_deviation: float = math.nan
     influence: Array = field(default_factory=lambda: np.empty((0, 3)))
+    stretch: tuple[float, float] = (0.0, 0.0)
+    start_heading: float = math.nan
+    start_heading_deviation: float = math.nan
+    squares: float = math.nan
+    freedom: int = 0
+    goodness: Goodness | None = None
+    repeating: float = 0.0
 
 
 #: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a robot's life.
@@ -81,6 +125,7 @@ class _Increments:
     walk, neighbours : variance of the increments of a random walk, and covariance of each with the one before, s, shape (n,)
     reference : variance of the reference in each block, up to one factor, shape (n + 1,)
     time : of the blocks, s, shape (n + 1,)
+    since : from the first point to the first block: heading, time and what the shared errors add in that block, then what the gyro turned
 
     """
 
@@ -92,10 +137,17 @@ class _Increments:
     neighbours: Array
     reference: Array
     time: Array
+    since: Array
 
 
 #: Longest block, s. What a run does within it (vibration, backlash, an eccentric encoder) is no random walk and must not be taken for one.
-_BLOCK = 0.5
+BLOCK = 0.5
+#: Standard deviations of what is assumed beforehand: of the error of the delay that is being found, s, and of the lag, s².
+DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
+
+
+#: Two offsets fit alike if one leaves at most so many times what the other does.
+_ALIKE = 1.5
 
 
 class _Pairing:
@@ -103,10 +155,10 @@ class _Pairing:
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
         self._time, self._rate = time, rate
-        self._prior = np.array([math.inf, math.inf, 0.1, lag])
+        self._prior = np.array([math.inf, math.inf, DELAY_DEVIATION, lag])
         self._integral, self._interval = integrate(time, rate), float(np.median(np.diff(time)))
         self.sampled = motion.rate is None
-        self._block = _block(motion)
+        self._block = block_length(motion)
         self._points = _points(motion, self._block)
 
     def increments(self, offset: float, lag: float = 0.0) -> _Increments:
@@ -121,7 +173,7 @@ class _Pairing:
         kept = (at >= self._time[0]) & (at <= self._time[-1])
         time, weight = points.time[kept], 1.0 / points.variance[kept]
         if len(time) < 2:
-            return _Increments(np.empty((0, 4)), *np.empty((7, 0)))
+            return _Increments(np.empty((0, 4)), *np.empty((8, 0)))
         begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block + 1e-6), prepend=-1.0))
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
@@ -132,7 +184,8 @@ class _Pairing:
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk(time, weight, begins)
-        return _Increments(columns, prior, expected, np.diff(means[:, 4]), *walk, 1.0 / precision, means[:, 1])
+        since = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:], [means[0, 4] - known[0, 4]]])
+        return _Increments(columns, prior, expected, np.diff(means[:, 4]), *walk, 1.0 / precision, means[:, 1], since)
 
     def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate that is linear between the samples, the first and last without the lag."""
@@ -144,9 +197,23 @@ class _Pairing:
         return rate + constant * acceleration, acceleration, integral + constant * rate
 
     def coarse_offset(self, largest: float) -> float:
-        """Return the offset, s, at which most increments fit; a slip does not count more than the blocks that it is in."""
-        offsets = np.arange(-round(largest / 0.02), round(largest / 0.02) + 1) * 0.02
-        return float(min(offsets, key=lambda offset: (self._misfit(offset), abs(offset))))
+        """
+        Return the offset, s, at which most increments fit; a slip does not count more than the blocks that it is in.
+
+        A motion that repeats itself fits at several offsets, about alike: the smallest of these is taken.
+
+        """
+        step = 0.02 if self.sampled else 0.04  # what a profile says is smoother than what was measured
+        offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
+        misfits = np.array([self._misfit(offset) for offset in offsets])
+        beside = np.pad(misfits, 1, constant_values=math.inf)
+        bottoms = offsets[(misfits <= np.minimum(beside[:-2], beside[2:])) & (misfits <= 6.0 * misfits.min())]
+        if len(bottoms) < 2 or math.isinf(misfits.min()):
+            return float(offsets[misfits.argmin()])
+        fine = np.arange(-5, 6) * 0.002
+        deepest = [min((self._misfit(offset), offset) for offset in bottom + fine) for bottom in bottoms]
+        alike = [offset for misfit, offset in deepest if misfit <= _ALIKE * min(deepest)[0]]
+        return float(min(alike, key=abs))
 
     def _misfit(self, offset: float) -> float:
         data = self.increments(offset)
@@ -155,9 +222,9 @@ class _Pairing:
         return float(np.mean(np.abs(robust_residual(data.columns[:, :2], data.turned, 3))))
 
 
-def _block(motion: Motion) -> float:
+def block_length(motion: Motion) -> float:
     """Return the length of a block, s: short enough that the means over blocks keep what the heading varies by."""
-    block = min(_BLOCK, motion.duration / 40.0)
+    block = min(BLOCK, motion.duration / 40.0)
     time = np.arange(0.0, motion.duration, block / 64.0)
     heading = motion.heading_at(time[:len(time) // 64 * 64]).reshape(-1, 64)
     whole, within = np.var(heading), [np.var(heading.reshape(-1, size), axis=1).mean() for size in (64, 32, 16, 8, 4)]
@@ -354,7 +421,7 @@ def _away_from_zero(scale: float) -> float:
 
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
-                   lag: float = 0.1) -> Fit:
+                   lag: float = LAG_DEVIATION) -> Fit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -381,7 +448,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
 
     """
     pairing = _Pairing(time, rate, motion, lag)
-    offset, found_lag = pairing.coarse_offset(largest_time_offset), 0.0
+    offset, found_lag = pairing.coarse_offset(largest_time_offset + (0.0 if pairing.sampled else FOLLOWING)), 0.0
     for _ in range(8):
         data = pairing.increments(offset, found_lag)
         if len(data.turned) < 10:
@@ -398,26 +465,99 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
         np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
     scale, bias = estimate.values[:2]
+    residual, stretch = _worst_stretch(estimate.noise, data, pairing.sampled)
     return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset, math.sqrt(estimate.rate_variance),
                math.sqrt(estimate.rate_variance * estimate.noise.ratio) / abs(_away_from_zero(scale)),
-               _worst_stretch(estimate.noise, data), math.sqrt(covariance[2, 2]), np.column_stack([estimate.influence, data.time[1:]]))
+               residual, math.sqrt(covariance[2, 2]), np.column_stack([estimate.influence, data.time[1:]]), stretch,
+               *(_start_heading(data, estimate) if pairing.sampled else (math.nan, math.nan)),
+               *_squares(data, estimate, pairing.sampled))
 
 
-def _worst_stretch(noise: _Covariance, data: _Increments) -> tuple[float, float]:
+#: A robot that follows its profile by a lag is later than it began by up to this, s.
+FOLLOWING = 0.25
+
+
+def _squares(data: _Increments, estimate: _Estimate, sampled: bool) -> tuple[float, int]:
+    """Return the weighted sum of squares and its degrees of freedom: of rate noise alone against a profile, which has no noise itself."""
+    if not sampled:
+        estimate = _estimate(data, _Covariance(data, 0.0), data.columns)
+    used = len(data.prior) + sampled  # the ratio of the noises is found too
+    return float(estimate.residual @ estimate.noise.solve(estimate.residual)), len(data.turned) - used
+
+
+def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
     """
-    Return the largest stretch of the run that turned otherwise than the profile beyond chance, rad, and its size in standard deviations.
+    Return the true heading where gyro and reference begin, from the reference's first heading, and its standard deviation, rad.
 
-    All stretches of a few lengths are looked at. Fit and scale are robust, so that a slip does not hide itself.
+    What the noise of the first block's heading is expected to be, given all that follows, is taken off it, and then what the gyro turned
+    before that block.
 
     """
-    residual = robust_residual(data.columns[:, :4], data.turned, 20)
-    whitened = np.concatenate([[0.0], np.cumsum(noise.whiten(residual))])
-    turned = np.concatenate([[0.0], np.cumsum(residual)])
-    scale = max(float(np.median(np.abs(np.diff(whitened)))) / 0.6745, 1e-15)
-    worst = (0.0, 0.0)
-    for length in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000):
-        if length < len(whitened) / 2:
-            sizes = np.abs(whitened[length:] - whitened[:-length]) / (scale * math.sqrt(length))
-            turns = np.where(sizes > CHANCE, np.abs(turned[length:] - turned[:-length]), 0.0)
-            worst = max(worst, (float(turns.max()), float(sizes[turns.argmax()])))
-    return worst
+    heading, since, shared, turned = data.since[0], data.since[1], data.since[2:-1], data.since[-1]
+    scale, bias = _away_from_zero(estimate.values[0]), estimate.values[1]
+    prior, first = estimate.noise.ratio * data.reference[0], np.eye(len(data.turned))[0]
+    error = prior * float(estimate.noise.solve(estimate.residual)[0])
+    weighted = estimate.noise.solve(data.columns)
+    left = float(estimate.noise.solve(first)[0]) - weighted[0] @ np.linalg.pinv(weighted.T @ data.columns, rcond=1e-14) @ weighted[0]
+    variance = estimate.rate_variance * (max(prior - prior ** 2 * left, 0.0) + since / 3.0) + since ** 2 * estimate.covariance[1, 1]
+    variance += shared @ estimate.covariance[4:, 4:] @ shared
+    start = heading + (shared @ estimate.values[4:] - error - turned + bias * since) / scale
+    return float(start), math.sqrt(variance) / abs(scale)
+
+
+def _worst_stretch(noise: _Covariance, data: _Increments, sampled: bool) -> tuple[tuple[float, float], tuple[float, float]]:
+    """
+    Return how far the unlikeliest stretch turned otherwise than the profile, rad, its size in standard deviations, and its times, s.
+
+    The values are fitted together with what each stretch turned too far, so that a slip does not hide itself, and the size of chance is
+    taken from a robust fit.
+
+    """
+    robust = noise.whiten(robust_residual(data.columns[:, :4], data.turned, 20))
+    chance = max(float(np.median(np.abs(robust))) / 0.6745 * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
+    edges = np.unique(np.linspace(0, len(robust), min(len(robust), _EDGES) + 1).astype(int))
+    interval = data.columns[:, 1]
+    steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
+    first, last, rate, squares, left = unlikeliest(noise.whiten(data.columns), noise.whiten(steps), noise.whiten(data.turned))
+    if sampled:  # noise that comes with turning alone, such as the slip of wheels, is larger than a robust size of it says
+        chance = max(chance, math.sqrt(max(left, 0.0) / (len(robust) - 4.0)))
+    begin, end = edges[first], edges[last]
+    turned = abs(rate) * float(interval[begin:end].sum())
+    return (turned, math.sqrt(squares) / chance), (float(data.time[begin]), float(data.time[end]))
+
+
+#: Stretches begin and end at so many places of a run at most.
+_EDGES = 150
+
+
+def unlikeliest(columns: Array, steps: Array, turned: Array) -> tuple[int, int, float, float, float]:
+    """
+    Return the stretch that a fit is best told apart, what it turned too fast, rad/s, and the squares that this takes off the residual.
+
+    Parameters
+    ----------
+    columns : of the fit, white, shape (n, k)
+    steps : what a turn of 1 rad/s that begins at each edge and goes on adds, white, shape (n, m); the last edge is the end
+    turned : what is fitted, white, shape (n,)
+
+    Returns
+    -------
+    from which edge, to which edge, rate, squares, and the squares that are left then
+
+    """
+    left, singular, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    left = left[:, singular > 1e-7]
+    apart = steps - left @ (left.T @ steps)
+    sums, products, whole = apart.T @ turned, apart.T @ apart, steps.T @ steps
+    differences = sums[:, None] - sums
+    norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix for matrix in (products, whole))
+    # one that scale and bias explain nearly as well cannot be told, nor one that has no length
+    told = np.triu(norms > _APART * wholes, 1)
+    gains = np.where(told, differences ** 2 / np.where(told, norms, 1.0), 0.0)
+    first, last = np.unravel_index(int(gains.argmax()), gains.shape)
+    rate, gain = float(differences[first, last] / max(norms[first, last], 1e-300)), float(gains[first, last])
+    return int(first), int(last), rate, gain, float(turned @ turned - np.sum((left.T @ turned) ** 2)) - gain
+
+
+#: Part of a stretch that the columns of a fit must leave, so that it can be told from them; what is left less of turns far by chance.
+_APART = 0.2

@@ -1,7 +1,4 @@
-"""
-Calibration against an encoder: what was put in is found, with true intervals, on simulated logs and on measured ones.
-
-"""
+"""Calibration against an encoder: what was put in is found, with true intervals, on simulated logs and on measured ones."""
 
 import math
 import runpy

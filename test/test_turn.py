@@ -281,6 +281,24 @@ def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model,
     assert answer['static_rad_per_turn'] == pytest.approx(expected, abs=5e-3)
 
 
+def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_path):
+    """A supply that is higher while it turns one way would pass for an error of that way, by the means of dwells alone."""
+    (tmp_path / 'model.yaml').write_text('effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
+    time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
+    motion = from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
+    log = simulate(GyroModel(), motion, 50.0, np.random.default_rng(2))
+    supply = np.where(np.abs(log.time - 20.0) < 11.0, 6.0, 5.0)
+    write_log(tmp_path / 'log.csv', replace(log, output=log.output + 0.01 * (supply - 5.0), supply=supply))
+    answer = json.loads(run(tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json')[1])
+    assert answer['static']['largest_rad_per_turn'] > 0.1 and answer['modelled']['largest_rad_per_turn'] < 1e-9
+
+
+def test_a_table_of_counts_alone_is_wrong_use_that_names_the_sensitivity(run, tmp_path):
+    (tmp_path / 'table.csv').write_text('gyro_counts,reference_rate_dps\n1,0\n102,10\n')
+    code, text, error = run(tmp_path / 'table.csv')
+    assert code == 2 and not text and '--sensitivity' in error
+
+
 def test_a_log_without_a_reference_is_refused(run, tmp_path):
     (tmp_path / 'log.csv').write_text('gyro_dps\n1.0\n2.0\n3.0\n')
     code, text, error = run(tmp_path / 'log.csv')

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-import hashlib
 import io
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,14 +14,16 @@ import numpy as np
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.files import write_atomically
-from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.log import DEGREE, Array, Log, Mask
+from gyro_calibration.log_compensation import compensate_log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.picture import draw_turn_errors
 from gyro_calibration.scatter import not_outlying
 from gyro_calibration.selection import select_effects
+from gyro_calibration.storage import files_of
 from gyro_calibration.turn import SLOWEST, Size, TurnErrors, predicted_rates, size, turn_errors
-from gyro_calibration.verbs.verb import Answer, add_log, picture_file, positive, read, verb
+from gyro_calibration.verbs.verb import Answer, add_log, digest, output_of, picture_file, positive, read, verb
 
 TURN = 2.0 * math.pi
 #: Temperatures go into this many bins at most.
@@ -46,8 +46,10 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _turn(given: argparse.Namespace) -> Answer:
-    found = dwells(read(given))
-    rate, kept, remarks, data = _fitted(found) if given.model is None else _as_given(given, read_model(given.model), found)
+    log = read(given)
+    output_of(given, log)  # counts alone are wrong use here, as for other verbs
+    found = dwells(log)
+    rate, kept, remarks, data = _fitted(found) if given.model is None else _as_given(given, read_model(given.model), log, found)
     errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
     if given.out:
         _write(given.out, errors)
@@ -69,7 +71,7 @@ def _fitted(found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     return predicted_rates(calibration), calibration.scatter.kept, [remark], {'effects': names, 'left_out': True}
 
 
-def _as_given(given: argparse.Namespace, model: GyroModel, found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+def _as_given(given: argparse.Namespace, model: GyroModel, log: Log, found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by a given model, which dwells are not outlying, and what to say of it."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
@@ -81,13 +83,19 @@ def _as_given(given: argparse.Namespace, model: GyroModel, found: Dwells) -> tup
         remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated temperatures; the nearest end was used')
     if beyond:
         remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; the correction is extrapolated')
-    return result.rate, not_outlying(found), remarks, {'effects': names, 'left_out': False, 'temperature_clipped': clipped,
-                                                            'beyond_range': beyond}
+    rate = _around(model, log, found) if model.looks_around else result.rate
+    return rate, not_outlying(found), remarks, {'effects': names, 'left_out': False, 'temperature_clipped': clipped, 'beyond_range': beyond}
+
+
+def _around(model: GyroModel, log: Log, found: Dwells) -> Array:
+    """Return rates by a model that looks at more than the means of dwells tell, such as the past: the log is compensated row by row."""
+    error = np.asarray(log.output) - compensate_log(model, log)
+    return found.output - np.array([error[rows].mean() for rows in found.rows])
 
 
 def _acquainted(model: GyroModel, log: str) -> str:
     """Say whether the model was fitted to the log, by the sums of the files that it comes from."""
-    if hashlib.sha256(Path(log).read_bytes()).hexdigest() in str(model.origin):
+    if any(file.is_file() and digest(file) in str(model.origin) for file in files_of(log)):
         return '; it was fitted to this log, so that these are errors of a fit, not of a prediction'
     return '' if 'sha256' in str(model.origin) else '; if it was fitted to this log, these are errors of a fit, not of a prediction'
 
