@@ -1,7 +1,4 @@
-"""
-From dwells to a gyro's model: the values of given effects, how well they are known, and how well they predict sweeps left out.
-
-"""
+"""From dwells to a gyro's model: the values of given effects, how well they are known, and how well they predict sweeps left out."""
 
 from __future__ import annotations
 
@@ -163,6 +160,7 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
     _refuse_few(dwells, terms)
     scatter = scatter or find_scatter(dwells)
     used = take(dwells, scatter.kept)
+    _refuse_few(used, terms)
     whitener = Whitener(used, scatter)
     return _calibration(dwells, _solve(used, _search(used, terms), whitener), scatter, whitener)
 

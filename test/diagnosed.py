@@ -1,7 +1,4 @@
-"""
-Hidden logs put to the diagnosis, and how right its answers are; for the tests and for `benchmarks/diagnosis.py`.
-
-"""
+"""Hidden logs put to the diagnosis, and how right its answers are; for the tests and for `benchmarks/diagnosis.py`."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from hidden import OUTSIDE, Cause, HiddenLog
-from hidden.effects import AGAINST_A_MODEL, COUNTED, WITHOUT_COLUMN
+from hidden.effects import AGAINST_A_MODEL, COUNTED, STEPPED, WITHOUT_COLUMN
 
 from gyro_calibration.diagnosis.finding import Diagnosis, Finding
 from gyro_calibration.diagnosis.steps import diagnose
@@ -24,8 +21,8 @@ from gyro_calibration.noise import Noise
 SAME = {'reference_scale': 'scale_factor_error'}
 #: An answer with more names is no answer.
 LARGEST_SET = 3
-#: What has no size that an interval could hold.
-WITHOUT_SIZE = {*COUNTED, 'unit_error', 'bias_instability'}
+#: What has no size that an interval could hold: what is counted, steps that are read off, and what has none.
+WITHOUT_SIZE = {*COUNTED, *STEPPED, 'unit_error', 'bias_instability'}
 #: A diagnosis holds out one of so many blocks, of so many s.
 EVERY, BLOCK = 3, 60.0
 
@@ -136,7 +133,7 @@ def held(causes: Iterable[Cause], findings: Sequence[Finding], deviations: float
     told = {}
     for cause in causes:
         estimate = None if cause.name in WITHOUT_SIZE else by_name.get(cause.name)
-        if estimate is not None and estimate.interval[0] < estimate.interval[1]:
+        if estimate is not None:
             half = 0.5 * (estimate.interval[1] - estimate.interval[0]) * deviations / 1.96
             size = abs(cause.size) if 'phase' in cause.shapes else cause.size
             told[cause.name] = bool(abs(estimate.estimate - size) <= half)

@@ -1,7 +1,4 @@
-"""
-Allan deviation, and the noise figures in it, against textbook definitions, simulated noise with known truth, and recordings.
-
-"""
+"""Allan deviation, and the noise figures in it, against textbook definitions, simulated noise with known truth, and recordings."""
 
 import json
 import math
@@ -15,6 +12,7 @@ from gyro_calibration.command_line import main
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
+from gyro_calibration.stamps import number_stamps
 
 INTERVAL = 0.01
 WHITE = Noise(1e-3)
@@ -165,12 +163,38 @@ def test_lost_samples_are_counted_and_do_not_change_the_figures():
     np.testing.assert_allclose(*(allan_deviation(each, INTERVAL, times).deviation for each in (record.rate, rate)), rtol=0.05)
 
 
+@pytest.mark.parametrize('jitter', [0.0, 0.1])
+@pytest.mark.parametrize('share', [0.02, 0.05, 0.1, 0.19])
+def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
+    generator = np.random.default_rng(int(1000 * share))
+    rate, kept = simulate_noise(WHITE, 60_000, INTERVAL, generator), generator.random(60_000) > share
+    kept[[0, -1]] = True
+    record = even_record((stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
+    assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and np.isnan(record.rate).sum() == pytest.approx((~kept).sum(), abs=3)
+    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(1e-3, rel=0.015)
+
+
+@pytest.mark.parametrize('every', [8, 20])
+def test_one_lost_sample_of_so_many_is_seen(every):
+    kept = np.arange(10_000) % every != 1
+    assert number_stamps(stamps(10_000)[kept]).lost.sum() == (~kept).sum()
+
+
 def test_two_records_hours_apart_are_not_taken_for_one():
     rate = simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11)) + np.where(np.arange(40_000) < 20_000, 0.0, 0.1)
     record = even_record(stamps(40_000) + np.where(np.arange(40_000) < 20_000, 0.0, 1e7), rate)
     assert len(record.rate) < 50_000
     fit = fit_noise(record.rate, record.interval)
     assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.03) and not any(fit.figures[symbol].value for symbol in 'BKQR')
+
+
+def test_every_averaging_time_of_a_chart_has_an_upper_bound_however_few_windows_fit_between_gaps():
+    """Of two records in one, the first is just long enough for a window or two over the longest averaging times."""
+    for first in range(2600, 2720, 8):
+        time = stamps(4000) + np.where(np.arange(4000) < first, 0.0, 1e3)
+        record = even_record(time, simulate_noise(WHITE, 4000, INTERVAL, np.random.default_rng(first)))
+        chart = allan_deviation(record.rate, record.interval)
+        assert chart.degrees_of_freedom.min() > 0.99 and np.isfinite(chart.upper).all()
 
 
 def bursts(count):

@@ -1,7 +1,4 @@
-"""
-Calibration from dwells: on simulated rate tables whose truth is known, and beside plain least squares.
-
-"""
+"""Calibration from dwells: on simulated rate tables whose truth is known, and beside plain least squares."""
 
 import math
 import runpy

@@ -198,6 +198,18 @@ def test_slow_samples_are_enough(every, generator):
     assert np.allclose(found.rate / DEGREE, RATES) and (np.abs(errors(found)) < 5.0).all()
 
 
+@pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
+def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_said(reference, generator):
+    log = run(generator, **references(generator)[reference])
+    quantity = 'reference_rate' if reference == 'rate' else 'reference_heading'
+    given = np.where(np.arange(len(TIME)) % 5 == 0, getattr(log, quantity), np.nan)
+    given[25000:25040] = np.nan
+    found = find_dwells(replace(log, **{quantity: given}))
+    assert len(found) == len(RATES) and (np.abs(errors(found)) < 5.0).all()
+    assert [remark for remark in found.remarks if 'lost' in remark] == [
+        'the reference was lost once, for 44 samples, at 249.96 s; they are left out']
+
+
 def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
     log = run(generator)
     found, same = find_dwells(replace(log, output=-log.output)), find_dwells(log)

@@ -1,7 +1,4 @@
-"""
-Every effect's formula, and the one recovery test that all of them pass: simulate, compensate, and the rate is back.
-
-"""
+"""Every effect's formula, and the one recovery test that all of them pass: simulate, compensate, and the rate is back."""
 
 import math
 from dataclasses import replace
@@ -124,6 +121,15 @@ def test_moving_the_stamps_undoes_a_delay_and_a_wrong_clock(name, value):
     model, time, rate, output = distorted(name, value)
     assert np.abs(output - rate).max() > 0.01
     inside = (time > 0.1) & (time < 9.8)
+    assert output[inside] == pytest.approx(np.sin(1.7 * model.true_time(time[inside])), abs=1e-6)
+
+
+@pytest.mark.parametrize('names', [('time_offset', 'clock_rate'), ('clock_rate', 'time_offset')], ids='-'.join)
+def test_a_delay_and_a_wrong_clock_are_undone_in_the_order_of_the_model(names):
+    values = {'time_offset': 0.5, 'clock_rate': 0.05}
+    model, time = GyroModel(tuple(Term(CATALOGUE[name], (values[name],)) for name in names)), np.arange(0.0, 10.0, 1e-3)
+    output = model.distorted('rate', np.sin(1.7 * time), time)
+    inside = (time > 1.0) & (time < 8.0)
     assert output[inside] == pytest.approx(np.sin(1.7 * model.true_time(time[inside])), abs=1e-6)
 
 

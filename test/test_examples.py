@@ -1,7 +1,4 @@
-"""
-The examples of the documents run as they stand, each in an empty folder.
-
-"""
+"""The examples of the documents run as they stand, each in an empty folder."""
 
 import os
 import subprocess

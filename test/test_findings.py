@@ -96,8 +96,10 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     errors = {} if gain is None else {what: gain[f'{what}_rms'] for what in ('rate', 'heading') if gain[f'{what}_rms']}
     assert set(errors) == {what for what, *_ in GAINS.get(recording, [])}
     for what, before, after, won in GAINS.get(recording, []):
-        _, low, high = numbers(won)[0]
+        _, *interval = numbers(won)[0]
+        assert bool(interval) == (errors[what]['ci95'] is not None)
+        width = interval[1] - interval[0] if interval else 0.0
         for text, moment in ((before, 'before'), (after, 'after')):
             (size,), form = numbers(text)
             (now,), unit = numbers(amount(errors[what][moment], {'rate': 'rad/s', 'heading': 'rad'}[what]))
-            assert unit == form and abs(now - size) <= max(0.25 * (high - low), 0.03 * size), (what, moment, now)
+            assert unit == form and abs(now - size) <= max(0.25 * width, 0.03 * size), (what, moment, now)

@@ -1,7 +1,4 @@
-"""
-The verb fit, as people and other programs call it.
-
-"""
+"""The verb fit, as people and other programs call it."""
 
 import json
 import runpy

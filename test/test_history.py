@@ -1,7 +1,4 @@
-"""
-Channels with a memory: against responses that are known exactly, and the same for a stream, a log, and its blocks.
-
-"""
+"""Channels with a memory: against responses that are known exactly, and the same for a stream, a log, and its blocks."""
 
 import time as clock
 

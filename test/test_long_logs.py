@@ -1,7 +1,4 @@
-"""
-Logs of any length: the verb compensate takes them block by block, and needs no more memory for a longer one.
-
-"""
+"""Logs of any length: the verb compensate takes them block by block, and needs no more memory for a longer one."""
 
 import itertools
 import math

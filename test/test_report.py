@@ -1,7 +1,4 @@
-"""
-The report of a diagnosis: one page that needs nothing else, looked at in a browser as people do, on a phone and on a desk.
-
-"""
+"""The report of a diagnosis: one page that needs nothing else, looked at in a browser as people do, on a phone and on a desk."""
 
 import base64
 import json
@@ -306,11 +303,13 @@ def test_a_chance_is_said_in_words(probability, words):
     assert chance(probability) == words
 
 
-@pytest.mark.parametrize('interval, words', [((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'within chance'), ((-0.02, -0.01), 'worse')])
+@pytest.mark.parametrize('interval, words', [
+    ((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'too few or too uneven'), ((-0.02, -0.01), 'worse'), (None, 'no interval')])
 def test_a_gain_is_called_what_it_is(interval, words):
     whole = extended()
     gain = replace(whole.gain, heading=replace(whole.gain.heading, interval=interval))
-    assert words in headline(replace(whole, gain=gain))[1]
+    changed = replace(whole, gain=gain)
+    assert words in headline(changed)[1] and words in Page(report(changed)).text
 
 
 def test_lines_for_a_terminal_are_not_too_long(made):
@@ -321,10 +320,7 @@ def test_lines_for_a_terminal_are_not_too_long(made):
 # the page in a browser
 
 class Browser:
-    """
-    Chromium without a window, spoken to through a pipe in its own protocol; what it asks the network for and complains of is kept.
-
-    """
+    """Chromium without a window, spoken to through a pipe in its own protocol; what it asks the network for and complains of is kept."""
 
     def __init__(self, folder):
         there, self._out = os.pipe()

@@ -1,7 +1,4 @@
-"""
-The sources worked through again: each number is what a small computation of its own gives, and verdicts can fail.
-
-"""
+"""The sources worked through again: each number is what a small computation of its own gives, and verdicts can fail."""
 
 import ast
 import json

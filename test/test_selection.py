@@ -1,7 +1,4 @@
-"""
-The choice of effects: what is there is found, what is not there is not, and what cannot be told is said.
-
-"""
+"""The choice of effects: what is there is found, what is not there is not, and what cannot be told is said."""
 
 import runpy
 from dataclasses import replace

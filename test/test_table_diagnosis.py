@@ -12,16 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import binom
+from scipy.stats import t as student
 
 from gyro_calibration.calibration import fit_effects
+from gyro_calibration.diagnosis import dwell_rest
 from gyro_calibration.diagnosis import table as diagnosis
 from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.dwells import join
-from gyro_calibration.effects import CATALOGUE, STEADY, rate_temperature_polynomial
-from gyro_calibration.log import DEGREE, DataRefused
-from gyro_calibration.model import GyroModel, Term, same_effects
+from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, STEADY, rate_temperature_polynomial
+from gyro_calibration.log import DEGREE, DataRefused, Log
+from gyro_calibration.model import GyroModel, SelfCalibration, Term, same_effects
 from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.scatter import rms
+from gyro_calibration.scatter import Scatter, rms
 
 BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
 RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py')) for name in ('recovery', 'rate_table'))
@@ -53,7 +55,7 @@ def gyro(name, size):
 
 def diagnosed(table, truth, generator, model=None):
     """Return the diagnosis of a simulated table."""
-    return diagnose_table(table.measure(truth, generator), model, generator)
+    return diagnose_table(table.measure(truth, generator), model)
 
 
 def members(finding):
@@ -89,7 +91,7 @@ def test_where_nothing_is_hidden_hardly_anything_is_found(scatter):
 def test_a_true_model_is_adequate_and_stays_as_it_is():
     model = replace(gyro('cubic_nonlinearity', -0.005), covariance=None)
     found = diagnosed(WANDERING, model, np.random.default_rng(3), model)
-    assert found.verdict == 'adequate' and found.gain is None and same_effects(found.before, found.model)
+    assert found.verdict == 'adequate' and found.gain is None and found.model is model
 
 
 # sets, and what parts them
@@ -97,7 +99,7 @@ def test_a_true_model_is_adequate_and_stays_as_it_is():
 def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(without_gain):
     generator, truth = np.random.default_rng(4), gyro('sine_response', 0.25)
     table = Table().measure(truth, generator)
-    (found,) = diagnose_table(table, None, generator).findings
+    (found,) = diagnose_table(table, None).findings
     assert members(found) >= {'sine_response', 'cubic_nonlinearity'}
     (rate,) = (float(number) * DEGREE for number in re.findall(r'each way at (\d+) deg/s', found.separate_by))
     # Five standard deviations are aimed at, four needed: made twice, they leave nothing to chance.
@@ -105,7 +107,7 @@ def test_a_sine_and_a_cubic_are_a_set_until_the_proposed_dwells_are_added(withou
     fast = np.tile([rate, -rate], 4)
     noise = more.output - truth.output(more.rate, more.temperature)
     more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
-    (found,) = diagnose_table(join([table, more]), None, generator).findings
+    (found,) = diagnose_table(join([table, more]), None).findings
     assert members(found) == {'sine_response'}
 
 
@@ -120,10 +122,10 @@ def test_asymmetry_and_a_parabola_are_a_set_where_it_is_small(without_gain):
 def test_a_drift_while_the_table_heats_is_temperature_or_time_until_it_cools_again(without_gain):
     generator, truth = np.random.default_rng(6), gyro('bias_temperature', 1e-4)
     up = Table().measure(truth, generator)
-    (found,) = diagnose_table(up, None, generator).findings
+    (found,) = diagnose_table(up, None).findings
     assert members(found) >= {'bias_temperature', 'rate_ramp'} and 'cool' in found.separate_by
     down = replace(Table(), temperatures=Table().temperatures[::-1]).measure(truth, generator)
-    (found,) = diagnose_table(join([up, down]), None, generator).findings
+    (found,) = diagnose_table(join([up, down]), None).findings
     assert members(found) == {'bias_temperature'}
 
 
@@ -132,15 +134,28 @@ def test_a_scale_factor_may_always_be_that_of_the_reference(without_gain):
     assert members(found.findings[0]) == {'scale_factor_error', 'reference_scale'}
 
 
+def test_a_factor_that_may_be_of_the_gyro_stays_in_the_scale_factor_of_a_model(without_gain):
+    found = diagnosed(Table(), GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.024,)))), np.random.default_rng(8))
+    terms = {term.effect.name: term.values for term in found.model.terms}
+    assert 'unit_error' in names(found) and terms['scale_factor_error'][0] == pytest.approx(0.024, abs=1e-3)
+    assert any('was not multiplied' in said for said in found.remarks)
+
+
+def test_a_model_of_a_mended_table_says_what_its_output_was_multiplied_by(without_gain):
+    table = Table().measure(gyro('scale_factor_asymmetry', 0.02), np.random.default_rng(8))
+    found = diagnose_table(replace(table, output=-table.output), None)
+    assert found.model.origin['output_multiplied_by'] == [-1.0] and any('was multiplied by -1' in said for said in found.remarks)
+
+
 # models that are put to the test
 
 def test_a_value_that_the_model_has_wrong_is_put_right(without_gain):
     generator, truth = np.random.default_rng(8), gyro('sine_response', 0.3)
     found = diagnosed(WANDERING, truth, generator, gyro('sine_response', 0.25))
     assert names(found) == ['sine_response']
-    low, high = found.findings[0].parameters['k'].interval
-    assert low < 0.3 < high and found.before.terms[-1].values == (0.25, 1.0)
-    assert found.model.terms[-1].values[0] == found.findings[0].parameters['k'].estimate and len(found.model.terms) == 3
+    change = found.findings[0].parameters['k']
+    assert change.interval[0] < 0.05 < change.interval[1] and found.before.terms[-1].values == (0.25, 1.0)
+    assert found.model.terms[-1].values[0] == pytest.approx(0.25 + change.estimate) and len(found.model.terms) == 3
 
 
 def test_a_sine_in_the_model_gives_way_to_the_cubic_that_is_there(without_gain):
@@ -160,6 +175,13 @@ def test_effects_are_named_on_top_of_a_polynomial(without_gain):
     assert low < 5e-4 < high and len(found.model.covariance) == sum(len(term.fitted) for term in found.model.terms)
 
 
+def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_before(without_gain):
+    model = replace(GyroModel(LINEAR), temperature_range=(20.0, 30.0), self_calibration=SelfCalibration(0.01), origin={'date': '2025'})
+    found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(21), model).model
+    assert found.temperature_range == (20.0, pytest.approx(47.0)) and found.self_calibration is None
+    assert found.origin['before'] == [{'date': '2025'}]
+
+
 def test_what_dwells_cannot_test_of_a_model_is_left_and_said(without_gain):
     model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
     found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(11), model)
@@ -173,31 +195,65 @@ def test_what_is_not_in_the_catalogue_gets_no_name(waves):
     generator = np.random.default_rng(12)
     table = Table().measure(GyroModel(LINEAR), generator)
     table = replace(table, output=table.output + 0.06 * DEGREE * np.sin(waves * table.rate + 1.0))
-    found = diagnose_table(table, None, generator)
+    found = diagnose_table(table, None)
     assert found.verdict == 'unexplained' and not found.findings
     assert found.unexplained[0].along in ('rate', 'single_rates') and found.unexplained[0].share_of_variance > 0.3
+
+
+def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_for(monkeypatch):
+    generator = np.random.default_rng(19)
+    table = Table().measure(GyroModel(LINEAR), generator)
+    table = replace(table, output=table.output + 0.03 * DEGREE * np.sin(6.0 * table.rate + 1.0))
+    fit = fit_effects(table, [term.effect for term in LINEAR])
+    certain, probes = np.zeros((np.count_nonzero(fit.scatter.kept), 1)), dwell_rest._probes(table)
+    found = dwell_rest.what_is_left(fit, 1e-3, certain).found[0]
+    monkeypatch.setattr(dwell_rest, '_probes', lambda dwells: {found.along: probes[found.along]})
+    alone = dwell_rest.what_is_left(fit, 1e-3, certain).found[0]
+    tried = sum(columns.shape[1] > 0 for columns in probes.values())
+    assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 
 
 def test_wild_dwells_and_wrong_units_are_said_and_not_fitted():
     generator = np.random.default_rng(13)
     table = Table().measure(GyroModel(LINEAR), generator)
     wild = table.output + np.where(np.arange(len(table)) == 50, 1.0 * DEGREE, 0.0)
-    found = diagnose_table(replace(table, output=wild * DEGREE), None, generator)
+    found = diagnose_table(replace(table, output=wild * DEGREE), None)
     assert names(found) == ['unit_error', 'outliers'] and 'row 51' in found.findings[1].evidence
     assert found.before.terms[1].values[0] == pytest.approx(0.01, abs=1e-3)
 
 
+def test_an_outlying_dwell_is_compared_with_what_the_others_foretell_of_it():
+    table, last = Table(sweeps=1, rates=13).measure(GyroModel(LINEAR), np.random.default_rng(21)), np.arange(13) == 12
+    table = replace(table, output=table.output + 0.4 * DEGREE * last)
+    fit = fit_effects(table, [term.effect for term in LINEAR], Scatter(0.03 * DEGREE, 0.0, 0.0, 0.0, ~last))
+    (found,) = diagnosis._outliers(table, fit, 1.0)
+    line, covariance = np.polyfit(table.rate[~last], (table.output - table.rate)[~last], 1, cov='unscaled')
+    off = (table.output - table.rate)[12] - np.polyval(line, table.rate[12])
+    deviation = 0.03 * DEGREE * np.sqrt(1.0 + [table.rate[12], 1.0] @ covariance @ [table.rate[12], 1.0])
+    # The scatter of 12 dwells is found about a parabola: their temperature rises as the rate does.
+    assert found.p_value == pytest.approx(13 * 2.0 * student.sf(abs(off) / deviation, 9))
+
+
 def test_tables_without_temperature_say_what_they_cannot_show():
     generator = np.random.default_rng(14)
-    found = diagnose_table(replace(Table().measure(GyroModel(LINEAR), generator), temperature=None), None, generator)
+    found = diagnose_table(replace(Table().measure(GyroModel(LINEAR), generator), temperature=None), None)
     assert 'temperature_degc' in found.cannot_show['bias_temperature'] and 'time' in found.cannot_show['thermal_lag']
     assert set(found.cannot_show) | set(STEADY) | {'outliers', 'unit_error'} == set(diagnosis.CAUSES)
+
+
+def test_a_table_with_columns_that_are_not_looked_at_is_not_told_that_it_has_none(without_gain):
+    table = Table().measure(GyroModel(LINEAR), np.random.default_rng(20))
+    steady = np.full(len(table), 5.0)
+    log = Log(output=table.output, reference_rate=table.rate, temperature=table.temperature, supply=steady, specific_force=steady)
+    told = diagnose_table(log, None).cannot_show
+    assert 'alone are looked at' in told['supply_sensitivity'] and 'alone are looked at' in told['acceleration_sensitivity']
+    assert not [reason for reason in told.values() if 'holds no' in reason]
 
 
 def test_a_table_of_one_rate_is_refused():
     table = Table().measure(GyroModel(LINEAR), np.random.default_rng(15))
     with pytest.raises(DataRefused, match='one rate'):
-        diagnose_table(replace(table, rate=np.zeros(len(table)), output=table.output - table.rate), None, np.random.default_rng(1))
+        diagnose_table(replace(table, rate=np.zeros(len(table)), output=table.output - table.rate), None)
 
 
 # what is won
@@ -219,7 +275,7 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
 # a measured table
 
 def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data):
-    found = diagnose_table(RATE_TABLE['table'](data), None, np.random.default_rng(17))
+    found = diagnose_table(RATE_TABLE['table'](data), None)
     assert [members(finding) for finding in found.findings] == [{'sine_response', 'cubic_nonlinearity'}, {'scale_factor_temperature'}]
     assert found.gain.rate.before == pytest.approx(0.67 * DEGREE, rel=0.03) and found.gain.rate.after < 0.051 * DEGREE
     assert '186 deg/s' in found.findings[0].separate_by
@@ -229,7 +285,7 @@ def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data
 
 def test_of_the_recorded_table_a_polynomial_leaves_single_rates_alone(data):
     dwells = RATE_TABLE['table'](data)
-    found = diagnose_table(dwells, fit_effects(dwells, [rate_temperature_polynomial(3, 2)]).model, np.random.default_rng(18))
+    found = diagnose_table(dwells, fit_effects(dwells, [rate_temperature_polynomial(3, 2)]).model)
     assert not found.findings and [each.along for each in found.unexplained] == ['single_rates']
-    assert any('4 values, predict left-out sweeps to 0.0454 deg/s' in remark and '12 values, to 0.0511' in remark
+    assert any('4 values, predict the rates of left-out sweeps to 0.0' in remark and '12 values, to 0.0511' in remark
                for remark in found.remarks)

@@ -16,6 +16,9 @@ from gyro_calibration.noise import ALLAN_FLOOR
 #: Samples in a block: its few arrays stay in the cache while all averaging times go over it.
 _BLOCK = 16384
 
+#: Degrees of freedom of an averaging time, above the rounding of a single second difference.
+_LEAST_FREEDOM = 1.0 - 1e-9
+
 #: Longer products are given to several threads, which costs more than they win.
 _PRODUCT = 8192
 
@@ -111,6 +114,9 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
     freedom = degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
+    # A few windows that fit between gaps, nearly the same ones, tell less than a single one: their deviation has no upper bound.
+    told = freedom >= _LEAST_FREEDOM
+    sizes, counts, variance, freedom = sizes[told], counts[told], variance[told], freedom[told]
     return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom, *chi_squared_bounds(variance, freedom))
 
 

@@ -1,7 +1,4 @@
-"""
-The columns of each cause on a replayed log, for the shapes that are tried first.
-
-"""
+"""The columns of each cause on a replayed log, for the shapes that are tried first."""
 
 from __future__ import annotations
 
@@ -17,8 +14,10 @@ from gyro_calibration.log import Array
 
 #: A dead zone is looked for where an encoder makes so many steps a second or more.
 STEPS_A_SECOND = 20.0
-#: Places of a step that are tried in a log.
+#: Places of a step that are tried in all logs together.
 STEPS = 64
+#: A channel that changes by less than this in each log shows nothing.
+LEAST_CHANGE = {'temperature': 0.2, 'supply': 1e-9, 'specific_force': 1e-9}
 
 #: A thermal lag shorter than this, s, is nothing but the rate of the temperature.
 FASTEST_LAG = 12.0
@@ -108,13 +107,22 @@ def fitted_shapes(candidate: Candidate) -> list[int]:
 
 
 def with_shape(candidate: Candidate, place: int, value: float) -> Candidate:
-    """Return a candidate with another shape."""
+    """Return a candidate with another shape, within the bounds that a model has for it."""
+    if candidate.cause in CATALOGUE:
+        value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[place].bounds))
     return effect(candidate.cause, *candidate.shapes[:place], value, *candidate.shapes[place + 1:], run=candidate.run)
+
+
+def constant(replays: Sequence[Replay]) -> frozenset[str]:
+    """Return the channels that hardly change in any of the logs that have them, and so are as good as none."""
+    known = {name: [getattr(each.channels, name) for each in replays if name in each.has] for name in LEAST_CHANGE}
+    return frozenset(name for name, values in known.items()
+                     if values and max(float(np.ptp(value)) for value in values) < LEAST_CHANGE[name])
 
 
 def candidates(replays: Sequence[Replay]) -> list[Candidate]:
     """Return all causes that these logs may show, each with the shapes to begin with."""
-    has = frozenset.intersection(*(each.has for each in replays))
+    has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
     found = [*_of_time(replays), *(_of_temperature(replays) if 'temperature' in has else []), *_of_surroundings(has)]
     return [*found, *(_of_rate(replays, has) if moves else [])]
@@ -126,8 +134,19 @@ def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
         yield effect('warm_up', time_constant)
     for run, each in enumerate(replays):
-        for place in np.linspace(0.0, each.duration, STEPS // len(replays) + 2)[1:-1]:
-            yield effect('bias_step', place, run=run)
+        begin, spacing = float(each.channels.time[each.kept][0]), spacing_of_steps(each, len(replays))
+        for number in range(1, _steps(len(replays)) + 1):
+            yield effect('bias_step', begin + number * spacing, run=run)
+
+
+def _steps(logs: int) -> int:
+    """Return how many places of a step are tried in each of so many logs."""
+    return max(STEPS // logs, 1)
+
+
+def spacing_of_steps(each: Replay, logs: int) -> float:
+    """Return how far apart the places of a step are that are tried in one of so many logs, s."""
+    return each.duration / (_steps(logs) + 1)
 
 
 def reference_temperatures(replays: Sequence[Replay]) -> list[float]:

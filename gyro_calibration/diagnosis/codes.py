@@ -1,7 +1,4 @@
-"""
-Codes: the values that a digital output takes, the step between them, and the limit that it cannot go beyond.
-
-"""
+"""Codes: the values that a digital output takes, the step between them, the band about zero that none lies in, and the limit."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
+from scipy.special import ndtr
 
 from gyro_calibration.diagnosis.compared import Compared
 from gyro_calibration.log import Array, Mask
@@ -27,6 +25,14 @@ _NEIGHBOURS, _WITHIN = 4, 0.05
 _FINE = 0.1
 #: A code that is reached in so many separate runs is none that was stuck.
 _SEPARATE = 3
+#: Smaller than this part of the fastest output is that of a rest: no limit is as low, and a dead band is about one.
+_REST = 0.1
+#: Values of as many digits have steps of as many parts of them, up to this factor.
+_DIGIT = 10.0
+#: A dead band keeps other codes away by more than so many steps.
+_AWAY = 1.5
+#: What is expected so many standard deviations beyond a dead band may well be in it.
+_EDGE = 2.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,13 @@ def _about_the_densest(values: Array) -> tuple[Array, float]:
 
 
 def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
-    """Return the length of the mean phase of some places on a lattice, and by how much the lattice is moved."""
+    """
+    Return the length of the mean phase of some places on a lattice, and by how much the lattice is moved.
+
+    The place that occurs most is left out: beside a value that comes at every rest, all others would count for nothing.
+
+    """
+    counts = np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts) if len(counts) > 1 else counts
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
 
@@ -114,6 +126,73 @@ def _line(number: Array, place: Array) -> tuple[float, Array, float]:
     squares = float(centred @ centred)
     slope = float(centred @ apart) / squares
     return slope, apart - slope * centred, float(np.sqrt(squares))
+
+
+def steps_about(codes: Codes, output: Array) -> Array:
+    """
+    Return the most that codes about each value may be apart, shape (n,).
+
+    Steps grow with the values in floats of 32 bits, and in what is printed with so many digits; or they are too fine to be seen. They are
+    no larger than the closest two among values as large or larger are apart, and than is usual for the digits of the finest.
+
+    """
+    steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
+    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0]) for sign in (1.0, -1.0)}
+    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf)) for sizes in sides.values())
+    for sign, sizes in sides.items():
+        if len(sizes) > 1:
+            side = sign * output >= 0.0
+            closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
+            place = np.minimum(np.searchsorted(sizes, sign * output[side]), len(closest) - 1)
+            steps[side] = np.maximum(steps[side], np.minimum(closest[place], _DIGIT * finest * np.abs(output[side])))
+    return steps
+
+
+@dataclass(frozen=True)
+class DeadBand:
+    """
+    A value that comes again and again, while those near it never do.
+
+    Attributes
+    ----------
+    value : rad/s
+    half : how far others keep away from it, rad/s
+
+    """
+
+    value: float
+    half: float
+
+    def holds(self, output: Array) -> Mask:
+        """Mark the samples in it."""
+        return np.abs(output - self.value) < 0.5 * self.half
+
+    def chances(self, seen: Compared) -> Array:
+        """Return the chance of each sample to be in it, by what is expected of it; without expectation it rests."""
+        rest = np.full(len(seen.output), np.median(seen.output)) if seen.expected is None else seen.expected
+        off, doubt = np.nan_to_num(rest - self.value), max(doubt_of(seen), 1e-9 * self.half)
+        reach = self.half + _EDGE * doubt
+        return ndtr((reach - off) / doubt) - ndtr((-reach - off) / doubt)
+
+
+def dead_band(codes: Codes, output: Array) -> DeadBand | None:
+    """Return the dead band of an output, or None where it shows none."""
+    counts = np.where(np.abs(codes.values) < _slow(output), codes.counts, 0)
+    place = int(np.argmax(counts))
+    away = np.abs(np.delete(codes.values, place) - codes.values[place])
+    band = DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
+    runs = np.count_nonzero(np.diff(band.holds(output), prepend=False, append=False)) // 2
+    return band if counts[place] > 1 and runs > 1 and band.half > _AWAY * codes.step else None
+
+
+def _slow(output: Array) -> float:
+    """Return below which size an output is that of a rest; a wild one is not the fastest."""
+    return _REST * float(np.quantile(np.abs(output), 0.99))
+
+
+def doubt_of(seen: Compared) -> float:
+    """Return what a sample may be off what is expected of it, rad/s: beside its noise by all that is no straight line."""
+    return seen.white if seen.expected is None else max(seen.white, seen.scatter)
 
 
 @dataclass(frozen=True)
@@ -147,8 +226,9 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
     """
     Return the limit of an output, or None where it shows none.
 
-    An extreme code is one if it stands more often than its neighbours further in, where an output that is free to go beyond has fewer; and
-    if the output would have gone beyond by what is expected of it, which a coarse code at a constant rate would not.
+    An extreme code is one if it is beyond what comes at rests; if it stands more often than its neighbours further in, where an output
+    that is free to go beyond has fewer; and if the output would have gone beyond by what is expected of it, which a coarse code at a
+    constant rate would not.
 
     Parameters
     ----------
@@ -160,8 +240,8 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
     chances = {}
     for sign in (1.0, -1.0):
         values, counts = (codes.values, codes.counts) if sign > 0.0 else (-codes.values[::-1], codes.counts[::-1])
-        chance = _chance(values, counts, codes.step, seen.white)
-        if chance < level and _held_back(seen, sign, values[-1], codes.step):
+        chance = _chance(values, counts, float(steps_about(codes, sign * values[-1:])[0]), seen.white)
+        if chance < level and values[-1] > _slow(seen.output) and _held_back(seen, sign, values[-1], codes.step):
             chances[sign] = (sign * values[-1], chance)
     if not chances:
         return None
@@ -171,7 +251,7 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
 def _chance(values: Array, counts: Array, step: float, white: float) -> float:
     """Return the chance of as many samples at the last code as the first of them has company, if the density falls towards it."""
     reach = max(_NEIGHBOURS * step, _WITHIN * white)
-    neighbours = min(reach / step, 1e6) if step else 1e6
+    neighbours = min(reach / step, 1e6)
     before = int(counts[:-1][values[:-1] > values[-1] - reach - 0.5 * step].sum())
     return float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + before, 1.0 / (neighbours + 1.0)))
 
@@ -186,5 +266,5 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
         return fine and runs >= _SEPARATE
     middle = float(np.median(beyond))
     # What is expected errs by the wander of the bias and by all that is no straight line, which is alike in all these samples.
-    doubt = max(seen.white, seen.scatter)
+    doubt = doubt_of(seen)
     return middle > 0.5 * step + 2.0 * doubt or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt))

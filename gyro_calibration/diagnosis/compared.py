@@ -1,7 +1,4 @@
-"""
-The output beside what the reference lets expect of it, sample by sample, as far as a straight line between the two tells.
-
-"""
+"""The output beside what the reference lets expect of it, sample by sample, as far as a straight line between the two tells."""
 
 from __future__ import annotations
 
@@ -12,13 +9,15 @@ import numpy as np
 from scipy import stats
 from scipy.signal import savgol_filter
 
-from gyro_calibration.log import Array, Log
+from gyro_calibration.log import Array, Log, Mask
 from gyro_calibration.model import GyroModel
 
 #: A rate is taken from a heading by parabolas over so long, s, for its steps would hide it over one sample.
 _SMOOTHING = 0.15
 #: Lengths of the blocks in which output and reference are compared, s; the shorter where the motion averages out in the longer.
 _BLOCKS = (0.5, 0.1)
+#: Part of the range of the output at each end that a first line leaves out, and how often a line is fitted to what is near the one before.
+_ENDS, _FITS = 0.05, 4
 
 
 @dataclass(frozen=True)
@@ -116,18 +115,18 @@ def scale_of(model: GyroModel, rate: Array) -> float:
 def _block_means(time: Array, rate: Array, output: Array) -> tuple[Array, Array]:
     means = rate, output
     for length in _BLOCKS:
-        block = np.floor((time - time[0]) / length).astype(np.int64)
+        number = np.floor((time - time[0]) / length)
+        block = np.cumsum(np.diff(number, prepend=number[0]) > 0.0)
         count = np.bincount(block)
-        sums = [np.bincount(block, values)[count > 0] / count[count > 0] for values in (rate, output)]
-        means = sums[0], sums[1]
+        means = np.bincount(block, rate) / count, np.bincount(block, output) / count
         if np.std(means[0]) > 0.8 * np.std(rate):
             break
     return means
 
 
 def _line(rate: Array, output: Array) -> Line | None:
-    good = np.ones(len(rate), dtype=bool)
-    for _ in range(3):
+    good = _within(rate, output)
+    for _ in range(_FITS):
         if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.0:
             return None
         columns = np.column_stack([rate, np.ones(len(rate))])
@@ -135,6 +134,14 @@ def _line(rate: Array, output: Array) -> Line | None:
         off = output - columns @ solution
         good = np.abs(off) <= 5.0 * 1.4826 * np.median(np.abs(off)) + 1e-15
     return Line(float(solution[0]), float(solution[1]), _scatter(columns[good], off[good]))
+
+
+def _within(rate: Array, output: Array) -> Mask:
+    """Mark what is not near the ends of the output, to begin with, for it may be cut there; all where nearly all is at the ends."""
+    low, high = output.min(), output.max()
+    within = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
+    enough = np.count_nonzero(within) >= 8 and np.ptp(rate[within]) > 0.3 * np.ptp(rate)
+    return within if enough else np.ones(len(rate), dtype=bool)
 
 
 def _scatter(columns: Array, off: Array) -> float:

@@ -1,18 +1,18 @@
-"""
-The residual along each variable, for people to see: by the simulation as it was, and as extended.
-
-"""
+"""The residual along each variable, for people to see: by the simulation as it was, and as extended."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gyro_calibration.allan import allan_deviation
+from gyro_calibration.diagnosis.field import Work
 from gyro_calibration.diagnosis.finding import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.outcome import Outcome, joined
 from gyro_calibration.diagnosis.replay import Replay, white_deviation
+from gyro_calibration.diagnosis.spectrum import transform
 from gyro_calibration.log import Array
 from gyro_calibration.noise import Noise
 
@@ -22,22 +22,36 @@ BINS, POINTS = 40, 600
 _ALLAN_SAMPLES = 1 << 18
 
 
-def curves(before: Outcome, after: Outcome) -> list[Curve]:
-    """Return the mean residual in bins of each variable that changes in the logs."""
-    replays = before.replays
-    kept = [each.kept for each in replays]
-    left = [joined([residual[mask] - bias for residual, mask, bias in zip(found.residuals, kept, found.biases)])
-            for found in (before, after)]
-    white = joined([np.full(int(mask.sum()), white_deviation(residual[mask])) for residual, mask in zip(after.residuals, kept)])
-    added = joined([each.added[mask] + bias for each, mask, bias in zip(replays, kept, before.biases)])
-    found = [_curve(name, unit, joined([of(each)[each.kept] for each in replays]), left, white, added)
-             for name, unit, of in _variables(replays)]
+def what_is_left(found: Outcome) -> list[Array]:
+    """Return what is left of each log without its bias, rad/s, shape (n,)."""
+    return [residual - bias for residual, bias in zip(found.residuals, found.biases)]
+
+
+def beside_model(replays: Sequence[Replay]) -> list[Array]:
+    """Return what a model that was given leaves of each log as it is, rad/s, shape (n,)."""
+    return [each.channels.output - each.reference for each in replays]
+
+
+def curves(before: Sequence[Array], after: Outcome) -> list[Curve]:
+    """
+    Return the mean residual in bins of each variable that changes in the logs.
+
+    Parameters
+    ----------
+    before : what the simulation leaves of each log, rad/s, shape (n,)
+    after : the extended simulation
+
+    """
+    replays = after.replays
+    simulated = [each.added + error - rest for each, error, rest in zip(replays, beside_model(replays), before)]
+    values = [joined([part[each.kept] for part, each in zip(parts, replays)]) for parts in (before, what_is_left(after), simulated)]
+    found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after) for name, unit, of in _variables(replays)]
     return [each for each in found if len(each.at) > 1] + [_spectrum(before, after)]
 
 
 def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[Replay], Array]]]:
-    has = frozenset.intersection(*(each.has for each in replays))
     """Give name, unit, and what takes it from a log."""
+    has = frozenset.intersection(*(each.has for each in replays))
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
         yield 'rate', 'rad/s', lambda each: each.channels.rate
@@ -53,25 +67,50 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
         yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
 
 
-def _curve(name: str, unit: str, at: Array, left: Sequence[Array], white: Array, added: Array) -> Curve:
+def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array], after: Outcome) -> Curve:
     """Bin by even steps between the quantiles that hold nearly all, and leave out bins with few samples."""
+    at = joined(parts)
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
         return Curve(name, unit, *(np.empty(0) for _ in range(5)))
-    place = np.clip(((at - low) / (high - low) * BINS).astype(int), 0, BINS - 1)
+    bins = [np.clip(((part - low) / (high - low) * BINS).astype(int), 0, BINS - 1) for part in parts]
+    place = np.concatenate(bins)
     count = np.bincount(place, minlength=BINS)
     enough = count > 9
-
-    def mean(values: Array) -> Array:
-        return np.bincount(place, values, BINS)[enough] / count[enough]
-
-    return Curve(name, unit, mean(at), mean(left[0]), mean(left[1]), np.sqrt(mean(white ** 2) / count[enough]), mean(added))
+    middle, left, mended, simulated = (np.bincount(place, each, BINS)[enough] / count[enough] for each in (at, *values))
+    return Curve(name, unit, middle, left, mended, np.sqrt(_variances(after, bins)[enough]) / count[enough], simulated)
 
 
-def _spectrum(before: Outcome, after: Outcome) -> Curve:
+def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
+    """
+    Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
+
+    Slow noise is alike in neighbours and averages out less than white noise; in the cosine transform it is independent. What was averaged
+    out of the samples that are one point of the grid is white.
+
+    """
+    total = np.zeros(BINS)
+    for each, residual, variance, place in zip(after.replays, after.residuals, _spectra(after.work), bins):
+        point = np.minimum(each.place // each.every, each.points - 1)
+        held = np.bincount(place * each.points + point, minlength=BINS * each.points).reshape(BINS, each.points).astype(float)
+        within = np.maximum(held.sum(axis=1) - (held ** 2).sum(axis=1) / each.every, 0.0)
+        total += transform(held) ** 2 @ variance + white_deviation(residual[each.kept]) ** 2 * within
+    return total
+
+
+def _spectra(done: Work) -> list[Array]:
+    """Return the variance of the coefficients of each log by noise, averaged over the noises that it may be, shape (points - 1,) each."""
+    whole, judged = done.field, done.judged
+    relative = (judged.probability[0] * judged.squares[0] / done.by.freedom) @ (1.0 / whole.noises.weights)
+    count = np.diff(np.append(whole.starts, len(whole.deviation)))
+    variance = whole.deviation ** 2 * np.repeat(relative, count)
+    return np.split(variance, np.cumsum([each.points - 1 for each in whole.replays])[:-1])
+
+
+def _spectrum(before: Sequence[Array], after: Outcome) -> Curve:
     """Return the largest amplitude of the first log's residual in bins of frequency."""
-    each = before.replays[0]
-    series = [each.on_grid(found.residuals[0] - found.biases[0]) for found in (before, after)]
+    each = after.replays[0]
+    series = [each.on_grid(left[0]) for left in (before, what_is_left(after))]
     amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values) for values in series]
     frequency = np.fft.rfftfreq(len(series[0]), each.step)[1:]
     edges = np.unique(np.searchsorted(frequency, np.geomspace(frequency[0], frequency[-1], BINS + 1)))[:-1]
@@ -81,10 +120,10 @@ def _spectrum(before: Outcome, after: Outcome) -> Curve:
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
-def heading_curve(before: Outcome, after: Outcome) -> HeadingCurve:
-    """Return what the heading of the first log is wrong by, if the simulation is believed."""
-    each = before.replays[0]
-    lines = [np.cumsum(each.on_grid(found.residuals[0] - found.biases[0])) * each.step for found in (before, after)]
+def heading_curve(before: Sequence[Array], after: Outcome) -> HeadingCurve:
+    """Return what the heading of the first log is wrong by, if the simulation is believed, by what is left of each log before."""
+    each = after.replays[0]
+    lines = [np.cumsum(each.on_grid(left[0])) * each.step for left in (before, what_is_left(after))]
     some = np.unique(np.linspace(0, each.points - 1, POINTS).astype(int))
     return HeadingCurve(some * each.step, lines[0][some], lines[1][some])
 

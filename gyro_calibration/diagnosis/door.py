@@ -1,24 +1,29 @@
-"""
-The door: logs and models that allow no diagnosis are refused before any work is done, in one sentence that says what would do.
-
-"""
+"""The door: logs and models that allow no diagnosis are refused before any work is done, in one sentence that says what would do."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from gyro_calibration.diagnosis.codes import codes_of
 from gyro_calibration.diagnosis.compared import bridged, line_between, reference_rate, scale_of, white_noise
-from gyro_calibration.dwells.samples import output_of
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.dwells.samples import between_values, output_of, where_lost
+from gyro_calibration.log import DEGREE, Array, DataRefused, Log, refuse_wrapped
 from gyro_calibration.model import GyroModel
 
 #: Samples and seconds that a log in time has at least, rows that a rate table has, and the part of a log that must not be lost.
 FEWEST, SHORTEST, FEWEST_ROWS, LEAST = 100, 20.0, 8, 0.1
+#: Rows that a rate table has at most; more are samples whose time is missing.
+MOST_ROWS = 5000
+#: Of a log, s: three years, or stamps in another unit.
+LONGEST = 1e8
 #: Without a reference, a gyro is taken to rest as long as its means over a second stay this close to each other, rad/s.
 REST = 3.0 * DEGREE
+#: A reference that turns by less than this, rad, beside what its noise adds up to in so many standard deviations, may stand still; it does
+#: where the output follows it by no more than so many standard deviations.
+_STILL, _ADDED, _FOLLOWED = 1.0 * DEGREE, 4.0, 4.0
 #: An output that is nearer than this part of its spread to a line over the reference was made from it.
 _COPY = 1e-6
 #: Steps of print up to this part of the spread hide in a copy.
@@ -41,6 +46,9 @@ def refuse(log: Log, model: GyroModel | None = None) -> None:
 
     """
     output = output_of(log)
+    log, _ = prepared(log)
+    if log.reference_rate is None:
+        refuse_wrapped(log)
     if log.time is None:
         _refuse_table(log, output)
     else:
@@ -52,12 +60,59 @@ def refuse(log: Log, model: GyroModel | None = None) -> None:
         _refuse_units(log, output, model)
 
 
+def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
+    """
+    Return a log with the reference that is used, and what is to be said of that.
+
+    A rate that is known in less than half as many samples as the heading gives way to it, and one of nothing but noise becomes that of a
+    rest.
+
+    """
+    if log.time is None:
+        return log, ()
+    log, said = _chosen(log)
+    rate = reference_rate(log)
+    if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not rests(log):
+        return log, said
+    return replace(log, reference_rate=0.0 * rate, reference_heading=None), (
+        *said, 'What the reference shows is its noise, which the gyro does not see; it is taken to be at rest.')
+
+
+def evened(log: Log) -> Log:
+    """Return a log whose references are on the line between their values, where these come more slowly than those of the gyro."""
+    if log.time is None:
+        return log
+    rate, heading = (None if values is None else between_values(log.time, values) for values in (log.reference_rate, log.reference_heading))
+    return replace(log, reference_rate=rate, reference_heading=heading)
+
+
+def _chosen(log: Log) -> tuple[Log, tuple[str, ...]]:
+    rate, heading = (0 if values is None else int(np.isfinite(values).sum()) for values in (log.reference_rate, log.reference_heading))
+    by_rate = rate > 0 and 2 * rate >= heading
+    log = replace(log, reference_rate=log.reference_rate if by_rate else None, reference_heading=log.reference_heading if heading else None)
+    said = f'The reference rate is known in {rate} samples only; the heading, known in {heading}, is used.'
+    return log, () if by_rate or not rate else (said,)
+
+
 def rests(log: Log) -> bool:
     """Tell whether a gyro rests all the time: by the reference, by what the log says of being moved, or by its own output."""
     rate = reference_rate(log)
     if rate is not None:
-        return float(np.nanmax(np.abs(rate))) == 0.0
+        return not np.nanmax(np.abs(rate)) > 0.0 or _stands(log, rate)
     return bool((log.moving == 0.0).all()) if log.moving is not None else _is_steady(log)
+
+
+def _stands(log: Log, rate: Array) -> bool:
+    """Tell whether a reference is at rest but for its noise: it gets nowhere, and the output does not follow it."""
+    if log.time is None or log.output is None or log.moving is not None and log.moving.any():
+        return False
+    steps, whole = np.diff(log.time), bridged(rate)
+    noise = white_noise(whole) * math.sqrt(float(np.median(steps) * steps.sum()))
+    if np.ptp(np.cumsum(whole[1:] * steps)) > _STILL + _ADDED * noise:
+        return False
+    # In units of its own, for a simulator's rate of next to nothing would be lost beside the constant of the line.
+    line = line_between(log.time, rate / np.nanmax(np.abs(rate)), log.output)
+    return line is None or abs(line.factor) < _FOLLOWED * line.deviation
 
 
 def _is_steady(log: Log) -> bool:
@@ -75,6 +130,9 @@ def _refuse_table(log: Log, output: Array) -> None:
     if rows < FEWEST_ROWS:
         raise DataRefused(f'the log has no time_s, and {rows} rows with output and reference_rate_dps; as a rate table it needs at least '
                           f'{FEWEST_ROWS}, and as samples in time it needs time_s: add rows, or give --rate')
+    if rows > MOST_ROWS:
+        raise DataRefused(f'the log has no time_s, and {rows} rows, where a rate table has at most {MOST_ROWS}: add time_s, or say with '
+                          '--rate how many samples a second it holds')
 
 
 def _refuse_few(time: Array, output: Array) -> None:
@@ -84,17 +142,22 @@ def _refuse_few(time: Array, output: Array) -> None:
                           'again, and mend the line if it loses samples')
     if time[-1] - time[0] < SHORTEST:
         raise DataRefused(f'the log lasts {time[-1] - time[0]:.1f} s; a diagnosis wants at least {SHORTEST:g} s: record longer')
+    if time[-1] - time[0] > LONGEST:
+        raise DataRefused(f'the log lasts {time[-1] - time[0]:.3g} s by its stamps; see whether time_s is in s, or give --rate')
 
 
 def _refuse_without_reference(log: Log, output: Array) -> None:
-    given = [values for values in (log.reference_rate, log.reference_heading) if values is not None]
-    known = max((int(np.count_nonzero(np.isfinite(values) & np.isfinite(output))) for values in given), default=0)
-    if given and 0 < known < max(FEWEST, LEAST * len(output)):
-        raise DataRefused(f'the reference has a value in {known} of {len(output)} samples; at least {FEWEST} and a tenth are needed: '
-                          'mend its line and record again')
-    if known == 0 and not rests(log):
+    values = log.reference_heading if log.reference_rate is None else log.reference_rate
+    if values is None and not rests(log):
         raise DataRefused('the log has no reference, and the gyro is not at rest: add reference_rate_dps or reference_heading_deg, or let '
                           'it rest, and say so with a column moving of zeros')
+    if values is None:
+        return
+    known = np.isfinite(values)
+    count, covered = (int(np.count_nonzero(each & np.isfinite(output))) for each in (known, ~where_lost(known)))
+    if count < FEWEST or covered < LEAST * len(output):
+        raise DataRefused(f'the reference has a value in {count} of {len(output)} samples; at least {FEWEST} and a tenth are needed, or '
+                          'one at even intervals: mend its line and record again')
 
 
 def _refuse_constant(output: Array) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
+from gyro_calibration.diagnosis.extension import origins_before, wider
 from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import (
     BIAS,
@@ -266,12 +267,11 @@ def _with_reference(term: Term, temperature: float) -> Term:
 # models
 
 def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
-    """Return the simulation that is put to the test: with the bias and scale factor that fit best, where they are no findings."""
-    effects = [each for each in NUISANCES if each in named.change.effects and each not in named.causes]
-    if not effects:
+    """Return the simulation that is put to the test: the model that was given, or that of the bias and scale factor that fit best."""
+    effects = [each for each in NUISANCES if each in named.change.effects]
+    if model is not None or not effects:
         return model or GyroModel()
-    tested = model or GyroModel()
-    return assembled(dwells, model, fit_effects(beside(dwells, tested, effects), effects, _scatter(dwells, named)))
+    return fit_effects(dwells, effects, _scatter(dwells, named)).model
 
 
 def _scatter(dwells: Dwells, named: Named) -> Scatter | None:
@@ -292,9 +292,11 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
     stays = [term for term in model.terms if not _replaced(term.effect, model, fit)]
     own = [term.effect.name for term in stays]
     terms = (*(new.get(term.effect.name, term) for term in stays), *(term for name, term in new.items() if name not in own))
-    outputs = (min(model.rate_range[0], float(dwells.output.min())), max(model.rate_range[1], float(dwells.output.max())))
+    temperatures = [] if dwells.temperature is None else [dwells.temperature]
     # A self-calibration behind the model was of its old bias and scale factor.
-    return replace(model, terms=terms, covariance=_covariance(model, fit, terms), rate_range=outputs, self_calibration=None)
+    return replace(model, terms=terms, covariance=_covariance(model, fit, terms), rate_range=wider(model.rate_range, [dwells.output], True),
+                   temperature_range=wider(model.temperature_range, temperatures, True), origin=origins_before(model),
+                   self_calibration=None)
 
 
 def _replaced(effect: Effect, model: GyroModel, fit: Calibration) -> bool:

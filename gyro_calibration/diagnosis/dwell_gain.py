@@ -1,7 +1,4 @@
-"""
-What an extension wins on sweeps that took no part in it, and what the errors of dwells look like before and after, for pictures.
-
-"""
+"""What an extension wins on sweeps that took no part in it, and what the errors of dwells look like before and after, for pictures."""
 
 from __future__ import annotations
 
@@ -11,18 +8,15 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from gyro_calibration.diagnosis.dwell_fit import simulated
-from gyro_calibration.diagnosis.finding import Change, Curve, Gain
+from gyro_calibration.diagnosis.finding import Curve, Gain
+from gyro_calibration.diagnosis.gain import WINDOW, change_over
 from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel
-from gyro_calibration.scatter import FEWEST_SWEEPS, Scatter, parts_of, rms, summed
+from gyro_calibration.scatter import FEWEST_SWEEPS, Scatter, parts_of, summed
 
 #: The parts of a table are left out in so many groups at most, for each choice of causes takes its time.
 _MOST_GROUPS = 8
-#: Draws of parts, for the interval of what is won.
-_DRAWS = 2000
-#: A heading error is that of so long a turn at the rate of a dwell, s.
-WINDOW = 60.0
 #: Bins of a curve at most, and dwells in each at least.
 _MOST_BINS, _DWELLS_A_BIN = 40, 4
 
@@ -30,7 +24,7 @@ _MOST_BINS, _DWELLS_A_BIN = 40, 4
 Extend = Callable[[Dwells], tuple[GyroModel, GyroModel]]
 
 
-def measure_gain(dwells: Dwells, extend: Extend, generator: np.random.Generator) -> Gain | None:
+def measure_gain(dwells: Dwells, extend: Extend) -> Gain | None:
     """
     Return what an extension wins, or None where the parts of the table do not allow to make it without one of them.
 
@@ -38,7 +32,6 @@ def measure_gain(dwells: Dwells, extend: Extend, generator: np.random.Generator)
     ----------
     dwells : of a rate table, outlying ones too
     extend : chooses the causes anew, and fits them
-    generator : source of the bootstrap
 
     """
     parts = parts_of(dwells)
@@ -55,26 +48,15 @@ def measure_gain(dwells: Dwells, extend: Extend, generator: np.random.Generator)
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
-    rate = _change(before[known], after[known], np.unique(parts[known], return_inverse=True)[1], generator)
-    return Gain(_held_out(dwells, groups), rate, _times(rate, WINDOW), WINDOW)
+    numbered = np.unique(parts[known], return_inverse=True)[1]
+    rate = change_over(summed(np.column_stack([before, after])[known] ** 2, numbered), np.bincount(numbered).astype(float))
+    # A heading error is that of so long a turn at the rate of a dwell.
+    return Gain(_held_out(dwells, groups), rate, rate.scaled(WINDOW), WINDOW)
 
 
 def _held_out(dwells: Dwells, groups: Numbers) -> str:
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 'consecutive dwells'
     return f'{what} left out, each of {groups.max() + 1} groups in turn'
-
-
-def _change(before: Array, after: Array, parts: Numbers, generator: np.random.Generator) -> Change:
-    """Return root mean squares with the interval of their difference, by drawing whole parts."""
-    squares = np.column_stack([summed(np.column_stack([before ** 2, after ** 2]), parts), np.bincount(parts)])
-    drawn = squares[generator.integers(len(squares), size=(_DRAWS, len(squares)))].sum(axis=1)
-    low, high = np.quantile(np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2]), (0.025, 0.975))
-    return Change(rms(before), rms(after), (float(low), float(high)))
-
-
-def _times(change: Change, factor: float) -> Change:
-    low, high = change.interval
-    return Change(factor * change.before, factor * change.after, (factor * low, factor * high))
 
 
 # curves

@@ -10,7 +10,7 @@ either; so each chance is averaged over what it may be, as the intervals of a ca
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -64,20 +64,21 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     used = take(fit.dwells, fit.scatter.kept)
     probes = {name: columns for name, columns in _probes(used).items() if columns.shape[1]}
     known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
-    found, gains, limit = [], {}, level / max(len(probes), 1)
+    found, gains, tried = [], {}, len(probes)
     while probes:
         judged = [_judged(name, fit, known, columns, error, doubt) for name, columns in probes.items()]
         best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
-        if best.p_value >= limit:
+        chance = min(1.0, tried * best.p_value)
+        if chance >= level:
             break
-        found.append(best)
+        found.append(replace(best, p_value=chance))
         gains[best.along] = gain
         known = np.column_stack([known, probes.pop(best.along)])
     return Left(tuple(found), gains)
 
 
 def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array, doubt: Array) -> tuple[Unexplained, float]:
-    """Return how much a curve explains beside what is known, with its chance, and by what it lowers the misfit."""
+    """Return how much a curve explains beside what is known, with the chance of this one alone, and by what it lowers the misfit."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
     base = _orthonormal(whitener.whiten(known))

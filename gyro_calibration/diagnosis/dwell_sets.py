@@ -1,7 +1,4 @@
-"""
-What dwells cannot rule out in place of a cause, and which further dwells would.
-
-"""
+"""What dwells cannot rule out in place of a cause, and which further dwells would."""
 
 from __future__ import annotations
 

@@ -1,101 +1,261 @@
-"""
-The model with what was found: named effects, values, covariance.
-
-"""
+"""The model with what was found: named effects, limit and steps, values, covariance, noise, and where it comes from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from gyro_calibration.diagnosis.field import Named, seen
+from gyro_calibration.diagnosis.figures import NAMES
+from gyro_calibration.diagnosis.finding import Finding
+from gyro_calibration.diagnosis.hygiene import Hygiene
 from gyro_calibration.diagnosis.outcome import Outcome
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.effects import BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, SCALE_FACTOR_ERROR, Effect
 from gyro_calibration.log import Array
-from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model import GyroModel, Term, same_effects
 from gyro_calibration.noise import Noise
+from gyro_calibration.self_calibration import Limits
+
+#: What must be known of a scale factor error for it to be believed.
+LIMITS = Limits()
+#: Effects that count from somewhere -> what comes of it beside them to count from elsewhere.
+_BESIDE: Mapping[str, Effect] = {'bias_temperature': BIAS, 'supply_sensitivity': BIAS, 'scale_factor_temperature': SCALE_FACTOR_ERROR,
+                                 'bias_temperature_quadratic': BIAS_TEMPERATURE}
 
 
-def extended(model: GyroModel, found: Outcome, noise: Noise, bias_deviation: float, origin: Mapping[str, object]) -> GyroModel:
+def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hygiene], findings: Sequence[Finding], noise: Noise,
+                  bias_deviation: float) -> GyroModel:
     """
-    Return the model of the simulation with all effects of the gyro that were named.
+    Return the extended model: the one that was given, where no finding is of the gyro.
 
     Parameters
     ----------
-    model : of the simulation
-    found : the causes and their values
-    noise : of what they leave
+    model : of the simulation, `calibrated`; None where that was an ideal gyro
+    found : the causes and their values, none of them `left_out`
+    hygiene : of each log
+    findings : all of them; of a noise that is given, only the figures among them become others
+    noise : of what the causes leave
     bias_deviation : standard deviation of the bias, rad/s
-    origin : what the file is to say of where it comes from
 
     """
-    bias = float(np.mean(found.biases))
-    terms = _added(_added(list(model.terms), Term(BIAS, (bias,))), Term(SCALE_FACTOR_ERROR, (found.scale_factor_error.value,)))
-    new = [(place, known) for place, known in enumerate(found.named) if known.candidate.cause in CATALOGUE]
-    for place, known in new:
-        candidate = known.candidate
-        effect = CATALOGUE[candidate.cause]
-        coefficients = [one.value for one in found.coefficients(place)] or [candidate.amplitude or 0.0][:len(effect.coefficients)]
-        terms = _added(terms, Term(effect, (*candidate.shapes, *coefficients)))
-    covariance = _covariance(terms, model, found, [place for place, _ in new], bias_deviation)
-    rates, temperatures = _ranges(found)
-    return replace(model, terms=tuple(terms), covariance=covariance, noise=noise, origin=dict(origin),
-                   rate_range=_wider(model.rate_range, rates, bool(model.terms)),
-                   temperature_range=_wider(model.temperature_range, temperatures, bool(model.terms)))
+    given, names = model or GyroModel(), {name for each in findings for name in (each.effect, *each.ambiguous_with)}
+    fitted = model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name} or any(each.candidate.cause in CATALOGUE for each in found.named)
+    new = _with_exact(extended(given, found, bias_deviation) if fitted else given, _of_the_output(hygiene))
+    figures = replace(given.noise, **{each.effect: getattr(noise, each.effect) for each in findings if each.effect in NAMES})
+    if model is not None and same_effects(new, model) and figures == model.noise:
+        return model
+    return noted(replace(new, noise=figures if given.noise.angle_random_walk else noise), given, hygiene, findings)
 
 
-def _added(terms: list[Term], new: Term) -> list[Term]:
-    """Return terms with one more, or with a larger value of one that is there already."""
-    for place, term in enumerate(terms):
-        shapes = len(new.effect.shapes)
-        if term.effect.name == new.effect.name and term.values[:shapes] == new.values[:shapes] and new.effect.coefficients:
-            values = [*term.values[:shapes], *(a + b for a, b in zip(term.values[shapes:], new.values[shapes:]))]
-            return [*terms[:place], Term(term.effect, tuple(values)), *terms[place + 1:]]
-    # A file names each effect once: of two, the one that was found first is the stronger.
-    return terms if any(term.effect.name == new.effect.name for term in terms) else [*terms, new]
+def extended(model: GyroModel, found: Outcome, bias_deviation: float) -> GyroModel:
+    """Return a model with all effects of the gyro that were named, and with bias and scale factor error put right."""
+    new, spread = _values(found, bias_deviation)
+    moves = _moves(found) and not doubts_scale(found)
+    outputs = [each.channels.output[each.kept] + each.added[each.kept] for each in found.replays if moves]
+    temperatures = [each.channels.temperature[each.kept] for each in found.replays if 'temperature' in each.has]
+    return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
+                   rate_range=wider(model.rate_range, outputs, bool(model.terms)),
+                   temperature_range=wider(model.temperature_range, temperatures, bool(model.terms)))
 
 
-def _covariance(terms: Sequence[Term], model: GyroModel, found: Outcome, new: Sequence[int], bias_deviation: float) -> Array | None:
-    """Return the covariance of all fitted values; None where that of the model's own is not known."""
+def noted(new: GyroModel, given: GyroModel, hygiene: Sequence[Hygiene], findings: Sequence[Finding] = ()) -> GyroModel:
+    """Return a new model whose origin says what it may be instead, for which output it is, and what the one that was given came from."""
+    used = {term.effect.name for term in new.terms if term not in given.terms}
+    notes = notes_of([each for each in findings if each.effect in used], [clean.factor for clean in hygiene])
+    return replace(new, origin={**notes, **origins_before(given)})
+
+
+def notes_of(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
+    """Return what the file of a model says of its findings that may be others, and of what outputs were multiplied by."""
+    sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead' for each in findings if each.ambiguous_with]
+    mended = list(factors) if any(factor != 1.0 for factor in factors) else []
+    return {name: note for name, note in (('ambiguous', sets), ('output_multiplied_by', mended)) if note}
+
+
+def origins_before(model: GyroModel) -> dict[str, object]:
+    """Return the origins of a model for that of its successor: side by side, for a reader of files allows few levels."""
+    earlier = model.origin.get('before', [])
+    own = {name: value for name, value in model.origin.items() if name != 'before'}
+    return {'before': [own, *(earlier if isinstance(earlier, list) else [earlier])]} if own else {}
+
+
+def calibrated(model: GyroModel) -> GyroModel:
+    """Return the same gyro without a self-calibration: what that found is in its bias and scale factor error, to the first order."""
+    known = model.self_calibration
+    if known is None:
+        return model
+    slope = 1.0 + sum(term.values[0] for term in model.terms if term.effect is SCALE_FACTOR_ERROR)
+    new = [Term(SCALE_FACTOR_ERROR, (slope * known.scale_factor_error,)), Term(BIAS, (slope * known.bias,))]
+    covariance = None if known.covariance is None else _covariance(model, new, slope ** 2 * np.array(known.covariance))
+    return replace(model, terms=_all(model.terms, new), covariance=covariance, self_calibration=None)
+
+
+def left_out(model: GyroModel, found: Outcome) -> tuple[Named, ...]:
+    """Return the causes of the gyro that its model cannot hold: a file names each effect once, and not every two of them make one."""
+    terms, out = model.terms, []
+    for place, known in enumerate(found.named):
+        if known.candidate.cause in CATALOGUE:
+            more = _with(terms, _term(found, place))
+            out += [known] if more is None else []
+            terms = more or terms
+    return tuple(out)
+
+
+def doubts_scale(found: Outcome) -> bool:
+    """
+    Tell whether a scale factor error was found that is not to be believed.
+
+    Where the gyro hardly turns, the noise of the reference passes for motion that the gyro does not see: an error of up to -100 %.
+
+    """
+    scale = found.scale_factor_error
+    return _moves(found) and (scale.value < -LIMITS.scale_factor_error or scale.deviation > LIMITS.scale_standard_deviation)
+
+
+def _moves(found: Outcome) -> bool:
+    return found.place(-1, 0) is not None
+
+
+# values
+
+def _of_the_output(hygiene: Sequence[Hygiene]) -> list[Term]:
+    """Return limit and steps of the output, where they are findings: of several logs, those of the first that shows them."""
+    found: dict[str, Term] = {}
+    for clean in hygiene:
+        sizes = {'saturation': clean.limit, 'quantization': clean.step}
+        for name in (each.effect for each in clean.findings if sizes.get(each.effect)):
+            found.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
+    return [term for term in found.values() if _is_within(term)]
+
+
+def _with_exact(model: GyroModel, terms: Sequence[Term]) -> GyroModel:
+    """Return a model with effects whose values are exact."""
+    spread = np.zeros((len(terms), len(terms)))
+    return replace(model, terms=_all(model.terms, terms), covariance=_covariance(model, terms, spread)) if terms else model
+
+
+def _values(found: Outcome, bias_deviation: float) -> tuple[list[Term], Array]:
+    """Return what was found as terms, and the covariance of all their values in a row: 0 of those that were not fitted."""
+    doubtful = doubts_scale(found)
+    scale = 0.0 if doubtful else found.scale_factor_error.value
+    terms = [Term(BIAS, (_bias(found, scale),)), Term(SCALE_FACTOR_ERROR, (scale,))]
+    ranks: list[int | None] = [None, None if doubtful else found.place(-1, 0)]
+    for place, known in enumerate(found.named):
+        if known.candidate.cause in CATALOGUE:
+            terms.append(_term(found, place))
+            shapes = len(known.candidate.shapes)
+            ranks += [found.place(place, -1 - number if number < shapes else number - shapes) for number in range(len(terms[-1].values))]
+    fitted = {number: rank for number, rank in enumerate(ranks) if rank is not None}
+    spread = np.zeros((len(ranks), len(ranks)))
+    spread[np.ix_(list(fitted), list(fitted))] = found.covariance[np.ix_(list(fitted.values()), list(fitted.values()))]
+    spread[0, 0] = bias_deviation ** 2
+    return terms, spread
+
+
+def _bias(found: Outcome, scale: float) -> float:
+    """Return the mean bias of the logs beside a scale factor error."""
+    rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
+    return float(np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates))
+
+
+def _term(found: Outcome, place: int) -> Term:
+    """Return a cause of the gyro as a term."""
+    candidate = found.named[place].candidate
+    effect = CATALOGUE[candidate.cause]
+    coefficients = [one.value for one in found.coefficients(place)] or [candidate.amplitude or 0.0][:len(effect.coefficients)]
+    return Term(effect, (*candidate.shapes, *coefficients))
+
+
+# terms beside others
+
+def _all(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
+    for each in new:
+        terms = _with(terms, each) or terms
+    return terms
+
+
+def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
+    """Return terms with one more, which becomes one with that of its effect; None where two of an effect do not make one."""
+    old = next((term for term in terms if term.effect.name == new.effect.name), None)
+    if old is None:
+        return (*terms, new)
+    alike, *beside = _counted_like(old, new)
+    one = _one(old, alike)
+    return None if one is None else _all(tuple(one if term is old else term for term in terms), beside)
+
+
+def _counted_like(old: Term, new: Term) -> list[Term]:
+    """Return a term that counts from where another one of its effect does, and the terms that come of it: together they do the same."""
+    if new.effect.name not in _BESIDE or new.values[0] == old.values[0]:
+        return [new]
+    begin, value = old.values[0], new.values[1]
+    way, other, alike = begin - new.values[0], _BESIDE[new.effect.name], Term(new.effect, (begin, value))
+    if new.effect is BIAS_TEMPERATURE_QUADRATIC:
+        return [alike, Term(other, (begin, 2.0 * way * value)), Term(BIAS, (way ** 2 * value,))]
+    return [alike, Term(other, (way * value,))]
+
+
+def _one(old: Term, new: Term) -> Term | None:
+    """Return the term that does what two of one effect do; None where there is none."""
+    effect, shapes = new.effect, len(new.effect.shapes)
+    if effect.stage == 'output':
+        return new  # logs are compared before limits and steps, so that those of a model are not in the simulation
+    # Delays add up, and so do the paces of clocks, as they hardly differ from 1.
+    first = 0 if effect.moved is not None else shapes
+    if new.values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
+            each.default is not None for each in effect.coefficients):
+        return None
+    one = Term(effect, (*new.values[:first], *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
+    return one if _is_within(one) else None
+
+
+def _is_within(term: Term) -> bool:
+    """Tell whether the values of a term are within the bounds that a file has for them."""
+    return all(parameter.bounds[0] <= value <= parameter.bounds[1] for parameter, value in zip(term.effect.parameters, term.values))
+
+
+# how well known
+
+def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array | None:
+    """
+    Return the covariance of all fitted values of a model with new terms; None where that of its own is not known.
+
+    Parameters
+    ----------
+    model : whose values come first, new ones being independent of them
+    new : the terms that it is given
+    spread : covariance of all their values in a row
+
+    """
     if model.terms and model.covariance is None:
         return None
-    names: list[tuple[str, int]] = [(term.effect.name, place) for term in terms for place in term.fitted]
-    at = {name: place for place, name in enumerate(names)}
-    whole = np.zeros((len(names), len(names)))
+    values, moved = _fitted(_all(model.terms, new)), np.sqrt(np.diag(spread))
+    changes = np.zeros((len(values), len(spread)))
+    for place in np.flatnonzero(moved).tolist():
+        changes[:, place] = (_fitted(_all(model.terms, list(_moved(new, place, moved[place])))) - values) / moved[place]
+    whole = changes @ spread @ changes.T
     if model.covariance is not None:
-        own = [at[term.effect.name, place] for term in model.terms for place in term.fitted]
-        whole[np.ix_(own, own)] += model.covariance
-    whole[at['bias', 0], at['bias', 0]] += bias_deviation ** 2
-    pairs = list(_pairs(found, new, at))
-    places, ranks = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    whole[np.ix_(places, places)] += found.covariance[np.ix_(ranks, ranks)]
+        whole[:len(model.covariance), :len(model.covariance)] += model.covariance
     return whole
 
 
-def _pairs(found: Outcome, new: Sequence[int], at: Mapping[tuple[str, int], int]) -> list[tuple[int, int]]:
-    """Return for each new value its place in the model's covariance and in that of the search."""
-    scale = found.place(-1, 0)
-    pairs = [] if scale is None else [(at['scale_factor_error', 0], scale)]
-    for cause in new:
-        candidate = found.named[cause].candidate
-        shapes = len(candidate.shapes)
-        for (name, place), target in at.items():
-            if name == candidate.cause:
-                rank = found.place(cause, -1 - place if place < shapes else place - shapes)
-                pairs += [] if rank is None else [(target, rank)]
-    return pairs
+def _fitted(terms: Sequence[Term]) -> Array:
+    return np.array([term.values[place] for term in terms for place in term.fitted])
 
 
-def _ranges(found: Outcome) -> tuple[tuple[float, float], tuple[float, float]]:
-    rates = [each.channels.output[each.kept] for each in found.replays]
-    temperatures = [each.channels.temperature[each.kept] for each in found.replays if 'temperature' in each.has]
-    return _range(rates), _range(temperatures)
+def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
+    """Give terms of which one value, by its place in a row, is another one."""
+    for term in terms:
+        here = 0 <= place < len(term.values)
+        yield replace(term, values=(*term.values[:place], term.values[place] + change, *term.values[place + 1:])) if here else term
+        place -= len(term.values)
 
 
-def _range(parts: Sequence[Array]) -> tuple[float, float]:
-    return (min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)) if parts else (-np.inf, np.inf)
-
-
-def _wider(known: tuple[float, float], new: tuple[float, float], was: bool) -> tuple[float, float]:
-    return (min(known[0], new[0]), max(known[1], new[1])) if was else new
+def wider(known: tuple[float, float], parts: Sequence[Array], was: bool) -> tuple[float, float]:
+    """Return a range that holds what the logs show, too: as it was where they show nothing, and of a new model theirs alone."""
+    if not parts:
+        return known
+    low, high = min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
+    return (min(known[0], low), max(known[1], high)) if was else (low, high)

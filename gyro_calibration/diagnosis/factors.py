@@ -1,7 +1,4 @@
-"""
-Units taken for another: factors and delays that are what they are because somebody forgot or confused something.
-
-"""
+"""Units taken for another: factors and delays that are what they are because somebody forgot or confused something."""
 
 from __future__ import annotations
 

@@ -1,32 +1,44 @@
-"""
-Logs as a regression: the residual and the columns in the cosine transform, whitened, with the noises that may be in them.
-
-"""
+"""Logs as a regression: the residual and the columns in the cosine transform, whitened, with the noises that may be in them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
 from gyro_calibration.diagnosis.evidence import Beside, Judged, Noises, Places, Sample, beside, judge, log_sum, sample, sums
-from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.spectrum import Shape, angles, bands, inverse, noise_grid
+from gyro_calibration.diagnosis.replay import SMOOTHED, Replay
+from gyro_calibration.diagnosis.spectrum import Shape, angles, bands, fall, inverse, levels, noise_grid
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array
 
+#: What the causes leave, if it was smoothed, is averaged over intervals of at most so many s; so many times the levels of its noise are
+#: found again, each time beside the noise that was likeliest with those before.
+_LONGEST, _ROUNDS = 0.1, 3
 #: A shape is changed by this part of itself to see what its column changes by.
 _SMALL = 1e-4
+#: Within its interval of 95 %, so many standard deviations to each side, the score of a shape falls by this.
+_DEVIATIONS, _FALL = 1.96, 1.92
 
 
 @dataclass(frozen=True)
 class Named:
-    """A cause in the list, with the values of its columns; without them nothing is known of what its shapes change."""
+    """
+    A cause in the list.
+
+    Attributes
+    ----------
+    candidate : the cause with its shapes
+    values : of its columns; without them nothing is known of what its shapes change
+    price : of the choice of its first shapes among others, in logarithms of the likelihood
+
+    """
 
     candidate: Candidate
     values: tuple[float, ...] = ()
+    price: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +50,7 @@ class Field:
     ----------
     replays : the logs
     first : the noise by which all is divided at first
-    deviation : what it gives each coefficient, over that of white noise, shape (m,)
+    deviation : what it gives each coefficient, with the levels of the logs, over that of white noise, shape (m,)
     starts : first coefficient of each band
     shapes : noises that are tried
     noises : the same, as weights of the bands
@@ -80,7 +92,8 @@ def _rounding(replays: Sequence[Replay]) -> float:
 
 def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -> Field:
     parts = [(angles(each.points), each.step) for each in replays]
-    deviation = np.sqrt(np.concatenate([first.variance(angle, step) / step for angle, step in parts]))
+    plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
+    deviation = np.sqrt(plain * np.concatenate([each.level() for each in replays]))
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
     starts = np.concatenate([bands(angle, step) + offset for (angle, step), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
@@ -88,7 +101,7 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int)) for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
     angle, step = np.concatenate([part for part, _ in parts]), np.concatenate([np.full(len(part), step) for part, step in parts])
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
-    relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / deviation[chosen] ** 2, first_of)
+    relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen], first_of)
                          for shape in shapes]) / [len(part) for part in few]
     # Each combination of parts has an even chance; that parts come in many sizes must not outweigh that they may not be there.
     kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
@@ -140,11 +153,21 @@ class Work:
 
     def white(self) -> list[Array]:
         """Return what is left of each log by the likeliest noise, as white noise in time of variance 1: shape (points,) each."""
-        values, _ = self.estimates
-        left = self.residual - values @ self.columns
+        return [inverse(part) for part in self.whitened()]
+
+    def whitened(self) -> list[Array]:
+        """Return the coefficients of what is left of each log, by the likeliest noise of variance 1: shape (points - 1,) each."""
         best = int(self.judged.likelihood[0].argmax())
-        left = left * self.field.divided(best) * np.sqrt(self.by.freedom / self.judged.squares[0, best])
-        return [inverse(part) for part in np.split(left, np.cumsum([each.points - 1 for each in self.field.replays])[:-1])]
+        factor = self.field.divided(best) * np.sqrt(self.by.freedom / self.judged.squares[0, best])
+        return [part * own for part, own in zip(self.left(), self._parted(factor))]
+
+    def left(self) -> list[Array]:
+        """Return the coefficients of what is left of each log, divided by the first noise alone: shape (points - 1,) each."""
+        values, _ = self.estimates
+        return self._parted(self.residual - values @ self.columns)
+
+    def _parted(self, coefficients: Array) -> list[Array]:
+        return np.split(coefficients, np.cumsum([each.points - 1 for each in self.field.replays])[:-1])
 
     @property
     def estimates(self) -> tuple[Array, Array]:
@@ -216,16 +239,75 @@ def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[
     """Return what the sum of a cause's columns changes by with each shape that is fitted and smooth."""
     found: list[tuple[int, Array]] = []
     for place in free_shapes(known.candidate):
-        shape = known.candidate.shapes[place]
-        step = _SMALL * abs(shape) if shape else 1e-6
-        moved = columns_of(with_shape(known.candidate, place, shape + step), replays)
-        found.append((place, np.tensordot(known.values, moved - own, 1) / step))
+        moved = _moved(known.candidate, place, max(each.duration for each in replays))
+        change = np.tensordot(known.values, columns_of(moved, replays) - own, 1)
+        found.append((place, change / (moved.shapes[place] - known.candidate.shapes[place])))
     return found
 
 
+def _moved(candidate: Candidate, place: int, duration: float) -> Candidate:
+    """Return a cause with a shape changed a little, to the side where its bounds leave room."""
+    shape = candidate.shapes[place]
+    # A wave that is to change a little must stay in step throughout.
+    step = 1e-3 / duration if candidate.cause == 'interference_tone' else _SMALL * abs(shape) if shape else 1e-6
+    moved = with_shape(candidate, place, shape + step)
+    return with_shape(candidate, place, shape - step) if moved.shapes[place] == shape else moved
+
+
 def free_shapes(candidate: Candidate) -> list[int]:
-    """Return the places of the shapes that a fit may change a little: not those of a step, nor conventions."""
+    """Return the places of the shapes that a fit may change a little: not those whose columns leap, nor conventions."""
     return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
+
+
+def leaping_shapes(candidate: Candidate) -> list[int]:
+    """Return the places of the other shapes that are no conventions."""
+    return [place for place in fitted_shapes(candidate) if place not in free_shapes(candidate)]
+
+
+def deviation_of_leaping(done: Work, place: int, shape: int) -> float:
+    """Return the standard deviation of a shape whose columns leap: by how far off the score falls, to the side where that is further."""
+    candidate = done.named[place].candidate
+    others = work(replace(done.field, replays=done.plain), done.named[:place] + done.named[place + 1:])
+    least = with_one_more(others, candidate).score - _FALL
+
+    def falls(by: float) -> bool:
+        return with_one_more(others, with_shape(candidate, shape, candidate.shapes[shape] + by)).score < least
+
+    first = done.plain[0].step if candidate.cause == 'bias_step' else 1e-3 * candidate.shapes[shape]
+    return max(_until(falls, first), _until(falls, -first)) / _DEVIATIONS
+
+
+def _until(falls: Callable[[float], bool], first: float) -> float:
+    """Return how far off something first happens, to a percent: by doubling, and then by halving."""
+    near, far = 0.0, first
+    while not falls(far) and abs(far) < 1e6 * abs(first):
+        near, far = far, 2.0 * far
+    for _ in range(7):
+        middle = 0.5 * (near + far)
+        near, far = (near, middle) if falls(middle) else (middle, far)
+    return abs(far)
+
+
+def filtered(done: Work) -> tuple[Replay, ...]:
+    """
+    Return the logs with the levels that their noise has where a filter took from it, averaged where it left next to nothing.
+
+    A filter shows in what the causes leave. Before they are found, motion that is seen late or slowly would pass for noise.
+
+    """
+    found = [fall(part) < 1.0 for part in done.whitened()]
+    while any(deep := [fall(part) < SMOOTHED and 2.0 * each.step <= _LONGEST for each, part in zip(done.plain, done.whitened())]):
+        done = _again(done, [replace(each, every=each.every * (1 + more)) for each, more in zip(done.plain, deep)])
+    for number in range(_ROUNDS if any(found) else 0):
+        # At first by what is left as it is, or the fastest of the slow noises would stand for a part of the filter.
+        of = zip(done.plain, done.whitened() if number else done.left(), found)
+        done = _again(done, [each.filtered(levels(part)) if falls else each for each, part, falls in of])
+    return done.plain
+
+
+def _again(done: Work, replays: Sequence[Replay]) -> Work:
+    """Put the causes of a field into the same logs with other points or levels."""
+    return work(field(replays), done.named)
 
 
 def with_one_more(before: Work, candidate: Candidate) -> Work:

@@ -1,18 +1,15 @@
-"""
-The noise of what is left, in the figures of IEEE Std 952, and how it compares with what the model says.
-
-"""
+"""The noise of what is left, in the figures of IEEE Std 952, and how it compares with what the model says."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from gyro_calibration.diagnosis.field import Work
-from gyro_calibration.diagnosis.spectrum import differentiated
+from gyro_calibration.diagnosis.spectrum import angles, differentiated
 from gyro_calibration.log import Array
 from gyro_calibration.noise import Noise
 
@@ -39,21 +36,52 @@ class NoiseFigures:
 
 @dataclass(frozen=True)
 class _Bands:
-    """Energy and number of the coefficients of each band, and the variance that each figure of 1 gives them, shape (b, 3) or (b, 4)."""
+    """
+    The coefficients of b bands.
+
+    Attributes
+    ----------
+    energy, count : of each band
+    parts : the variance that each figure of 1 gives them, shape (b, 3) or (b, 4)
+    known : the variance that is no figure's, shape (b,)
+
+    """
 
     energy: Array
     count: Array
     parts: Array
+    known: Array
+
+    def variance(self, logarithms: Array) -> Array:
+        """Return the variance by squared figures, given by their logarithms."""
+        return np.asarray(self.known + self.parts @ np.exp(logarithms))
 
     def cost(self, logarithms: Array) -> float:
         """Return twice the negative log likelihood of squared figures, given by their logarithms."""
-        variance = self.parts @ np.exp(logarithms)
+        variance = self.variance(logarithms)
         return float((self.count * np.log(variance) + self.energy / variance).sum())
 
 
-def noise_figures(done: Work, expected: Noise) -> NoiseFigures:
-    """Fit noise figures to what is left, and compare them with those of a model; one whose angle random walk is 0 claims nothing."""
+def noise_figures(done: Work, expected: Noise, rounds: bool = False) -> NoiseFigures:
+    """
+    Fit noise figures to what is left, and compare them with those of a model.
+
+    Parameters
+    ----------
+    done : what was found
+    expected : the noise of the model; where its angle random walk is 0 it claims nothing
+    rounds : tells whether the model rounds its output itself, so that its angle random walk is without that; otherwise it may be with it
+
+    """
     bands = _bands(done)
+    without = _compared(bands, expected)
+    if rounds or not bands.known.any():
+        return without
+    whole = _compared(replace(bands, known=np.zeros_like(bands.known)), expected)
+    return replace(whole, chance={name: max(chance, without.chance[name]) for name, chance in whole.chance.items()})
+
+
+def _compared(bands: _Bands, expected: Noise) -> NoiseFigures:
     best, least = _fit(bands, {})
     figures = {name: float(np.exp(0.5 * best[place])) for place, name in enumerate(NAMES)}
     floor = _floors(bands, best)
@@ -68,18 +96,20 @@ def noise_figures(done: Work, expected: Noise) -> NoiseFigures:
 
 
 def _bands(done: Work) -> _Bands:
-    values, _ = done.estimates
-    field = done.field
-    left = (done.residual - values @ done.columns) * field.deviation
-    angle, step = field.angles()
-    count = np.diff(np.append(field.starts, len(left))).astype(float)
+    field, (angle, step) = done.field, done.field.angles()
+    left = np.concatenate(done.left()) * field.deviation
+    # Of noise behind a filter the figures are those below what it takes away, where the level is still 1.
+    used = np.concatenate([angles(each.points) < 1.5 * np.pi / len(each.levels) for each in field.replays])
+    coarse = np.concatenate([np.full(each.points - 1, each.coarse / each.every) for each in field.replays])
     frequency = angle / (2.0 * np.pi * step)
     wave = 2.0 - 2.0 * np.cos(angle)
     parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
     if field.first.reference:
         parts.append(differentiated(angle) / step)
-    means = np.column_stack([np.add.reduceat(part, field.starts) / count for part in parts])
-    return _Bands(np.add.reduceat(left ** 2, field.starts), count, means)
+    energy, count, *totals = (np.add.reduceat(part * used, field.starts) for part in (left ** 2, np.ones(len(left)), coarse, *parts))
+    kept = count > 0.0
+    known, *means = (total[kept] / count[kept] for total in totals)
+    return _Bands(energy[kept], count[kept], np.column_stack(means), known)
 
 
 def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> tuple[Array, float]:
@@ -103,7 +133,7 @@ def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> t
 
 def _floors(bands: _Bands, best: Array) -> Array:
     """Return the logarithms below which a figure is nowhere a hundredth of the noise."""
-    variance = bands.parts @ np.exp(best)
+    variance = bands.variance(best)
     return np.array([np.log(0.01 * (variance / bands.parts[:, place]).min()) for place in range(len(best))])
 
 

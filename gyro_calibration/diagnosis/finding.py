@@ -35,7 +35,7 @@ class Finding:
     ----------
     effect : its name in the catalogue
     cause : one sentence for people
-    parameters : name -> estimate
+    parameters : name -> estimate; of what a model has too, what comes on top of its value, but for figures of the noise
     p_value : the chance that a log without it shows as much
     minimum_detectable : what of its first parameter would have been found, in its unit; None where that has no meaning
     ambiguous_with : the names of those that the data at hand cannot rule out instead
@@ -78,15 +78,33 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class Change:
-    """A root mean square error before and after the extension, and the interval of 95 % of what is won (before less after)."""
+    """
+    A root mean square error before and after the extension.
+
+    Attributes
+    ----------
+    before, after : the errors
+    interval : of 95 % of what is won, before less after; None where a single part was held out
+
+    """
 
     before: float
     after: float
-    interval: tuple[float, float]
+    interval: tuple[float, float] | None
+
+    @property
+    def worse(self) -> bool:
+        """Tell whether the error grew beyond chance."""
+        return self.interval is not None and self.interval[1] < 0.0
+
+    def scaled(self, factor: float) -> Change:
+        """Return the errors in another unit."""
+        interval = None if self.interval is None else (factor * self.interval[0], factor * self.interval[1])
+        return Change(factor * self.before, factor * self.after, interval)
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
-        return {'before': self.before, 'after': self.after, 'ci95': list(self.interval)}
+        return {'before': self.before, 'after': self.after, 'ci95': None if self.interval is None else list(self.interval)}
 
 
 @dataclass(frozen=True)
@@ -111,7 +129,7 @@ class Gain:
     @property
     def worse(self) -> bool:
         """Tell whether the extension is worse than nothing, beyond chance."""
-        return any(change is not None and change.interval[1] < 0.0 for change in (self.rate, self.heading))
+        return any(change is not None and change.worse for change in (self.rate, self.heading))
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
@@ -130,8 +148,8 @@ class Curve:
     unit : of `at`, SI
     at : middle of each bin
     before, after : mean of the residual there, against the model that was given and against the extended one, rad/s
-    deviation : standard deviation of these means by the noise alone, rad/s; along the frequency, where amplitudes stand in place of means,
-        the usual one
+    deviation : standard deviation of these means by the noise alone, slow noise too, rad/s; along the frequency, where amplitudes stand in
+        place of means, the usual one
     simulated : mean error, output less true rate, that the simulation with the given model has there, rad/s; measured is that and `before`
 
     """

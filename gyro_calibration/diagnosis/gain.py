@@ -1,14 +1,12 @@
-"""
-What the extended model wins, on parts of the logs that took no part in the choice of causes or in the fit.
-
-"""
+"""What the extended model wins, on parts of the logs that took no part in the choice of causes or in the fit."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import t as student
 
 from gyro_calibration.diagnosis.field import work
 from gyro_calibration.diagnosis.finding import Change, Gain
@@ -21,10 +19,12 @@ from gyro_calibration.log import Array, Mask
 WINDOW = 60.0
 #: Of so many blocks one is held out.
 EVERY = 3
+#: A log with fewer samples than this beside what is held out is not fitted.
+_FEWEST = 20
 #: Chance at which a cause is chosen again without what is held out; that it is there was shown by the whole logs.
 _RATE = 0.01
-#: Times that blocks are drawn anew for an interval.
-RESAMPLED = 2000
+#: One part alone says nothing of how much the gain differs from part to part.
+_FEWEST_PARTS = 2
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Block:
     heading: tuple[float, float]
 
 
-def gain(search: Search, causes: Collection[str], generator: np.random.Generator) -> Gain | None:
+def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     """
     Hold out every third block, choose again among the causes and fit them without it, and predict what was held out.
 
@@ -44,37 +44,37 @@ def gain(search: Search, causes: Collection[str], generator: np.random.Generator
     ----------
     search : in the whole logs
     causes : those that were named, and their rivals
-    generator : draws blocks for the intervals
+    given : tells whether there is a model; before is then what it leaves as it is, otherwise what the best bias and scale leave
 
     Returns
     -------
-    None where the logs are too short to hold anything out
+    None where the logs are too short to hold anything out, or too little of them is known
 
     """
     replays = search.field.replays
     length = min(WINDOW, max(each.duration for each in replays) / 6.0)
     held = [held_out(each, length) for each in replays]
-    blocks = []
-    trained = [_without(each, out) for each, out in zip(replays, held)]
-    if not any(out.any() for out in held) or any(np.count_nonzero(each.kept) < 20 for each in trained):
+    if not any(out.any() for out in held) or any(np.count_nonzero(each.kept & ~out) < _FEWEST for each, out in zip(replays, held)):
         return None
-    rest = relaid(search, trained, causes, _RATE)
-    before, after = (Outcome(work(rest.field, named), rest.field.replays) for named in ((), searched(rest)))
-    for run, (each, out) in enumerate(zip(replays, held)):
-        left = [_left(each, run, found) for found in (before, after)]
-        blocks += [_block(each, left, part) for part in _parts(each, out, length)]
-    blocks = [block for block in blocks if block.count]
+    rest = relaid(search, [_without(each, out) for each, out in zip(replays, held)], causes, _RATE)
+    before = None if given else Outcome(work(rest.field, ()), rest.field.replays)
+    after = Outcome(work(rest.field, searched(rest)), rest.field.replays)
+    blocks = [block for run, (each, out) in enumerate(zip(replays, held))
+              for block in _blocks(each, out, length, [_left(each, run, found) for found in (before, after)])]
     words = (f'every third {length:.3g} s of the log' if len(replays) == 1 else f'every third {length:.3g} s of each log')
-    heading = _change(np.array([block.heading for block in blocks]) ** 2, np.ones(len(blocks)), generator) if length >= WINDOW else None
-    return Gain(f'{words}, {len(blocks)} parts', _change(np.array([block.squares for block in blocks]),
-                                                         np.array([block.count for block in blocks], float), generator), heading, WINDOW)
+    heading = change_over(np.array([block.heading for block in blocks]) ** 2, np.ones(len(blocks))) if length >= WINDOW else None
+    rate = change_over(np.array([block.squares for block in blocks]), np.array([block.count for block in blocks], float))
+    return Gain(f'{words}, {len(blocks)} parts', rate, heading, WINDOW)
 
 
 def held_out(each: Replay, length: float) -> Mask:
     """Mark the samples that are held out, shape (n,)."""
-    time = each.channels.time - each.channels.time[0]
-    number = np.floor(time / length).astype(int)
-    return (number % EVERY == 1) & (number < int(time[-1] / length + 1e-9))
+    number = _numbers(each, length)
+    return each.kept & (number % EVERY == 1) & (number < int((each.channels.time[-1] - each.channels.time[0]) / length + 1e-9))
+
+
+def _numbers(each: Replay, length: float) -> Array:
+    return np.floor((each.channels.time - each.channels.time[0]) / length)
 
 
 def _without(each: Replay, out: Mask) -> Replay:
@@ -83,27 +83,43 @@ def _without(each: Replay, out: Mask) -> Replay:
     return replace(each, kept=each.kept & ~out, place=place - place[0], filling=each.filling[place[0]:])
 
 
-def _left(each: Replay, run: int, found: Outcome) -> tuple[Array, Array]:
-    """Return what is left of rate and of increments of the heading in a whole log."""
-    added = found.explains(each, run) + found.biases[run]
+def _left(each: Replay, run: int, found: Outcome | None) -> tuple[Array, Array]:
+    """Return what is left of rate and of increments of the heading in a whole log; of a model that was given, all."""
+    added = 0.0 if found is None else found.explains(each, run) + found.biases[run]
     return each.channels.output - each.channels.rate - added, each.channels.output - each.reference - added
 
 
-def _parts(each: Replay, out: Mask, length: float) -> list[Mask]:
-    number = np.floor((each.channels.time - each.channels.time[0]) / length).astype(int)
-    return [out & each.kept & (number == block) for block in np.unique(number[out])]
+def _blocks(each: Replay, out: Mask, length: float, left: Sequence[tuple[Array, Array]]) -> Iterator[_Block]:
+    number = _numbers(each, length)
+    for place in np.unique(number[out]):
+        yield _block(each, left, out & (number == place))
 
 
 def _block(each: Replay, left: Sequence[tuple[Array, Array]], part: Mask) -> _Block:
     squares = tuple(float(np.sum(rate[part] ** 2)) for rate, _ in left)
-    heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part])) if part.any() else 0.0 for _, increments in left)
+    heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part])) for _, increments in left)
     return _Block((squares[0], squares[1]), int(np.count_nonzero(part)), (heading[0], heading[1]))
 
 
-def _change(squares: Array, count: Array, generator: np.random.Generator) -> Change:
-    """Return root mean squares before and after, from sums of squares, shape (blocks, 2), and the interval of their difference."""
+def change_over(squares: Array, count: Array) -> Change:
+    """
+    Return root mean squares before and after, and the interval of their difference.
+
+    Parts drawn anew give too narrow an interval where there are few. So it is that of the jackknife (Tukey 1958): each part is left out in
+    turn, and what that changes is spread as Student has it.
+
+    Parameters
+    ----------
+    squares : sums of squares of each part, before and after, shape (parts, 2)
+    count : how many were summed in each, shape (parts,)
+
+    """
     before, after = np.sqrt(squares.sum(axis=0) / count.sum())
-    drawn = generator.integers(len(count), size=(RESAMPLED, len(count)))
-    each = np.sqrt(squares[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None])
-    low, high = np.quantile(each[:, 0] - each[:, 1], [0.025, 0.975])
-    return Change(float(before), float(after), (float(low), float(high)))
+    parts = len(count)
+    if parts < _FEWEST_PARTS:
+        return Change(float(before), float(after), None)
+    others = np.sqrt(np.maximum(squares.sum(axis=0) - squares, 0.0) / (count.sum() - count)[:, None])
+    deviation = (parts - 1) / np.sqrt(parts) * np.std(others[:, 0] - others[:, 1], ddof=1)
+    half = float(student.ppf(0.975, parts - 1) * deviation)
+    won = float(before - after)
+    return Change(float(before), float(after), (won - half, won + half))

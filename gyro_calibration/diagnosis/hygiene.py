@@ -15,8 +15,9 @@ import numpy as np
 from scipy import stats
 
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.codes import Codes, Limit, codes_of, limit_of
+from gyro_calibration.diagnosis.codes import Codes, Limit, codes_of, dead_band, limit_of
 from gyro_calibration.diagnosis.compared import Compared, Line, compare, line_between, reference_rate, scale_of
+from gyro_calibration.diagnosis.door import evened, prepared
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding
 from gyro_calibration.diagnosis.stuck import Stuck, stuck_samples
@@ -74,17 +75,31 @@ def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
     model : what the simulation knows already: its steps and its limit are no findings
 
     """
-    output, rate = output_of(log), reference_rate(log)
+    log, said = prepared(log)
+    output, rate = output_of(log), reference_rate(evened(log))
     known = np.isfinite(output)
     line = None if rate is None else line_between(log.time, rate, output)
     unit = [] if rate is None or line is None else list(_unit(line, 1.0 if model is None else scale_of(model, rate)))
     factor = 1.0 / FACTORS[unit[0][0]] if unit else 1.0
-    found = Hygiene(tuple(finding for _, finding in unit), (), known, factor)
+    found = Hygiene(tuple(finding for _, finding in unit), said, known, factor)
     if log.time is None:
         return found
     found = _of_stamps(found, log, known)
     found = _of_reference(found, log)
     return _of_samples(found, output * factor, rate, None if line is None else _mended(line, factor), model, known, log)
+
+
+def decided(clean: Hygiene) -> Hygiene:
+    """Say what is done about the unit of a record: a factor that may be of the gyro is left to the scale factor."""
+    if clean.factor == 1.0:
+        return clean
+    if is_far(clean.factor):
+        said = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for an output so mended: mend the unit or the '
+                'sign of the log (its column, --sensitivity, --invert) before it is compensated.')
+        return replace(clean, remarks=(*clean.remarks, said))
+    said = f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: a new model has it as a scale factor error.'
+    return replace(clean, factor=1.0, step=clean.step / clean.factor, limit=None if clean.limit is None else clean.limit / clean.factor,
+                   remarks=(*clean.remarks, said))
 
 
 def _mended(line: Line, factor: float) -> Line:
@@ -197,12 +212,16 @@ def _of_samples(found: Hygiene, output: Array, rate: Array | None, line: Line | 
     codes, seen = codes_of(output[known]), compare(output, rate, line)
     limit = limit_of(codes, seen, LEVEL)
     at_limit = np.zeros(len(output), dtype=bool) if limit is None else limit.reached(seen.output)
-    good = known & ~at_limit
-    stuck = stuck_samples(seen, codes.step, good, LEVEL)
+    good, band = known & ~at_limit, dead_band(codes, seen.output)
+    stuck = stuck_samples(seen, codes, band, good, LEVEL)
+    if stuck is not None and stuck.has_one_more(at_limit):
+        limit, at_limit, good = None, np.zeros_like(at_limit), known
+        stuck = stuck_samples(seen, codes, band, good, LEVEL)
     good = good if stuck is None else good & ~stuck.repeats
-    wild = wild_samples(seen, good, 0.5 * codes.step, LEVEL)
+    # Single samples that get out of a dead band are not wild.
+    wild = wild_samples(seen, good if band is None else good & ~band.holds(seen.output), 0.5 * codes.step, LEVEL)
     good = good if wild is None else good & ~wild.samples
-    findings = [*found.findings, *_quantized(codes, seen.white, model), *_limited(limit, at_limit, seen, model), *_stuck(stuck, log),
+    findings = [*found.findings, *_quantized(codes, seen.white, model), *_limited(limit, at_limit, model), *_stuck(stuck, log),
                 *_wild(wild, log), *_rounded(found.heading_step, log, seen.white)]
     matters = codes.step >= STEP * seen.white
     return replace(found, findings=tuple(findings), trusted=good & _free(limit, seen), limit=None if limit is None else limit.size,
@@ -233,12 +252,11 @@ def _quantized(codes: Codes, white: float, model: GyroModel | None) -> Iterator[
                   f'where its white noise is {white / DEGREE:.3g} deg/s')
 
 
-def _limited(limit: Limit | None, at_limit: Mask, seen: Compared, model: GyroModel | None) -> Iterator[Finding]:
+def _limited(limit: Limit | None, at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
     if limit is None or _knows(model, 'saturation', limit.size):
         return
     sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high) if np.isfinite(value)]
-    size = float(np.abs(seen.output[at_limit]).mean())
-    yield finding('saturation', size, (limit.size, limit.size), limit.p_value,
+    yield finding('saturation', limit.size, (limit.size, limit.size), limit.p_value,
                   f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}')
 
 

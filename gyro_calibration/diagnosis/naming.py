@@ -13,7 +13,7 @@ from gyro_calibration.diagnosis.field import Named, work
 from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
 from gyro_calibration.diagnosis.outcome import Outcome, Value, joined
 from gyro_calibration.diagnosis.probes import along, is_named
-from gyro_calibration.diagnosis.search import MOST_SLIPS, Search, evidence_of
+from gyro_calibration.diagnosis.search import MOST_SLIPS, Search, evidence_of, price_of_freedom
 from gyro_calibration.effects import CATALOGUE
 
 #: Power with which an effect of the minimum detectable size is found.
@@ -32,7 +32,7 @@ def named_finding(search: Search, found: Outcome, place: int, p_value: float, ri
     unit = _unit(candidate.cause, parameters, found)
     size = next(iter(parameters.values()))
     half = 0.5 * (size.interval[1] - size.interval[0]) / _DEVIATIONS
-    return Finding(candidate.cause, cause.sentence, parameters, p_value, _detectable(search, half), (*twins, *unit),
+    return Finding(candidate.cause, cause.sentence, parameters, p_value, _detectable(search, found.named[place], half), (*twins, *unit),
                    separate_by or (cause.separate_by if twins or unit else ''), _evidence(size, half, candidate.run, len(found.replays)),
                    cause.along)
 
@@ -51,9 +51,10 @@ def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tupl
     return ('unit_error',) if unit_of_offset(offset.estimate, deviation, found.replays[0].interval) else ()
 
 
-def _detectable(search: Search, deviation: float) -> float | None:
-    """Return what would be found with the power that is asked for, at the level of one cause."""
-    return float(norm.isf(0.5 * search.rate) + norm.isf(1.0 - _POWER)) * deviation if deviation > 0.0 else None
+def _detectable(search: Search, known: Named, deviation: float) -> float | None:
+    """Return what would be found with the power that is asked for: half its square is evidence beyond chance and price."""
+    needed = search.chance.threshold(known.candidate.cause, search.rate) + price_of_freedom(known)
+    return float(np.sqrt(2.0 * max(needed, 0.0)) + norm.isf(1.0 - _POWER)) * deviation if deviation > 0.0 else None
 
 
 def _parameters(found: Outcome, place: int) -> dict[str, Estimate]:

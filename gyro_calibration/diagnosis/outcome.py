@@ -1,7 +1,4 @@
-"""
-What a search found, in values: those of the gyro's effects, of bias and scale, and what they leave.
-
-"""
+"""What a search found, in values: those of the gyro's effects, of bias and scale, and what they leave."""
 
 from __future__ import annotations
 
@@ -10,9 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from gyro_calibration.diagnosis.candidates import fitted_shapes
-from gyro_calibration.diagnosis.field import Named, Work, is_of_the_rate, seen
+from gyro_calibration.diagnosis.field import Named, Work, deviation_of_leaping, is_of_the_rate, leaping_shapes, seen
 from gyro_calibration.diagnosis.probes import is_named
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.log import Array
@@ -51,20 +49,27 @@ class Outcome:
         values, covariance = self.work.estimates
         return {owner: rank for rank, owner in enumerate(self.work.owner)}, values, covariance
 
+    @cached_property
+    def _leaping(self) -> dict[tuple[int, int], float]:
+        """Return the standard deviations of the shapes whose columns leap, by cause and place as in `place`."""
+        return {(place, -1 - shape): deviation_of_leaping(self.work, place, shape)
+                for place, known in enumerate(self.named) for shape in leaping_shapes(known.candidate)}
+
     def place(self, cause: int, number: int) -> int | None:
         """Return the place of a value among the estimates: of a column (from 0 on) or, as -1 less its place, of a shape."""
-        return self._estimates[0].get((cause, number))
+        ranks = [*self.work.owner, *self._leaping]
+        return ranks.index((cause, number)) if (cause, number) in ranks else None
 
     @property
     def covariance(self) -> Array:
         """Return that of all estimates."""
-        return self._estimates[2]
+        return np.asarray(block_diag(self._estimates[2], np.diag(np.square(list(self._leaping.values())))))
 
     def _value(self, cause: int, number: int, known: float | None = None) -> Value:
-        place = self.place(cause, number)
+        ranks, values, covariance = self._estimates
+        place = ranks.get((cause, number))
         if place is None:
-            return Value(0.0 if known is None else known, 0.0)
-        values, covariance = self._estimates[1:]
+            return Value(0.0, 0.0) if known is None else Value(known, self._leaping.get((cause, number), 0.0))
         return Value(float(values[place]) if known is None else known, float(np.sqrt(max(covariance[place, place], 0.0))))
 
     @property
@@ -117,7 +122,7 @@ class Outcome:
     def bias_variance(self) -> float:
         """Return the variance of the mean of the biases by what is open of the other values, (rad/s)²."""
         means = np.array([self._mean_change(place, number) for place, number in self.work.owner])
-        return float(means @ self.covariance @ means)
+        return float(means @ self._estimates[2] @ means)
 
     def _mean_change(self, cause: int, number: int) -> float:
         """Return by what one value more of a cause, or of the scale, lowers the mean of the biases."""

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.interpolate import BSpline
 
-from gyro_calibration.diagnosis.candidates import Candidate
+from gyro_calibration.diagnosis.candidates import Candidate, constant
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.log import Array
 
@@ -60,7 +60,7 @@ def _probe(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | N
 
 def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, Of]]:
     """Give the variables that these logs have and that change in them, each scaled to -1 to 1."""
-    has = frozenset.intersection(*(each.has for each in replays))
+    has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     known: dict[str, Of] = {'rate': lambda each: each.channels.rate}
     if 'temperature' in has:
         known['temperature'] = lambda each: each.channels.temperature
@@ -152,10 +152,11 @@ def _harmonic(number: int, times: Of | None) -> Callable[[Replay], Sequence[Arra
 
 def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for run, each in enumerate(replays):
+        begin = float(each.channels.time[each.kept][0])
         for width in BUMPS:
-            for moment in np.linspace(0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
-                yield _probe('time', _bump(moment * each.duration, width * each.duration), run, moment * each.duration)
+            for moment in begin + each.duration * np.linspace(0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
+                yield _probe('time', _bump(moment, width * each.duration), run, moment)
 
 
 def _bump(middle: float, width: float) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (np.exp(-0.5 * ((each.channels.time - each.channels.time[0] - middle) / width) ** 2),)
+    return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)

@@ -1,21 +1,19 @@
-"""
-A log and its simulation side by side: the residual, and what the causes look at, sample by sample and on an even grid.
-
-"""
+"""A log and its simulation side by side: the residual, and what the causes look at, sample by sample and on an even grid."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
-from gyro_calibration.diagnosis.spectrum import differentiated, transform
+from gyro_calibration.diagnosis.door import FEWEST, evened, prepared
+from gyro_calibration.diagnosis.spectrum import angles, differentiated, inverse, level, transform
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Array, DataRefused, Log, Mask
@@ -26,9 +24,16 @@ from gyro_calibration.stamps import number_stamps
 MOST_POINTS = 50_000
 #: Towards the highest frequencies the power of jumps falls to 0.18 between the second and the last quarter, that of noise to no less; what
 #: falls below this was smoothed before it was recorded. It is averaged over intervals of at most so many s.
-_SMOOTHED, _LONGEST = 0.05, 0.03
+SMOOTHED, _LONGEST = 0.05, 0.03
 #: Frequencies over which the power of a rate is averaged, and by what rounding is taken to be stronger than on average.
 _NEIGHBOURS, _OVER = 101, 1.5
+#: A held reference that keeps its value for more than so many of its intervals stood still; a change of fewer steps may have been slow.
+_STOOD = 1.5
+#: Samples beside a gap of a heading whose rate is not compared, where the gap has as many: a spline errs by 0.13, 0.036 and 0.01 of what
+#: its slope changes by there. Beside a shorter gap it changes by little.
+_BESIDE = 4
+#: Points of the grid for each sample, and points of a log that is too short to matter: most of a log must not be made up.
+_EACH, _SHORT = 5, 10_000
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,8 @@ class Replay:
     rounded : step of the heading that the reference is the derivative of, rad; 0 where it has none
     has : names of the channels that the log has
     added : what the simulation adds to the rate, rad/s, shape (n,); it is taken out of `channels.output`
+    coarse : variance that the rounding of the output adds to a sample, (rad/s)²
+    levels : of its white noise, where a filter took from it: see `spectrum.levels`
 
     """
 
@@ -61,6 +68,8 @@ class Replay:
     rounded: float
     has: frozenset[str]
     added: Array
+    coarse: float = 0.0
+    levels: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def step(self) -> float:
@@ -105,6 +114,16 @@ class Replay:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
         return transform(self.on_grid(values))
 
+    def level(self) -> Array:
+        """Return the level of the white noise at each coefficient, shape (points - 1,)."""
+        return level(angles(self.points), self.levels)
+
+    def filtered(self, more: Array) -> Replay:
+        """Return it with its levels multiplied by more of them; what fills the points that are lost is filtered, too."""
+        whole = transform(self.filling) * np.sqrt(level(angles(len(self.filling)) * self.every, more))
+        filling = inverse(whole)
+        return replace(self, levels=self.levels * more, filling=filling / white_deviation(filling))
+
     def with_rate(self, rate: Array) -> Replay:
         """Return it with another rate that the effects look at."""
         return replace(self, channels=replace(self.channels, rate=rate))
@@ -133,18 +152,48 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     """
     assert log.time is not None and log.output is not None
     time = _even(log.time)
-    reference, smooth = _reference(log, time, update, step)
+    shown = evened(replace(prepared(log)[0], time=time))
+    reference, smooth = _reference(shown, time, update is not None, step)
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
+    _refuse_few(kept)
     place, interval = numbered(time, kept)
+    _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
-    channels = replace(channels_of(replace(log, time=time)), rate=smooth, time=time, heading=_heading(time, log, smooth))
-    rounded = step if log.reference_rate is None else 0.0
+    channels = replace(channels_of(_surrounded(shown, model)), rate=smooth, time=time, heading=_heading(time, shown, smooth))
+    rounded = step if shown.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
-    output = log.output - _rounding(log.output, smooth, kept, codes) if codes else log.output
-    plain = Replay(replace(channels, output=output), reference, kept, place, interval, every, filling, rounded, _known(log),
-                   np.zeros(len(time)))
+    foreseen = _rounding(log.output, smooth, kept, codes) if codes else np.zeros(len(time))
+    coarse = max(codes ** 2 / 12.0 - float(np.var(foreseen[kept])), 0.0)
+    plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place, interval, every, filling, rounded, _known(log),
+                   np.zeros(len(time)), coarse)
     plain = replace(plain, every=every * _smoothed(plain))
     return plain if model is None else _simulated(plain, model)
+
+
+def _refuse_few(kept: Mask) -> None:
+    count = int(np.count_nonzero(kept))
+    if count < FEWEST:
+        raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are needed; the others are lost, stuck, wild or '
+                          'near a limit: turn more slowly, or mend the line, and record again')
+
+
+def _refuse_gaps(time: Array, place: NDArray[np.intp]) -> None:
+    """Refuse a log of which most is missing: what fills gaps is made up, and after a clock jumped it takes more memory than there is."""
+    points = int(place[-1]) + 1
+    if points <= max(_EACH * len(place), _SHORT):
+        return
+    gaps = np.diff(time)
+    longest = int(np.argmax(gaps))
+    raise DataRefused(f'{len(place)} samples can be used where the log has room for {points}, at least a fifth is needed; the longest gap, '
+                      f'of {gaps[longest]:.6g} s, begins at {time[longest]:.3f} s: cut the log there, and give both parts, or give --rate '
+                      'where the stamps are no use')
+
+
+def _surrounded(log: Log, model: GyroModel | None) -> Log:
+    """Return a log that has a temperature, where a model has one to be simulated at."""
+    if model is None or log.temperature is not None:
+        return log
+    return replace(log, temperature=np.full(len(log), model.reference_temperature))
 
 
 def _even(time: Array) -> Array:
@@ -171,7 +220,7 @@ def _smoothed(plain: Replay) -> int:
         power = replace(plain, every=plain.every * more).coefficients(rest) ** 2
         _, second, _, last = (float(np.median(part)) for part in np.array_split(power, 4))
         more *= 2
-        if last < _SMOOTHED * second:
+        if last < SMOOTHED * second:
             found = more
     return found
 
@@ -195,13 +244,14 @@ def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
     return total
 
 
-def _reference(log: Log, time: Array, update: float | None, step: float) -> tuple[Array, Array]:
+def _reference(log: Log, time: Array, held: bool, step: float) -> tuple[Array, Array]:
     """Return the reference rate as it is compared, and as effects look at it."""
     if log.reference_rate is not None:
-        rate = _between_updates(time, log.reference_rate, update)
+        rate = _between_updates(time, log.reference_rate, step) if held else log.reference_rate
         return rate, _filled(time, rate)
     if log.reference_heading is not None:
-        return _rates(time, _between_updates(time, log.reference_heading, update), step)
+        heading = _between_updates(time, log.reference_heading, step) if held else log.reference_heading
+        return _rates(time, heading, step)
     return np.zeros(len(time)), np.zeros(len(time))
 
 
@@ -263,20 +313,28 @@ def _known(log: Log) -> frozenset[str]:
     return frozenset(name for name in ('temperature', 'specific_force', 'supply') if getattr(log, name) is not None)
 
 
-def _between_updates(time: Array, values: Array, update: float | None) -> Array:
-    """Interpolate a held reference between its updates, for a held value is half an interval late."""
-    if update is None:
-        return values
-    renewed = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    return np.interp(time, time[renewed], values[renewed])
+def _between_updates(time: Array, values: Array, step: float) -> Array:
+    """
+    Interpolate a held reference between its updates, for a held value is half an interval late.
+
+    An update that brings the same value leaves no trace. So a value that stands for longer is held until the last update before the next.
+
+    """
+    known = np.isfinite(values)
+    renewed = np.flatnonzero((np.diff(values, prepend=np.nan) != 0.0) & known)
+    when, what = time[renewed], values[renewed]
+    usual = float(np.median(np.diff(when)))
+    stood = 1 + np.flatnonzero((np.diff(when) > _STOOD * usual) & (np.abs(np.diff(what)) > _STOOD * step))
+    when, what = np.insert(when, stood, when[stood] - usual), np.insert(what, stood, what[stood - 1])
+    return np.where(known, np.interp(time, when, what), np.nan)
 
 
 def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
     """Return the rate of a heading by cubic splines, nan where that is lost, and the same from a smooth heading where it has steps."""
-    known = np.isfinite(heading)
+    lost = ~np.isfinite(heading)
     rate = CubicSpline(time, _filled(time, heading))(time, 1)
-    near = known & np.append(known[1:], True) & np.append(True, known[:-1])
-    raw = np.where(near, rate, np.nan)
+    near = maximum_filter1d(lost, 3) | maximum_filter1d(binary_opening(lost, np.ones(_BESIDE)), 2 * _BESIDE + 1)
+    raw = np.where(near, np.nan, rate)
     return raw, _without_rounding(rate, step, float(np.median(np.diff(time)))) if step else rate
 
 

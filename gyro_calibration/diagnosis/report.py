@@ -20,6 +20,7 @@ from gyro_calibration.diagnosis.words import (
     doubt,
     headline,
     hidden,
+    is_inside,
     listed,
     noise_figures,
     offered,
@@ -92,7 +93,8 @@ def _tile(what: str, errors: Change, unit: str) -> Markup:
 
 
 def _gained(errors: Change, unit: str) -> str:
-    return str(quantity(Estimate(errors.before - errors.after, errors.interval, unit)))
+    won = errors.before - errors.after
+    return str(quantity(Estimate(won, errors.interval or (won, won), unit)))
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
@@ -245,7 +247,7 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
 # causes
 
 def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
-    inside = any(term.effect.name == found.effect for term in diagnosis.model.terms) and offered(diagnosis)
+    inside = is_inside(found, diagnosis)
     facts = [f'By noise alone: {chance(found.p_value)}.', smallest(found), 'It is in the extended model.' if inside else '']
     uncertain = element('p', doubt(found), class_='doubt') if found.ambiguous_with else None
     title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect), ' ', _code(found.effect))

@@ -27,6 +27,7 @@ from gyro_calibration.diagnosis.candidates import (
     effect,
     fitted_shapes,
     pulse,
+    spacing_of_steps,
     with_shape,
 )
 from gyro_calibration.diagnosis.evidence import Places, beside, drawn, evidence, judge, log_sum, sample, sums
@@ -34,7 +35,7 @@ from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_th
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
-from gyro_calibration.log import Array
+from gyro_calibration.log import Array, DataRefused
 
 #: Residuals drawn to learn what chance shows.
 DRAWS = 400
@@ -42,11 +43,11 @@ DRAWS = 400
 MOST_NOISES = 60
 #: A cause that explains the data less well than the best by more than this, in logarithms of the likelihood, is ruled out.
 RULED_OUT = 3.2
-#: What a shape costs that is known to some part of where it may be.
+#: What a shape costs at least, for it is known to some part of where it may be.
 PRICE_OF_SHAPE = 2.0
 #: Causes that have no first shapes, but are scanned for.
 SCANNED = frozenset({'interference_tone', 'reference_slip'})
-#: So many of a kind at most: slips are found all at once, and many tones are no tones, but something that is not even.
+#: So many of a kind at most in a log: slips are found all at once, and many tones are no tones, but something that is not even.
 MOST_OF = {'interference_tone': 3, 'reference_slip': 1}
 #: A tone has at least so many periods in a log; slower ones are wander.
 LEAST_PERIODS = 20
@@ -70,10 +71,7 @@ MOST_CAUSES = 6
 
 @dataclass(frozen=True)
 class Chance:
-    """
-    What evidence of each cause chance shows: beyond `start`, with probability `share`, it falls off by e every `scale`.
-
-    """
+    """What evidence of each cause chance shows: beyond `start`, with probability `share`, it falls off by e every `scale`."""
 
     start: Mapping[str, float]
     scale: Mapping[str, float]
@@ -142,6 +140,7 @@ class Search:
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
     scanned : causes that are scanned for over all frequencies, or all moments
+    tied : causes of which these logs leave nothing beside bias and scale factor error
     banks, looked : what was made before, by the causes that were named then
 
     """
@@ -151,6 +150,7 @@ class Search:
     chance: Chance
     rate: float
     scanned: frozenset[str] = SCANNED
+    tied: frozenset[str] = frozenset()
     banks: dict[Key, Bank] = field_of(default_factory=dict)
     looked: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
 
@@ -209,9 +209,11 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float
     everywhere = field(replays)
     whole = _of_likely_noises(everywhere, found)
     done, stock = work(whole, []), bank(whole, found)
-    if screen(done, stock).max() > STRONG:
+    shown, places = screen(done, stock), by_cause(found)
+    if shown.max() > STRONG:
         whole, done = everywhere, work(everywhere, [])
-    return Search(whole, stock, chances(done, stock, generator), rate / len(by_cause(found)))
+    tied = frozenset(cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
+    return Search(whole, stock, chances(done, stock, generator), rate / len(places), tied=tied)
 
 
 def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str], rate: float) -> Search:
@@ -226,6 +228,8 @@ def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
     middle = [places[len(places) // 2] for places in by_cause([each for each in found if is_named(each)]).values()]
     tried = [work(whole, []), work(whole, [], [found[place] for place in middle])]
     kept = np.flatnonzero(np.any([each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried], axis=0))
+    if not len(kept):
+        raise DataRefused('no noise explains what the simulation leaves, it is so large; see whether columns and units are right')
     return replace(whole, shapes=tuple(whole.shapes[place] for place in kept), noises=whole.noises.take(kept))
 
 
@@ -240,20 +244,44 @@ class _First:
 
 # what happens at any frequency, or at any moment
 
+def _runs(done: Work, cause: str) -> list[int]:
+    """Return the logs in which one more of a cause is looked for."""
+    taken = [known.candidate.run for known in done.named if known.candidate.cause == cause]
+    return [run for run in range(len(done.field.replays)) if taken.count(run) < MOST_OF[cause]]
+
+
 def tones(done: Work) -> list[_First]:
-    """Return the strongest tone, of as many as there are frequencies."""
-    found = []
-    for each, white in zip(done.field.replays, done.white()):
+    """Return the strongest tone, of as many as there are frequencies in all logs; in each, a tone has a size and a phase of its own."""
+    found, left = [], done.white()
+    for run in _runs(done, 'interference_tone'):
+        each, white = done.field.replays[run], left[run]
         # Twice as long, since a tone between two frequencies of the log alone would lose more than half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
         lowest = 2 * LEAST_PERIODS
         if len(power) > 2 * lowest:
             best = lowest + int(power[lowest:-2].argmax())
-            if each.rounded and not _of_the_gyro(each, 0.5 * best / each.duration):
+            frequency = _unfolded(each, 0.5 * best / each.duration)
+            if each.rounded and not _of_the_gyro(each, frequency):
                 continue
-            most = float(power[best]) - PRICE_OF_COLUMN
-            found.append(_First(effect('interference_tone', 0.5 * best / each.duration), most, most - float(np.log(len(power)))))
+            most, places = float(power[best]) - PRICE_OF_COLUMN, len(power) * len(left)
+            found.append(_First(effect('interference_tone', frequency, run=run), most, most - float(np.log(places))))
     return [max(found, key=lambda one: one.mean)] if found else []
+
+
+def _unfolded(each: Replay, frequency: float) -> float:
+    """Return the frequency that a tone has where neighbours are not averaged: of those that fold to it, the one that stands out most."""
+    if each.every == 1:
+        return frequency
+    samples = replace(each, every=1)
+    power = np.abs(np.fft.rfft(samples.on_grid(each.channels.output - each.reference), 2 * samples.points)) ** 2
+    folds = np.arange(each.every // 2 + 1) / each.step
+    places = 2.0 * samples.duration * np.concatenate([folds + frequency, folds[1:] - frequency])
+    return float(max(places[places < len(power) - 3], key=lambda at: _outstanding(power, round(at)))) / (2.0 * samples.duration)
+
+
+def _outstanding(power: Array, place: int) -> float:
+    """Return what the power at a frequency is over that of its neighbours."""
+    return float(power[place - 2:place + 3].max() / np.median(power[max(place - 60, 0):place + 61]))
 
 
 def _of_the_gyro(each: Replay, frequency: float) -> bool:
@@ -268,7 +296,9 @@ def slips(done: Work) -> list[_First]:
     found = []
     parts = np.cumsum([each.points - 1 for each in done.field.replays])[:-1]
     divided = np.split(done.field.divided(int(done.judged.likelihood[0].argmax())) / done.field.deviation, parts)
-    for run, (each, white, factor) in enumerate(zip(done.field.replays, done.white(), divided)):
+    left = done.white()
+    for run in _runs(done, 'reference_slip'):
+        each, white, factor = done.field.replays[run], left[run], divided[run]
         acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
@@ -362,7 +392,8 @@ def refined(before: Work, candidate: Candidate, price: float) -> Step:
     if not fitted_shapes(candidate) or candidate.cause == 'reference_slip':
         done = with_one_more(before, candidate)
         columns = PRICE_OF_COLUMN * max(done.widths[-1] - 1, 0)
-        return Step(done.named, done.score - columns - price - (0.0 if is_named(candidate) else MARGIN))
+        margin = 0.0 if is_named(candidate) else MARGIN
+        return Step((*before.named, Named(candidate, price=price)), done.score - columns - price - margin)
     begin = candidate if candidate.amplitude is None else _unbent(before, candidate)
     place = fitted_shapes(candidate)[0]
     low, high = _around(before.plain, begin, place)
@@ -372,7 +403,8 @@ def refined(before: Work, candidate: Candidate, price: float) -> Step:
 
     best = minimize_scalar(cost, bounds=(low, high), method='bounded', options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
     columns = PRICE_OF_COLUMN if candidate.cause == 'interference_tone' else 0.0
-    return Step((*before.named, Named(with_shape(begin, place, _shape(best.x, begin, place)))), -float(best.fun) - price - columns)
+    found = Named(with_shape(begin, place, _shape(best.x, begin, place)), price=price)
+    return Step((*before.named, found), -float(best.fun) - price - columns)
 
 
 def _shape(at: float, begin: Candidate, place: int) -> float:
@@ -383,12 +415,12 @@ def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[fl
     """Return where to look for a shape: between its neighbours, on a scale of logarithms but for moments."""
     mine = begin.shapes[place]
     if begin.cause == 'bias_step':
-        width = 1.5 * max(each.duration for each in replays) / 64
+        width = 1.5 * max(spacing_of_steps(each, len(replays)) for each in replays)
         return mine - width, mine + width
     if begin.amplitude is not None:
         return float(np.log(abs(mine))) - 0.7, float(np.log(abs(mine))) + 0.7
     if begin.cause == 'interference_tone':
-        width = 1.0 / (mine * max(each.duration for each in replays))
+        width = 1.0 / (mine * replays[begin.run or 0].duration)
         return float(np.log(mine)) - width, float(np.log(mine)) + width
     width = 0.8
     low = float(np.log(FASTEST_LAG)) if begin.cause == 'thermal_lag' else -np.inf
@@ -453,9 +485,7 @@ def _first(search: Search, done: Work, named: Sequence[Named]) -> list[_First]:
     first = [_First(search.candidates[max(own, key=lambda place: found[place])], float(found[own].max()), float(averaged(found[own])))
              for cause, own in by_cause(search.candidates).items() if cause not in taken and np.isfinite(found[own]).any()]
     scans = {'interference_tone': tones, 'reference_slip': slips}
-    already = [each.candidate.cause for each in named]
-    return first + [each for cause in sorted(search.scanned) if already.count(cause) < MOST_OF[cause] for each in scans[cause](done)
-                    if np.isfinite(each.mean)]
+    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done) if np.isfinite(each.mean)]
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
@@ -478,7 +508,7 @@ def _updated(done: Work, place: int, values: Array) -> Named:
         change = own.get((place, -1 - shape), 0.0)
         before = candidate.shapes[shape]
         candidate = with_shape(candidate, shape, before + float(np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
-    return Named(candidate, found or known.values)
+    return replace(known, candidate=candidate, values=found or known.values)
 
 
 def searched(search: Search) -> tuple[Named, ...]:
@@ -493,19 +523,18 @@ def searched(search: Search) -> tuple[Named, ...]:
     if all(is_named(each.candidate) for each in everything):
         return everything
     named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates if is_named(each)]), banks={}, looked={}))
-    return max((everything, named), key=lambda each: work(search.field, each).score - sum(_price(search, known) for known in each))
+    return max((everything, named), key=lambda each: work(search.field, each).score - sum(map(_price, each)))
 
 
-def _price(search: Search, known: Named) -> float:
+def _price(known: Named) -> float:
     """Return what a cause of a list costs, in logarithms of the likelihood."""
-    price = _price_of_freedom(known)
-    if is_named(known.candidate):
-        return price
-    return price + MARGIN + float(np.log(sum(each.cause == known.candidate.cause for each in search.candidates)))
+    return price_of_freedom(known) + (0.0 if is_named(known.candidate) else MARGIN)
 
 
-def _price_of_freedom(known: Named) -> float:
-    return PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)) + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
+def price_of_freedom(known: Named) -> float:
+    """Return what the choice of its place and shapes, and the columns of a cause cost, in logarithms of the likelihood."""
+    shapes = max(known.price, PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)))
+    return shapes + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
 
 
 def _grown(search: Search) -> tuple[Named, ...]:
@@ -545,11 +574,11 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
     return named
 
 
-def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list[tuple[Named, float]]:
+def alternatives(search: Search, named: tuple[Named, ...], place: int) -> list[tuple[Named, float]]:
     """Return the causes that may stand in the place of a named one, itself among them, with what they lack in likelihood."""
-    others = tuple(each for each in named if each is not known)
-    _, steps = strongest(search, others)
-    mine = max((step.score for step in steps if step.named[-1].candidate.cause == known.candidate.cause), default=np.inf)
+    cause = named[place].candidate.cause
+    _, steps = strongest(search, named[:place] + named[place + 1:])
+    mine = max((step.score for step in steps if step.named[-1].candidate.cause == cause), default=np.inf)
     return [(step.named[-1], mine - step.score) for step in steps
             if mine - step.score < RULED_OUT and is_named(step.named[-1].candidate)]
 
@@ -557,4 +586,4 @@ def alternatives(search: Search, named: tuple[Named, ...], known: Named) -> list
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the evidence of one of the causes beside the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
-    return work(search.field, named).score - work(search.field, others).score - _price_of_freedom(named[place])
+    return work(search.field, named).score - work(search.field, others).score - price_of_freedom(named[place])

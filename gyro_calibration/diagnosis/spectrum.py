@@ -17,6 +17,11 @@ from scipy.fft import dct, idct
 
 from gyro_calibration.log import Array
 
+#: Parts of the angle in which the noise of a filtered output has levels of its own, at most; the least number of coefficients in each; and
+#: the lowest level, for what is nearly free of noise would count for more than it is worth.
+_PARTS, _LEAST, _LOWEST = 32, 100, 0.003
+#: By how many of its standard deviations the level must fall for a filter: of the logarithm of a median of n that is 2.33 over root n.
+_SURE, _SCATTER = 4.5, 2.33
 #: Numbers of random walks, of strengths and times of Gauss-Markov processes, and of corners of flicker that are tried: see `noise_grid`.
 _WALKS, _STRENGTHS, _TIMES, _CORNERS = 14, 7, 7, 14
 
@@ -82,6 +87,30 @@ def inverse(coefficients: Array) -> Array:
 def angles(count: int) -> Array:
     """Return pi k / n of the coefficients of a signal of so many samples: shape (n - 1,)."""
     return np.arange(1, count) * math.pi / count
+
+
+def levels(whitened: Array) -> Array:
+    """
+    Return how strong coefficients are in equal parts of the angle, relative to the second part: shape (parts,); too few have one part.
+
+    The first part is as the second: what is slow is for `Shape` to say.
+
+    """
+    parts = np.array_split(whitened ** 2, max(min(_PARTS, len(whitened) // _LEAST), 1))
+    found = np.array([part.mean() for part in parts])
+    return np.maximum(np.concatenate([found[1:2], found[1:]]) / found[1], _LOWEST) if len(found) > 1 else np.ones(1)
+
+
+def fall(whitened: Array) -> float:
+    """Return what the power of coefficients in the last quarter of the angle is of that in the second; 1 where that may be chance."""
+    _, second, _, last = (float(np.median(part ** 2)) for part in np.array_split(whitened, 4))
+    by_chance = math.exp(-_SURE * _SCATTER * math.sqrt(8.0 / len(whitened)))
+    return last / second if last < by_chance * second else 1.0
+
+
+def level(angle: Array, found: Array) -> Array:
+    """Return the level at each angle by those in equal parts of it: straight lines of the logarithm between their middles."""
+    return np.exp(np.interp(angle, (np.arange(len(found)) + 0.5) * math.pi / len(found), np.log(found)))
 
 
 def bands(angle: Array, interval: float, single: int = 24, ratio: float = 1.12) -> Array:

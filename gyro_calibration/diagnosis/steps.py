@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2, norm
 
-from gyro_calibration.diagnosis.candidates import fitted_shapes
+from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.diagnosis.curves import curves, heading_curve, noise_curve
+from gyro_calibration.diagnosis.curves import beside_model, curves, heading_curve, noise_curve, what_is_left
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.experiment import separating
-from gyro_calibration.diagnosis.extension import extended
-from gyro_calibration.diagnosis.field import Named, work
+from gyro_calibration.diagnosis.extension import calibrated, doubts_scale, extended, left_out, noted, with_findings
+from gyro_calibration.diagnosis.field import Named, filtered, work
 from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figures
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
 from gyro_calibration.diagnosis.gain import gain
-from gyro_calibration.diagnosis.hygiene import Hygiene, inspect
+from gyro_calibration.diagnosis.hygiene import Hygiene, decided, inspect
 from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.search import MOST_OF, Search, alternatives, begin, evidence_of, polished, pruned, searched
 from gyro_calibration.diagnosis.units import amount
+from gyro_calibration.effects import QUANTIZATION
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
@@ -37,6 +39,10 @@ _LARGEST = 0.5
 _REPEATS = 1e-3
 #: Causes named from a temperature must repeat.
 _MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
+#: What is said of a channel that is constant, and the variable that is constant with it.
+_HARDLY = {'temperature': 'the temperature hardly changes', 'supply': 'the supply voltage does not change',
+           'specific_force': 'the specific force does not change'}
+_WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
 Say = Callable[[str], object]
 
@@ -61,24 +67,30 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
     """
     say('hygiene')
+    given, model = model, None if model is None else calibrated(model)
     for log in logs:
         refuse(log, model)
-    hygiene = [inspect(log, model) for log in logs]
+    hygiene = [decided(inspect(log, model)) for log in logs]
     say('replay')
     replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, clean.step, model)
                for log, clean in zip(logs, hygiene)]
     say('search')
-    search = begin(replays, generator, _OF_SEARCH * rate)
-    named, unnamed = _parted(search, searched(search))
+    search, everything = _searched(replays, generator, _OF_SEARCH * rate)
+    named, unnamed = _parted(search, everything)
     say('sets')
     named, rivals = _simplest(search, named, unnamed)
     found = Outcome(work(search.field, named), search.field.replays)
+    out = left_out(model or GyroModel(), found)
     say('noise')
-    figures = noise_figures(found.work, Noise() if model is None else model.noise)
+    figures = noise_figures(found.work, *_said_of_noise(model, hygiene))
     say('gain')
-    won = gain(search, {each.candidate.cause for members in rivals for each in members}, generator) if named else None
+    changed = [] if model is None else _of_model(found, model, figures.noise, rate)
+    causes = {each.candidate.cause for known, members in zip(named, rivals) if known not in out for each in members}
+    won = gain(search, causes, model is not None) if (causes or changed) and not doubts_scale(found) else None
     say('report')
-    return _told(_Conclusion(search, found, rivals, unnamed, figures, won), hygiene, model, rate, names, generator)
+    known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won, _cannot_show(search, logs))
+    told = _told(known, hygiene, model, rate, names, generator)
+    return replace(told, before=given, model=given) if given is not None and told.model is model else told
 
 
 @dataclass(frozen=True)
@@ -90,19 +102,54 @@ class _Conclusion:
     ----------
     search : in the logs
     found : the causes that are named, in values
+    out : those of them that the model cannot hold
     rivals : of each, itself and those that may be in its place
     unnamed : structure without a name, and causes whose names were withdrawn
     figures : of the noise that is left
+    changed : bias and scale factor error, where they are not those of the model that was given
     won : on what was held out
+    cannot_show : causes that these logs cannot show, with the reasons
 
     """
 
     search: Search
     found: Outcome
+    out: Sequence[Named]
     rivals: Sequence[Sequence[Named]]
     unnamed: tuple[Named, ...]
     figures: NoiseFigures
+    changed: Sequence[Finding]
     won: Gain | None
+    cannot_show: Mapping[str, str]
+
+    @property
+    def offered(self) -> bool:
+        """Tell whether the extended model is no worse than the one before."""
+        return self.won is None or not self.won.worse
+
+    @cached_property
+    def inside(self) -> Outcome:
+        """Return the causes that the model can hold, in values: fitted without the others, as it will stand without them."""
+        kept = [each for each in self.found.named if each not in self.out]
+        return Outcome(work(self.search.field, kept), self.found.replays) if self.out else self.found
+
+
+def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: float) -> tuple[Search, tuple[Named, ...]]:
+    """Search, and once more where what is left is the noise of a filter, which passes for causes while it is taken for white."""
+    search = begin(replays, generator, rate)
+    everything = searched(search)
+    as_filtered = filtered(work(search.field, everything))
+    if as_filtered is search.field.replays:
+        return search, everything
+    search = begin(as_filtered, generator, rate)
+    return search, searched(search)
+
+
+def _said_of_noise(model: GyroModel | None, hygiene: Sequence[Hygiene]) -> tuple[Noise, bool]:
+    """Return the noise that a model states, none without a model, and whether its output is rounded besides: a new one has steps found."""
+    if model is None:
+        return Noise(), any(each.effect == QUANTIZATION.name for clean in hygiene for each in clean.findings)
+    return model.noise, any(term.effect is QUANTIZATION for term in model.terms)
 
 
 def _mended(log: Log, clean: Hygiene) -> Log:
@@ -119,8 +166,8 @@ def _parted(search: Search, everything: tuple[Named, ...]) -> tuple[tuple[Named,
 
     """
     beyond = {name for each in everything if not is_named(each.candidate) for name in along(each.candidate).split(' and ')}
-    tones = [each for each in everything if each.candidate.cause == 'interference_tone']
-    if len(tones) >= MOST_OF['interference_tone']:
+    tones = [each.candidate.run for each in everything if each.candidate.cause == 'interference_tone']
+    if any(tones.count(run) >= MOST_OF['interference_tone'] for run in tones):
         beyond.add('frequency')
     kept = tuple(each for each in everything if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in beyond)
     kept = tuple(each for each in kept if _repeats(search, everything, each) and _is_small(search, each))
@@ -158,39 +205,41 @@ def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> boo
 def _simplest(search: Search, named: tuple[Named, ...], unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
     """Put the simplest member of each set in its place, and return all members of each."""
     rivals: list[list[Named]] = []
-    for place, known in enumerate(named):
-        members = [each for each, _ in alternatives(search, (*named, *unnamed), known)] or [known]
-        chosen = min(members, key=_size)
-        if _size(chosen) < _size(known):
+    for place in range(len(named)):
+        members = [each for each, _ in alternatives(search, (*named, *unnamed), place)] or [named[place]]
+        sizes = [_size(search, each) for each in members]
+        chosen = members[int(np.argmin(sizes))]
+        if min(sizes) < _size(search, named[place]):
             named = polished(search, (*named[:place], chosen, *named[place + 1:]))
         rivals.append(members)
     return named, rivals
 
 
-def _size(known: Named) -> int:
+def _size(search: Search, known: Named) -> int:
     """Return how many values a cause has."""
     candidate = known.candidate
-    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else max(len(known.values), 1))
+    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else len(candidate.columns(search.field.replays[0])))
 
 
 def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float, names: Sequence[str],
           generator: np.random.Generator) -> Diagnosis:
     """Put all that was found into words and records."""
-    search, found, noise = known.search, known.found, known.figures.noise
-    given, simulated = (GyroModel(), Noise()) if model is None else (model, model.noise)
-    findings = [*_named(known, generator), *_once([each for clean in hygiene for each in clean.findings])]
+    search, found, noise, simulated = known.search, known.found, known.figures.noise, Noise() if model is None else model.noise
+    of_record = _once([each for clean in hygiene for each in clean.findings])
+    said = {name for each in of_record for name in each.ambiguous_with}
+    findings = [*_named(known, generator), *of_record, *(each for each in known.changed if each.effect not in said)]
     if model is not None:
-        findings += [*_of_model(found, model, noise, rate), *_of_noise(known.figures, model.noise, rate, found.replays)]
+        findings += _of_noise(known.figures, model.noise, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
-    plain, deviation = Outcome(work(search.field, []), found.replays), _bias_deviation(found, noise)
-    offered = known.won is None or not known.won.worse
-    before = extended(given, plain, noise, deviation, {}) if model is None else model
-    after = extended(given, found, noise, deviation, _said_of_sets(findings)) if offered else before
-    shown = found if offered else plain
+    plain, deviation = Outcome(work(search.field, []), found.replays), _bias_deviation(known.inside, noise)
+    before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise), GyroModel(), hygiene)
+    after = with_findings(model, known.inside, hygiene, findings, noise, deviation) if known.offered else before
+    # Bias and scale factor error that are not found to differ are drawn as they fit best: they may differ by chance.
+    left, shown = beside_model(found.replays) if known.changed else what_is_left(plain), known.inside if known.offered else plain
     return Diagnosis(
-        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated, known.won, before, after, _cannot_show(search),
-        curves(plain, shown), heading_curve(plain, shown), noise_curve(found, noise, simulated),
-        tuple(_remarks(hygiene, names, known, offered)), rate, tuple(names))
+        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated, known.won, before, after, known.cannot_show,
+        curves(left, shown), heading_curve(left, shown), noise_curve(found, noise, simulated),
+        tuple(_remarks(hygiene, names, known, model)), rate, tuple(names))
 
 
 def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
@@ -249,7 +298,7 @@ def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) 
     unit = next(iter(cause.units.values()))
     return Finding(name, cause.sentence, {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
                    float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins, cause.separate_by if twins else '',
-                   f'beside the model, it is {abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
+                   f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
 
 
 def _of_noise(figures: NoiseFigures, expected: Noise, rate: float, replays: Sequence[Replay]) -> list[Finding]:
@@ -265,46 +314,53 @@ def _of_noise(figures: NoiseFigures, expected: Noise, rate: float, replays: Sequ
     return found
 
 
-def _said_of_sets(findings: Sequence[Finding]) -> dict[str, object]:
-    """Return a note on each set of which the simplest member is used, for the origin of the model."""
-    notes = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead' for each in findings if each.ambiguous_with]
-    return {'ambiguous': notes} if notes else {}
-
-
-def _cannot_show(search: Search) -> dict[str, str]:
-    """Say of each cause that was not searched for why these logs cannot show it."""
+def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
+    """Say of each cause that was not searched for, or could not be found, why these logs cannot show it."""
     replays = search.field.replays
     has = frozenset.intersection(*(each.has for each in replays)) | {'time', 'output'}
-    has |= {'reference', *REFERENCES} if any(np.any(each.reference != 0.0) for each in replays) else frozenset()
+    of_motion = frozenset({'reference', *REFERENCES})
+    has |= of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES) else frozenset()
+    moves = any(np.any(each.reference[each.kept] != 0.0) for each in replays)
     told = {}
     for name, cause in CAUSES.items():
         missing = sorted(cause.needs - has)
         if missing:
             told[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
+        elif not moves and cause.needs & of_motion:
+            told[name] = 'the reference shows no motion'
     for name, reason in _constant(replays).items():
         told.update({cause.name: reason for cause in CAUSES.values() if cause.along == name and cause.name not in told})
+    alike = 'in these logs it would look exactly like a bias or a scale factor error'
+    told.update(dict.fromkeys(sorted(search.tied & (CAUSES.keys() - told.keys())), alike))
     return told
 
 
 def _constant(replays: Sequence[Replay]) -> dict[str, str]:
     """Return the variables that stay the same in all logs, with what is said of them."""
-    quiet = {}
-    for name, reason in (('temperature', 'the temperature hardly changes'), ('supply', 'the supply voltage does not change'),
-                         ('specific_force', 'the specific force does not change')):
-        values = [getattr(each.channels, name) for each in replays if name in each.has]
-        if values and max(float(np.ptp(value)) for value in values) < (0.2 if name == 'temperature' else 1e-9):
-            quiet[name] = reason
-    if 'temperature' in quiet:
-        quiet['temperature_rate'] = quiet['temperature']
-    return quiet
+    same = constant(replays)
+    quiet = {name: reason for name, reason in _HARDLY.items() if name in same}
+    return {**quiet, **{other: quiet[name] for name, other in _WITH.items() if name in quiet}}
 
 
-def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion, offered: bool) -> Iterator[str]:
+def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion, model: GyroModel | None) -> Iterator[str]:
     for place, clean in enumerate(hygiene):
         where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
     for name in dict.fromkeys(each.candidate.cause for each in known.unnamed if is_named(each.candidate)):
         why = 'it is at many frequencies' if name == 'interference_tone' else 'it differs from log to log, or is not alone'
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    if not offered:
+    yield from _of_what_is_left_out(known, model)
+    if not known.offered:
         yield 'On the parts held out, the extended model was worse than the one before; it is not offered.'
+
+
+def _of_what_is_left_out(known: _Conclusion, model: GyroModel | None) -> Iterator[str]:
+    """Say what was found and is in no model, and why."""
+    scale, own = known.found.scale_factor_error, {term.effect.name for term in ([] if model is None else model.terms)}
+    if doubts_scale(known.found):
+        yield (f'A scale factor error of {100.0 * scale.value:.2g} +- {100.0 * scale.deviation:.1g} % is in no model: there is too little '
+               'motion beside the noise of gyro and reference for it to be believed; turn faster, and both ways.')
+    for name in dict.fromkeys(each.candidate.cause for each in known.out):
+        remedy = '; take that out of the model that is given, and diagnose again' if name in own else ''
+        yield (f'A further {name.replace("_", " ")} is not in the extended model, because that has one already and the two do not make '
+               f'one{remedy}.')

@@ -1,7 +1,4 @@
-"""
-Stuck samples: the last value once more, where a new one was due. An output of coarse codes repeats itself honestly.
-
-"""
+"""Stuck samples: the last value once more, where a new one was due. An output of coarse codes repeats itself honestly."""
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import ndtr
 
+from gyro_calibration.diagnosis.codes import Codes, DeadBand, doubt_of, steps_about
 from gyro_calibration.diagnosis.compared import Compared
 from gyro_calibration.log import Array, Mask
 
@@ -25,6 +23,10 @@ _COARSE = 0.3
 _RARE = 0.02
 #: Excess of repeats over the honest ones, as a part of these, below which their number is not known well enough.
 _EXCESS = 0.5
+#: A run is like others up to so many times the longest of them.
+_ALIKE = 2.0
+#: A code that is narrower than this part of the noise is a point.
+_NARROW = 1e-5
 
 
 @dataclass(frozen=True)
@@ -47,17 +49,47 @@ class Stuck:
     @property
     def runs(self) -> int:
         """Return how often it stuck."""
-        return int(np.count_nonzero(np.diff(self.repeats.astype(np.int8), prepend=0) > 0))
+        return len(_lengths(self.repeats))
+
+    def has_one_more(self, at_limit: Mask) -> bool:
+        """Tell whether samples at a limit are one run that is like the others: the largest or smallest value of the log stuck, too."""
+        lengths = _lengths(at_limit)
+        return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * _lengths(self.repeats).max()
 
 
-def stuck_samples(seen: Compared, step: float, good: Mask, level: float) -> Stuck | None:
+@dataclass(frozen=True)
+class _Honest:
+    """
+    What codes and noise explain of each change, arrays of shape (n - 1,).
+
+    Attributes
+    ----------
+    chance : of it to be none
+    again : the most that this is within a run of repeats
+    width : of the code that it begins in, rad/s
+
+    """
+
+    chance: Array
+    again: Array
+    width: Array
+
+
+def _lengths(marked: Mask) -> NDArray[np.int_]:
+    """Return the lengths of the runs of marked samples."""
+    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
+    return edges[1::2] - edges[::2]
+
+
+def stuck_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask, level: float) -> Stuck | None:
     """
     Find samples that are stuck, or return None.
 
     Parameters
     ----------
     seen : output and expectation
-    step : between codes, rad/s; 0 for none
+    codes : of the output
+    band : of rates that the output has one value for, if it has one
     good : samples to look at; those at a limit repeat honestly
     level : chance of a false alarm
 
@@ -66,45 +98,54 @@ def stuck_samples(seen: Compared, step: float, good: Mask, level: float) -> Stuc
     same, expected = (change == 0.0) & looked, _expected_change(seen.expected, len(change))
     if not same.any():
         return None
-    chance = _honest_chances(change, expected, step, looked)
+    honest = _in_the_band(_honest(change, expected, steps_about(codes, seen.output[:-1]), looked), band, seen)
     repeats, p_value = np.zeros(len(good), dtype=bool), 1.0
-    honest = float(chance[looked].sum())
-    rare = (chance < _COARSE) & looked
-    excess, believed = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
+    rare = (honest.chance < _COARSE) & looked
+    excess, believed = int(np.count_nonzero(same & rare)), float(honest.chance[rare].sum())
     by_number = float(stats.poisson.sf(excess - 1, believed)) if excess > believed * (1.0 + _EXCESS) else 1.0
     if by_number < level:
-        repeats[1:], p_value = same & (chance < _RARE), by_number
-    for start, stop, unlikely in _runs(same, chance, expected, step, seen.white):
+        repeats[1:], p_value = same & (honest.chance < _RARE), by_number
+    for start, stop, unlikely in _runs(same, honest, expected, doubt_of(seen)):
         if unlikely * len(good) < level:
             repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
-    return Stuck(repeats, honest, p_value) if repeats.any() else None
+    return Stuck(repeats, float(honest.chance[looked].sum()), p_value) if repeats.any() else None
 
 
 def _expected_change(expected: Array | None, count: int) -> Array:
     return np.zeros(count) if expected is None else np.nan_to_num(np.diff(expected))
 
 
-def _honest_chances(change: Array, expected: Array, step: float, looked: Mask) -> Array:
+def _honest(change: Array, expected: Array, step: Array, looked: Mask) -> _Honest:
     """
-    Return the chance of each change to be none.
+    Return what codes and noise explain of each change.
 
-    It is the part of a code that the sample before leaves for this one, averaged over the noise, among changes that are expected alike.
+    The chance is the part of a code that the sample before leaves for this one, averaged over the noise, among changes that are expected
+    alike. The longer a run is, the likelier its code is the one in whose middle the expectation lies; so within it that code counts.
 
     """
-    if step == 0.0:
-        return np.zeros(len(change))
-    chances = np.ones(len(change))
+    chances, again = np.ones((2, len(change)))
     edges = np.quantile(np.abs(expected), np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1])
     classes = np.searchsorted(edges, np.abs(expected), side='left')
     for each in np.unique(classes):
         members = np.flatnonzero((classes == each) & looked)
         if len(members):
-            deviation = _deviation_of_changes(change[members] - expected[members], change[members] == 0.0, step)
-            chances[members] = np.maximum(_same_code(expected[members], deviation, step), _share_of_neighbours(change[members], step))
-    return chances
+            due, steps = expected[members], step[members]
+            deviation = _deviation_of_changes(change[members] - due, change[members] == 0.0, float(np.median(steps)))
+            chances[members] = np.maximum(_same_code(due, deviation, steps), _share_of_neighbours(change[members], steps))
+            again[members] = np.maximum(_middle_code(due, deviation, steps), chances[members])
+    return _Honest(chances, again, step)
 
 
-def _share_of_neighbours(change: Array, step: float) -> float:
+def _in_the_band(honest: _Honest, band: DeadBand | None, seen: Compared) -> _Honest:
+    """Return the same, where a sample in a dead band repeats itself as long as the next one is due in it."""
+    if band is None:
+        return honest
+    within, chances = band.holds(seen.output[:-1]), band.chances(seen)[1:]
+    chance, again = (np.where(within, np.maximum(each, chances), each) for each in (honest.chance, honest.again))
+    return _Honest(chance, again, np.where(within, 2.0 * band.half, honest.width))
+
+
+def _share_of_neighbours(change: Array, step: Array) -> float:
     """Return the share of changes by one code or two, each way: no fewer are none, whatever the noise is like."""
     size = np.abs(change)
     count = np.count_nonzero((size > 0.5 * step) & (size < 2.5 * step))
@@ -120,32 +161,39 @@ def _deviation_of_changes(change: Array, same: Mask, step: float) -> float:
     square = float(np.mean(moved ** 2))
     variance = square
     for _ in range(20):
-        variance = square * (1.0 - float(_same_code(np.zeros(1), np.sqrt(variance), step)[0]))
+        variance = square * (1.0 - float(_same_code(np.zeros(1), np.sqrt(variance), np.array([step]))[0]))
     return float(np.sqrt(variance))
 
 
-def _same_code(expected: Array, deviation: float, step: float) -> Array:
+def _same_code(expected: Array, deviation: float, step: Array) -> Array:
     """Return the mean of max(0, 1 - |D| / step) for D of this mean and standard deviation: two samples then have one code."""
-    scale = max(deviation, 1e-9 * step)
+    scale = np.maximum(deviation, 1e-9 * step)
     low, middle, high = ((edge - expected) / scale for edge in (-step, 0.0, step))
     above, below = ndtr(high) - ndtr(middle), ndtr(middle) - ndtr(low)
     sizes = expected * (above - below) + scale * (2.0 * _density(middle) - _density(high) - _density(low))
-    return np.clip(above + below - sizes / step, 0.0, 1.0)
+    # Differences of nearly nothing are rounding.
+    return np.where(step < _NARROW * scale, step / scale * _density(middle), np.clip(above + below - sizes / step, 0.0, 1.0))
+
+
+def _middle_code(expected: Array, deviation: float, step: Array) -> Array:
+    """Return the chance of the code that lies in the middle between two expectations, for each of the two samples."""
+    scale = np.maximum(deviation / math.sqrt(2.0), 1e-9 * step)
+    return ndtr(0.5 * (step - expected) / scale) - ndtr(-0.5 * (step + expected) / scale)
 
 
 def _density(values: Array) -> Array:
     return np.exp(-0.5 * values ** 2) / math.sqrt(2.0 * math.pi)
 
 
-def _runs(same: Mask, chance: Array, expected: Array, step: float, white: float) -> Iterator[tuple[int, int, float]]:
+def _runs(same: Mask, honest: _Honest, expected: Array, doubt: float) -> Iterator[tuple[int, int, float]]:
     """Give where runs of at least two repeats begin and end, and how unlikely each is."""
     edges: NDArray[np.intp] = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]
-    product, due = (np.concatenate([[0.0], np.cumsum(each)]) for each in (np.log(np.maximum(chance, 1e-12)), expected))
+    product, due = (np.concatenate([[0.0], np.cumsum(each)]) for each in (np.log(np.maximum(honest.again, 1e-12)), expected))
     for start, stop in zip(starts[stops - starts >= 2].tolist(), stops[stops - starts >= 2].tolist()):
-        if chance[start:stop].max() < _COARSE:
+        if honest.chance[start:stop].max() < _COARSE:
             yield start, stop, float(np.exp(max(product[stop] - product[start], -700.0)))
         else:
             # Repeats of a coarse code depend on each other: it is stuck only if it should have left the code.
-            left = abs(due[stop] - due[start]) - step
-            yield start, stop, float(2.0 * stats.norm.sf(left / (np.sqrt(2.0) * white))) if left > 0.0 else 1.0
+            left = abs(due[stop] - due[start]) - honest.width[start]
+            yield start, stop, float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * doubt))) if left > 0.0 else 1.0

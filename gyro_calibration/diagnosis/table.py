@@ -1,7 +1,4 @@
-"""
-The diagnosis of a rate table, a log without time whose rows are dwells: what the simulation gets wrong, why, and what is won.
-
-"""
+"""The diagnosis of a rate table, a log without time whose rows are dwells: what the simulation gets wrong, why, and what is won."""
 
 from __future__ import annotations
 
@@ -14,22 +11,24 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from gyro_calibration.calibration import Calibration, columns_of, fit_effects
+from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.dwell_fit import NUISANCES, Named, change_of, doubt, model_after, model_before, name_causes, seen, tried
-from gyro_calibration.diagnosis.dwell_gain import WINDOW, curves, measure_gain
+from gyro_calibration.diagnosis.dwell_gain import curves, measure_gain
 from gyro_calibration.diagnosis.dwell_rest import RATE, SINGLE_RATES, Left, what_is_left
 from gyro_calibration.diagnosis.dwell_sets import alternatives
+from gyro_calibration.diagnosis.extension import notes_of
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
-from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.diagnosis.gain import WINDOW
+from gyro_calibration.diagnosis.hygiene import decided, inspect
 from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.dwells import Dwells, from_table, listed, take
 from gyro_calibration.effects import CUBIC_NONLINEARITY, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE, STEADY, Effect
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
-from gyro_calibration.scatter import SMALLEST_TEMPERATURE_SPREAD, Uncertainty
+from gyro_calibration.scatter import SMALLEST_TEMPERATURE_SPREAD, Uncertainty, Whitener, freedom_beside_surface, rms
 from gyro_calibration.selection import supported_effects, swapped_effects
 
 #: Parts of the false-alarm rate: of structure without a name, and of outlying dwells; the rest is that of causes.
@@ -46,7 +45,7 @@ _METHOD = (
 _WITHDRAWN = 0.1
 
 
-def diagnose_table(table: Log | Dwells, model: GyroModel | None, generator: np.random.Generator, rate: float = 0.01) -> Diagnosis:
+def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0.01) -> Diagnosis:
     """
     Say what a simulation gets wrong of the dwells of a rate table.
 
@@ -54,7 +53,6 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, generator: np.r
     ----------
     table : a log without time, or its dwells
     model : that is put to the test; an ideal gyro with the bias and scale factor that fit best where it is None
-    generator : source of the bootstrap
     rate : of false alarms, a table
 
     Raises
@@ -65,17 +63,17 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, generator: np.r
     dwells = table if isinstance(table, Dwells) else from_table(table)
     refuse(_as_log(dwells), model)
     _refuse_one_rate(dwells)
-    record = inspect(_as_log(dwells), model)
+    record = decided(inspect(_as_log(dwells), model))
     dwells = replace(dwells, output=dwells.output * record.factor)
     known = _conclude(dwells, model, rate)
-    gain = measure_gain(dwells, lambda part: _models(part, model, rate, known.withdrawn), generator) if known.named.causes else None
+    gain = measure_gain(dwells, lambda part: _models(part, model, rate, known.withdrawn)) if known.named.causes else None
     before = model_before(dwells, model, known.named)
     offered = bool(known.named.causes) and not (gain is not None and gain.worse)
     after = model_after(dwells, model, known.named) if offered else before
     findings = (*record.findings, *_outliers(dwells, known.named.fit, _OUTLYING * rate), *_findings(known.named))
     return Diagnosis(
-        findings, known.left.found, Noise(), Noise() if model is None else model.noise, gain, before, _noted(after, findings, before),
-        _cannot_show(dwells), curves(dwells, known.named.fit.scatter, before, after),
+        findings, known.left.found, Noise(), Noise() if model is None else model.noise, gain, before,
+        _noted(after, findings, before, record.factor), _cannot_show(dwells), curves(dwells, known.named.fit.scatter, before, after),
         remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)), false_alarm_rate=rate,
         method=' '.join(_METHOD).format(share=100.0 * rate))
 
@@ -126,10 +124,11 @@ def _models(dwells: Dwells, model: GyroModel | None, rate: float, withdrawn: fro
 def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
     """Give outlying dwells, if the farthest is beyond chance beside what is fitted to the others."""
     outlying = np.flatnonzero(~fit.scatter.kept)
-    if not len(outlying) or fit.freedom < 1:
+    freedom = freedom_beside_surface(take(dwells, fit.scatter.kept))
+    if not len(outlying) or min(freedom, fit.freedom) < 1:
         return
-    far = np.abs(fit.residual[outlying]) / _total_deviation(fit)[outlying]
-    chance = min(1.0, len(dwells) * 2.0 * float(student.sf(far.max(), fit.freedom)))
+    far = np.abs(fit.residual[outlying]) / _deviation_from(fit)[outlying]
+    chance = min(1.0, len(dwells) * 2.0 * float(student.sf(far.max(), freedom)))
     if chance < level:
         cause, count = CAUSES['outliers'], float(len(outlying))
         places = listed([dwells.place[row] for row in outlying])
@@ -138,10 +137,12 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
                       f'say: {places}', along=RATE)
 
 
-def _total_deviation(fit: Calibration) -> Array:
-    """Return the standard deviation of each dwell with what its sweep shares, rad/s, shape (n,)."""
-    shared = fit.scatter.shared(fit.dwells)
-    return np.asarray(np.sqrt(fit.scatter.deviation(fit.dwells) ** 2 + np.sum(shared ** 2, axis=1)))
+def _deviation_from(fit: Calibration) -> Array:
+    """Return the standard deviation by which each dwell would be off a fit that it took no part in, rad/s, shape (n,)."""
+    used, shared = take(fit.dwells, fit.scatter.kept), fit.scatter.shared(fit.dwells)
+    columns = Whitener(used, fit.scatter).whiten(columns_of(used, fit.terms))
+    of_fit = columns_of(fit.dwells, fit.terms) @ np.linalg.pinv(columns)
+    return np.asarray(np.sqrt(fit.scatter.deviation(fit.dwells) ** 2 + np.sum(shared ** 2, axis=1) + np.sum(of_fit ** 2, axis=1)))
 
 
 # findings
@@ -173,15 +174,21 @@ def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
 def _finding(named: Named, effect: Effect) -> Finding:
     cause, others = CAUSES[effect.name], alternatives(named.fit, effect)
     along = 'temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE else cause.along
-    return Finding(effect.name, cause.sentence, _estimates(named.fit, effect), named.chance_of(effect), _smallest(named, effect),
+    return Finding(effect.name, cause.sentence, _estimates(named, effect), named.chance_of(effect), _smallest(named, effect),
                    others.names, others.separate_by, _evidence(named, effect), along)
 
 
-def _estimates(fit: Calibration, effect: Effect) -> dict[str, Estimate]:
-    """Return the values of an effect; 1.96 standard deviations hold 95 %."""
-    term, deviations = _with_deviations(fit, effect)
-    return {effect.parameters[place].name: _estimate(term.values[place], deviation, effect.parameters[place].unit)
+def _estimates(named: Named, effect: Effect) -> dict[str, Estimate]:
+    """Return what comes on top of the values that the model has of an effect; 1.96 standard deviations hold 95 %."""
+    term, deviations = _with_deviations(named.fit, effect)
+    own = _own_values(named, effect)
+    return {effect.parameters[place].name: _estimate(term.values[place] - own[place], deviation, effect.parameters[place].unit)
             for place, deviation in zip(term.fitted, deviations)}
+
+
+def _own_values(named: Named, effect: Effect) -> tuple[float, ...]:
+    """Return the values that the model has of an effect, 0 where it has none."""
+    return next((term.values for term in named.model.terms if term.effect is effect), (0.0,) * len(effect.parameters))
 
 
 def _estimate(value: float, deviation: float, unit: str) -> Estimate:
@@ -209,7 +216,8 @@ def _smallest(named: Named, effect: Effect) -> float | None:
     if cubic is None:
         return None
     size = _found_from(cubic, CUBIC_NONLINEARITY, level)
-    return size if effect is CUBIC_NONLINEARITY else math.sqrt(6.0 * size)
+    own = _own_values(named, SINE_RESPONSE)[0]
+    return size if effect is CUBIC_NONLINEARITY else math.sqrt(own ** 2 + 6.0 * size) - own
 
 
 def _found_from(fit: Calibration, effect: Effect, level: float) -> float:
@@ -241,10 +249,9 @@ def _evidence(named: Named, effect: Effect) -> str:
 
 # what a person should know
 
-def _noted(model: GyroModel, findings: tuple[Finding, ...], before: GyroModel) -> GyroModel:
-    """Return the extended model with what it does not tell apart, for its file."""
-    notes = [f'{found.effect} is used; it may be {" or ".join(found.ambiguous_with)} instead' for found in findings if found.ambiguous_with]
-    return model if model is before or not notes else replace(model, origin={**model.origin, 'ambiguous': notes})
+def _noted(model: GyroModel, findings: tuple[Finding, ...], before: GyroModel, factor: float) -> GyroModel:
+    """Return the extended model with what it does not tell apart, and what its output was multiplied by, for its file."""
+    return model if model is before else replace(model, origin={**model.origin, **notes_of(findings, [factor])})
 
 
 def _remarks(dwells: Dwells, model: GyroModel | None, known: _Known, gain: Gain | None, offered: bool) -> Iterator[str]:
@@ -287,7 +294,9 @@ def _beside_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
     except DataRefused:
         return
     effects = ', '.join(effect.name for effect in named.effects)
-    yield (f'{effects} alone, {_values(named)} values, predict left-out sweeps to {named.left_out_rms / DEGREE:.3g} deg/s; a polynomial '
+    # What effects of the rate leave is of the output; what a polynomial of the output leaves is of the rate already.
+    of_rate = rms((named.left_out / named.model.steepness(channels_of(dwells)))[named.scatter.kept])
+    yield (f'{effects} alone, {_values(named)} values, predict the rates of left-out sweeps to {of_rate / DEGREE:.3g} deg/s; a polynomial '
            f'of the orders that the model has, {_values(polynomial)} values, to {polynomial.left_out_rms / DEGREE:.3g} deg/s.')
 
 
@@ -306,10 +315,10 @@ _REASONS = {
     **dict.fromkeys(('interference_tone', 'quantization', 'dead_zone', 'saturation', 'stuck_samples', 'dropped_samples',
                      'angle_random_walk', 'bias_instability', 'rate_random_walk'), _AVERAGED),
     **dict.fromkeys(('heading_sensitivity', 'reference_once_per_rev', 'reference_quantization'),
-                    'the table holds no heading, and whole turns average over all; record reference_heading_deg in time'),
+                    'whole turns average over all headings; record reference_heading_deg in time'),
     **dict.fromkeys(('acceleration_sensitivity', 'vibration_rectification'),
-                    'the table holds no specific force; record acceleration_mps2 in several poses'),
-    'supply_sensitivity': 'the table holds no supply voltage; record supply_v',
+                    'of a table, rates and temperatures alone are looked at; record acceleration_mps2 in several poses, in time'),
+    'supply_sensitivity': 'of a table, rates and temperatures alone are looked at; record supply_v in time',
     'reference_scale': 'only a second reference tells the scale of the first from that of the gyro'}
 
 

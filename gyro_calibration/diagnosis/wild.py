@@ -1,7 +1,4 @@
-"""
-Wild samples: single ones far from their neighbours, and not because the gyro moves.
-
-"""
+"""Wild samples: single ones far from their neighbours, and not because the gyro moves."""
 
 from __future__ import annotations
 
@@ -62,7 +59,7 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
     Parameters
     ----------
     seen : output and expectation
-    good : samples that count
+    good : samples that count; beside three and more of six that do not, as after a stuck run, one is not judged
     floor : the scatter is at least this, rad/s: half a code
     level : chance of a false alarm
 
@@ -74,15 +71,16 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
     if expected is not None:
         beside = _far(output - expected, moved, good, floor)
         far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
-    wild = _single((far > limit) & good)
-    count, near = int(np.count_nonzero(wild)), int(np.count_nonzero((far > _NEAR) & (far <= limit) & good))
+    judged = good & (np.count_nonzero(_neighbours(~good, _SIDE), axis=1) < _SIDE)
+    wild = _single((far > limit) & judged)
+    count, near = int(np.count_nonzero(wild)), int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged))
     if not count or near > 0.5 * count + stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
     return Wild(wild, float(far[wild].max()), p_value) if p_value < level else None
 
 
-def _neighbours(values: Array, side: int) -> Array:
+def _neighbours(values: Array | Mask, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
     # Turned over about the first and last sample, a slope goes on as it is.
     window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'), 2 * side + 1)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from gyro_calibration.diagnosis.finding import Change, Diagnosis, Finding, Unexplained
 from gyro_calibration.diagnosis.units import Quantity, amount, chance, number, quantity
-from gyro_calibration.model import same_effects
+from gyro_calibration.model import Term, same_effects
 
 #: Lines for a terminal are not longer.
 _WIDTH = 120
@@ -89,8 +89,21 @@ def _share(share: float) -> str:
 
 
 def offered(diagnosis: Diagnosis) -> bool:
-    """Tell whether the model was extended; bias and scale factor error alone may differ by chance."""
-    return bool(diagnosis.findings) and not same_effects(diagnosis.before, diagnosis.model)
+    """Tell whether the model was extended: its effects, their values or its noise."""
+    before, after = diagnosis.before, diagnosis.model
+    return bool(diagnosis.findings) and not (same_effects(before, after) and before.noise == after.noise)
+
+
+def is_inside(found: Finding, diagnosis: Diagnosis) -> bool:
+    """Tell whether the extended model has a cause: by a value that is new, and of several of one effect by their shapes."""
+    new = [term for term in diagnosis.model.terms if term.effect.name == found.effect and term not in diagnosis.before.terms]
+    alone = sum(each.effect == found.effect for each in diagnosis.findings) == 1
+    return offered(diagnosis) and any(alone or _has_shapes(term, found) for term in new)
+
+
+def _has_shapes(term: Term, found: Finding) -> bool:
+    values = dict(zip((parameter.name for parameter in term.effect.parameters), term.values[:len(term.effect.shapes)]))
+    return all(found.parameters[name].estimate == value for name, value in values.items() if name in found.parameters)
 
 
 def _won(diagnosis: Diagnosis) -> str:
@@ -108,11 +121,13 @@ def _won(diagnosis: Diagnosis) -> str:
 def change(errors: Change, unit: str, what: str) -> str:
     """Return what becomes of an error, as the end of a sentence."""
     before, after = (amount(value, unit) for value in (errors.before, errors.after))
+    if errors.interval is None:
+        return f'brings {what} from {before} to {after} rms, with one part only and so no interval'
     if errors.interval[0] > 0.0:
         return f'brings {what} down from {before} to {after} rms'
-    if errors.interval[1] < 0.0:
+    if errors.worse:
         return f'makes {what} worse, from {before} to {after} rms'
-    return f'leaves {what} as it is within chance, {before} before and {after} after'
+    return f'brings {what} from {before} to {after} rms, over parts too few or too uneven to promise that for others'
 
 
 # one by one

@@ -1,7 +1,4 @@
-"""
-Averaging: the means of dwells, and how well each is known.
-
-"""
+"""Averaging: the means of dwells, and how well each is known."""
 
 from __future__ import annotations
 

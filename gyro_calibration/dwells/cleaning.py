@@ -1,7 +1,4 @@
-"""
-Cleaning: wild and stuck samples of a gyro, found in a stretch of steady rate and left out of it.
-
-"""
+"""Cleaning: wild and stuck samples of a gyro, found in a stretch of steady rate and left out of it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""
-Samples: what of a log in time can be used, and the small questions that all parts of the search for dwells ask of them.
-
-"""
+"""Samples: what of a log in time can be used, and the small questions that all parts of the search for dwells ask of them."""
 
 from __future__ import annotations
 
@@ -17,6 +14,8 @@ from gyro_calibration.stamps import lost_samples
 
 #: Samples that a dwell holds at least.
 FEWEST = 8
+#: Values of a reference that are further apart than so many usual intervals have lost some in between.
+_LOST = 1.5
 #: Longer intervals than this say nothing of the sample rate, s.
 _PAUSE = 1.0
 
@@ -44,14 +43,32 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
     if time is None or reference is None:
         raise DataRefused('the log has no time or no reference; to find dwells it needs time_s and one of reference_rate_dps and '
                           'reference_heading_deg')
-    lost = ~np.isfinite(reference)
+    known = np.isfinite(reference)
+    lost = where_lost(known)
     # A reference that gets lost errs before and after; the tracker loses its markers one by one.
-    good = np.flatnonzero(~maximum_filter1d(lost, 2 * count(time, 0.05) + 1) & np.isfinite(output))
+    good = np.flatnonzero(~maximum_filter1d(lost, 2 * count(time, 0.05) + 1) & known & np.isfinite(output))
     if len(good) < FEWEST:
         raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and a reference; look at the columns')
     rate, heading, temperature = (None if values is None else values[good]
                                   for values in (log.reference_rate, log.reference_heading, log.temperature))
     return Samples(time[good], output[good], rate, heading, temperature), list(_lost_reference(time, lost))
+
+
+def where_lost(known: Mask) -> Mask:
+    """Tell where a reference was lost: its values are further apart there than most of them, for it may be slower than the gyro."""
+    apart = np.diff(np.flatnonzero(known), prepend=-1, append=len(known))
+    usual = float(np.median(apart[1:-1])) if len(apart) > 2 else 1.0
+    lost = ~known
+    lost[~known] = np.repeat(apart > _LOST * usual, apart - 1)
+    return lost
+
+
+def between_values(time: Array, values: Array) -> Array:
+    """Return a reference that is slower than the gyro at each sample, on the line between two values; nan where it was lost."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return values
+    return np.where(where_lost(known), np.nan, np.interp(time, time[known], values[known], np.nan, np.nan))
 
 
 def output_of(log: Log) -> Array:

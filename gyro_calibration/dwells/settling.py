@@ -1,7 +1,4 @@
-"""
-Settling: what a gyro still, or already, answers to a ramp is cut off the ends of dwells.
-
-"""
+"""Settling: what a gyro still, or already, answers to a ramp is cut off the ends of dwells."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""
-Steadiness: what a stretch of a log must keep to be a dwell, and where a reference rate keeps it.
-
-"""
+"""Steadiness: what a stretch of a log must keep to be a dwell, and where a reference rate keeps it."""
 
 from __future__ import annotations
 

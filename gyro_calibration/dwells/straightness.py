@@ -1,7 +1,4 @@
-"""
-Straightness: where a reference heading runs along a straight line in time, but for the steps of its encoder.
-
-"""
+"""Straightness: where a reference heading runs along a straight line in time, but for the steps of its encoder."""
 
 from __future__ import annotations
 
@@ -103,6 +100,8 @@ def _apart(parts: Iterable[slice]) -> list[slice]:
 def _holds_its_slope(time: Array, heading: Array, step: float, limits: Steadiness) -> bool:
     """Tell whether the quarters of a stretch have one slope: a slow swing is straight for a while, but not steady."""
     quarters = [quarter for quarter in np.array_split(np.arange(len(time)), 4) if len(quarter) > 2]
+    if not quarters:
+        return True
     slopes = np.array([slope(time[quarter], heading[quarter]) for quarter in quarters])
     blur = 8.0 * step / (time[-1] - time[0])
     return bool(np.ptp(slopes) <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)

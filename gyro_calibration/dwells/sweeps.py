@@ -1,7 +1,4 @@
-"""
-Sweeps: which dwells belong to one pass through the rates.
-
-"""
+"""Sweeps: which dwells belong to one pass through the rates."""
 
 from __future__ import annotations
 

@@ -29,6 +29,7 @@ class Dwells:
     sweep : number of the sweep, or block of time, that a dwell belongs to; what is left out together
     place : where each dwell stands in its file, for messages
     remarks : what was found and left out, one sentence each
+    rows : of its log, which each dwell is the mean of
 
     """
 
@@ -39,6 +40,7 @@ class Dwells:
     sweep: Numbers
     place: tuple[str, ...]
     remarks: tuple[str, ...] = ()
+    rows: tuple[Numbers, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rate)
@@ -69,8 +71,9 @@ def take(dwells: Dwells, which: Mask) -> Dwells:
     """Return some of the dwells, by a mask of shape (n,)."""
     temperature = None if dwells.temperature is None else dwells.temperature[which]
     places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
+    rows = tuple(rows for rows, wanted in zip(dwells.rows, which) if wanted)
     return replace(dwells, rate=dwells.rate[which], output=dwells.output[which], temperature=temperature,
-                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places)
+                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places, rows=rows)
 
 
 def join(parts: Sequence[Dwells]) -> Dwells:
@@ -86,7 +89,7 @@ def join(parts: Sequence[Dwells]) -> Dwells:
     return Dwells(np.concatenate([part.rate for part in parts]), np.concatenate([part.output for part in parts]),
                   np.concatenate(temperatures) if whole else None, np.concatenate([part.deviation for part in parts]),
                   np.concatenate([part.sweep + number for part, number in zip(parts, first)]),
-                  sum((part.place for part in parts), ()), remarks)
+                  sum((part.place for part in parts), ()), remarks, sum((part.rows for part in parts), ()))
 
 
 def from_table(log: Log) -> Dwells:
@@ -110,7 +113,7 @@ def from_table(log: Log) -> Dwells:
     rate, names = log.reference_rate[rows], log.others.get('sweep')
     sweep = sweeps(rate) if names is None else numbered([names[row] for row in rows])
     return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows], _told_deviation(log)[rows], sweep,
-                  tuple(f'row {row + 1}' for row in rows), tuple(_lost_rows(good)))
+                  tuple(f'row {row + 1}' for row in rows), tuple(_lost_rows(good)), tuple(np.split(rows, len(rows))))
 
 
 def _told_deviation(log: Log) -> Array:
@@ -142,5 +145,7 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
     samples, dwells, remarks = find_stretches(log, limits or Steadiness())
     rate, output, deviation = averaged(samples, dwells)
     time, temperature = samples.time, samples.temperature
+    row = np.searchsorted(np.asarray(log.time), time)
     return Dwells(rate, output, None if temperature is None else np.array([temperature[rows].mean() for rows in dwells]), deviation,
-                  sweeps(rate), tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells), remarks)
+                  sweeps(rate), tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells), remarks,
+                  tuple(row[rows] for rows in dwells))

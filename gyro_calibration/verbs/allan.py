@@ -15,7 +15,7 @@ from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.picture import draw_allan
-from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, time_of, verb
+from gyro_calibration.verbs.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, time_of, verb, with_origin
 
 #: Symbol -> unit that people use, and how many of it are one in SI.
 UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE), 'K': ('deg/h/√h', 216000.0 / DEGREE),
@@ -44,7 +44,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     if given.picture:
         draw_allan(given.picture, chart, fit, {symbol: _named(symbol, figure) for symbol, figure in fit.figures.items() if figure.value})
     if given.out:
-        write_model(given.out, replace(model, noise=fit.noise))
+        write_model(given.out, replace(with_origin(given, model), noise=fit.noise))
     return Answer('\n'.join(_lines(given, record, chart, fit)), _data(given, record, chart, fit))
 
 

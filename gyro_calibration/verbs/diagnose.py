@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from gyro_calibration.diagnosis.extension import calibrated
 from gyro_calibration.diagnosis.finding import Diagnosis
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.table import diagnose_table
-from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import write_atomically
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
@@ -59,14 +60,21 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
     if any(log.time is None for log in logs):
         if len(logs) > 1:
             raise UsageError(f'{len(logs)} logs, and one without time_s; give rate tables one by one, or say with --rate how samples came')
-        found = diagnose_table(logs[0], model, generator)
+        found = diagnose_table(logs[0], None if model is None else calibrated(model))
     else:
         with tqdm(total=_STEPS, desc='diagnose', delay=2.0, leave=False, disable=None) as bar:
             def say(step: str) -> None:
                 bar.set_description(step)
                 bar.update()
             found = diagnose(logs, generator, model, names=given.log, say=say)
-    return replace(found, logs=tuple(given.log), model=replace(found.model, origin={**origin_of(given.log), **found.model.origin}))
+    return _with_origin(replace(found, logs=tuple(given.log)), model)
+
+
+def _with_origin(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis whose model says what it comes from; one that was given and is not extended stays as it is."""
+    if model is not None and not offered(found):
+        return replace(found, before=model, model=model)
+    return replace(found, model=replace(found.model, origin={**found.model.origin, **origin_of(found.logs)}))
 
 
 def _written(folder: str, found: Diagnosis) -> list[str]:

@@ -13,14 +13,14 @@ Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `like
 
 """
 
-from .effects import FORMS
-from .log import ALL, Cause, Gyro, HiddenLog, Truth, draw_gyro, hide, record
-from .motion import Session, described, session
-from .noise import KINDS, NoiseFigures
-from .oracle import OracleGain, oracle_gain
-from .outside import OUTSIDE
-from .size import DETECTABLE
-from .twins import TWINS, part, twin
+from hidden.effects import FORMS
+from hidden.log import ALL, Cause, Gyro, HiddenLog, Truth, draw_gyro, hide, record
+from hidden.motion import Session, described, session
+from hidden.noise import KINDS, NoiseFigures
+from hidden.oracle import OracleGain, oracle_gain
+from hidden.outside import OUTSIDE
+from hidden.size import DETECTABLE
+from hidden.twins import TWINS, part, twin
 
 __all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog', 'NoiseFigures', 'OracleGain', 'Session',
            'Truth', 'described', 'draw_gyro', 'hide', 'oracle_gain', 'part', 'record', 'session', 'twin']

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import norm
 
-from .filters import lag
-from .motion import Session
+from hidden.filters import lag
+from hidden.motion import Session
 
 REFERENCE_TEMPERATURE = 25.0
 REFERENCE_SUPPLY = 5.0

@@ -1,7 +1,4 @@
-"""
-First-order filters on evenly spaced samples.
-
-"""
+"""First-order filters on evenly spaced samples."""
 
 from __future__ import annotations
 

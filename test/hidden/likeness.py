@@ -1,7 +1,4 @@
-"""
-What else in the catalogue looks like what is hidden, as far as these recordings can tell.
-
-"""
+"""What else in the catalogue looks like what is hidden, as far as these recordings can tell."""
 
 from __future__ import annotations
 
@@ -10,10 +7,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .effects import FORMS, WITHOUT_COLUMN, Shapes, errors, top_rate
-from .motion import Session
-from .noise import NoiseFigures
-from .size import Columns, Metric, thinned
+from hidden.effects import FORMS, WITHOUT_COLUMN, Shapes, errors, top_rate
+from hidden.motion import Session
+from hidden.noise import NoiseFigures
+from hidden.size import Columns, Metric, thinned
 
 #: A reference may slip at any moment, and a tone has any frequency: enough of them explain anything.
 ANYTHING = {'reference_slip', 'interference_tone'}

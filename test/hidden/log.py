@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from .effects import COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN, Form, Shapes, errors, seen, slipped, top_rate
-from .likeness import Likeness
-from .motion import Session, session
-from .noise import NoiseFigures, draw_figures, make
-from .outside import OUTSIDE
-from .size import DETECTABLE, Metric, solve_noise, solve_size
+from hidden.effects import COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN, Form, Shapes, errors, seen, slipped, top_rate
+from hidden.likeness import Likeness
+from hidden.motion import Session, session
+from hidden.noise import NoiseFigures, draw_figures, make
+from hidden.outside import OUTSIDE
+from hidden.size import DETECTABLE, Metric, solve_noise, solve_size
 
 #: Recordings -> name of an effect -> what of it is not to be random.
 Given = Callable[[list[Session]], Mapping[str, Shapes]]

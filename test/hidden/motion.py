@@ -1,7 +1,4 @@
-"""
-What happens to a gyro during a recording: motion, temperature, supply, tilt and vibration, drawn at random.
-
-"""
+"""What happens to a gyro during a recording: motion, temperature, supply, tilt and vibration, drawn at random."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter1d
 
-from .filters import lag
+from hidden.filters import lag
 
 #: Knots of the rate, s. A cubic B-spline through them is exactly zero at rest, and its integral is exact.
 KNOT = 0.05

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from .filters import autoregression
+from hidden.filters import autoregression
 
 #: Between the time constants of the ladder that makes flicker.
 STEP_OF_LADDER = 4.0

@@ -1,7 +1,4 @@
-"""
-What is won by who knows the truth.
-
-"""
+"""What is won by who knows the truth."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .log import HiddenLog
+from hidden.log import HiddenLog
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,4 @@
-"""
-Effects that the catalogue does not have: a diagnosis must say that something is left, and give it no name.
-
-"""
+"""Effects that the catalogue does not have: a diagnosis must say that something is left, and give it no name."""
 
 from __future__ import annotations
 
@@ -10,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .effects import Form, Shapes, _column, _phase, top_rate
-from .motion import Session
+from hidden.effects import Form, Shapes, _column, _phase, top_rate
+from hidden.motion import Session
 
 
 def _middle(values: list[np.ndarray]) -> float:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.optimize import brentq
 
-from .motion import Session
-from .noise import NoiseFigures, Whitening, divergence
+from hidden.motion import Session
+from hidden.noise import NoiseFigures, Whitening, divergence
 
 #: Standard deviations: the level corrected for some 31 columns, and the power.
 DETECTABLE = 4.8

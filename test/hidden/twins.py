@@ -1,7 +1,4 @@
-"""
-Twins: conditions under which two causes cannot be told apart, and those under which they can.
-
-"""
+"""Twins: conditions under which two causes cannot be told apart, and those under which they can."""
 
 from __future__ import annotations
 
@@ -10,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .effects import Shapes
-from .log import Given, HiddenLog, hide, record
-from .motion import Session, session
-from .noise import NoiseFigures
+from hidden.effects import Shapes
+from hidden.log import Given, HiddenLog, hide, record
+from hidden.motion import Session, session
+from hidden.noise import NoiseFigures
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ TWINS: Mapping[tuple[str, str], Twins] = {
     ('bias_temperature', 'warm_up'): Twins({'temperature': 'cold_start'}, {}, _as_the_cold_start),
     ('warm_up', 'rate_ramp'): Twins({}, {}, _very_slowly, longer=4.0),
     ('heading_sensitivity', 'reference_once_per_rev'): Twins({'motion': 'one_speed'}, {}),
-    ('scale_factor_asymmetry', 'quadratic_nonlinearity'): Twins({'motion': 'two_way'}, {}, multiple=8.0),
+    ('scale_factor_asymmetry', 'quadratic_nonlinearity'): Twins({'motion': 'two_way'}, {}, multiple=8.0, longer=2.0),
     ('scale_factor_asymmetry', 'vibration_rectification'): Twins({'motion': 'two_way', 'force': 'turning'}, {}),
     ('quadratic_nonlinearity', 'acceleration_sensitivity'): Twins({'force': 'off_axis'}, {}),
     ('cubic_nonlinearity', 'sine_response'): Twins(

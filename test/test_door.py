@@ -1,0 +1,138 @@
+"""The door: of two references the usable one is taken, noise is no motion, and what would only exhaust the memory is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyro_calibration.diagnosis.door import MOST_ROWS, prepared, refuse, rests
+from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.encoder import calibrate_encoder
+from gyro_calibration.log import DEGREE, DataRefused, Log
+
+INTERVAL = 0.01
+COUNT = 12_000
+TIME = np.arange(COUNT) * INTERVAL
+RATE = np.sin(0.9 * TIME) * np.clip(3.0 * np.sin(0.11 * TIME), 0.0, 1.0)
+HEADING = np.concatenate([[0.0], np.cumsum(0.5 * INTERVAL * (RATE[1:] + RATE[:-1]))])
+TURNED = np.cumsum(np.abs(RATE)) * INTERVAL
+
+
+def gyro(rate, seed=1):
+    """Return the output of a gyro with white noise of 0.057 deg/s a sample, and a scale factor error of 1 %."""
+    return 1.01 * rate + 2e-3 + 1e-3 * np.random.default_rng(seed).standard_normal(len(rate))
+
+
+LOG = Log(output=gyro(RATE), time=TIME, reference_rate=RATE)
+STILL = Log(output=gyro(np.zeros(COUNT)), time=TIME)
+
+
+# a reference that says nothing
+
+def test_a_reference_of_nan_alone_is_none():
+    """Beside a heading that says all, and at rest."""
+    nothing = np.full(COUNT, np.nan)
+    by_heading, by_none = (prepared(replace(log, reference_rate=nothing))[0] for log in (replace(LOG, reference_heading=HEADING), STILL))
+    assert by_heading.reference_rate is None and by_heading.reference_heading is HEADING
+    assert by_none.reference_rate is None and rests(by_none)
+    assert not diagnose([replace(STILL, reference_heading=nothing)], np.random.default_rng(1)).findings
+
+
+def test_a_rate_that_is_known_at_times_gives_way_to_the_heading():
+    some = np.where(np.arange(COUNT) < 50, RATE, np.nan)
+    log = replace(LOG, reference_rate=some, reference_heading=np.round(HEADING / 1e-3) * 1e-3)
+    hygiene = inspect(log)
+    assert hygiene.heading_step == pytest.approx(1e-3) and 'known in 50 samples only' in ' '.join(hygiene.remarks)
+    assert prepared(log)[0].reference_rate is None
+
+
+# noise is no motion
+
+def noisy(kind):
+    """Return a reference at rest as it is measured: of odometry, motion capture, a simulator, or an encoder between two codes."""
+    generator = np.random.default_rng(7)
+    noise = generator.standard_normal(COUNT)
+    if kind == 'odometry':
+        return {'reference_rate': 0.01 * noise}
+    if kind == 'simulator':
+        return {'reference_rate': 1e-8 * noise}
+    if kind == 'motion capture':
+        return {'reference_heading': 1e-3 * noise + 2e-3 * np.sin(0.05 * TIME)}
+    return {'reference_heading': 0.088 * DEGREE * (np.sin(0.07 * TIME) + 0.3 * noise > 0.0)}
+
+
+@pytest.mark.parametrize('kind', ['odometry', 'simulator', 'motion capture', 'encoder'])
+def test_the_noise_of_a_reference_at_rest_is_no_motion(kind):
+    log = replace(STILL, **noisy(kind))
+    refuse(log)
+    assert rests(log) and not np.nan_to_num(prepared(log)[0].reference_rate).any()
+    assert 'taken to be at rest' in ' '.join(inspect(log).remarks)
+
+
+def test_a_gyro_at_rest_beside_a_noisy_reference_has_no_findings():
+    found = diagnose([replace(STILL, **noisy('motion capture'))], np.random.default_rng(1))
+    assert not found.findings and 'scale_factor_error' in found.cannot_show
+
+
+@pytest.mark.parametrize('size', [0.05, 0.5])
+def test_a_small_motion_that_the_gyro_sees_stays_motion(size):
+    """Swings of so many deg, beside the noise of the references above."""
+    swing = size * DEGREE * np.sin(0.5 * TIME)
+    for kind in ('odometry', 'motion capture'):
+        noise = next(iter(noisy(kind).values()))
+        motion = {'odometry': {'reference_rate': 0.1 * noise + np.gradient(swing, TIME)},
+                  'motion capture': {'reference_heading': 0.1 * noise + swing}}[kind]
+        assert not rests(replace(STILL, output=gyro(np.gradient(swing, TIME)), **motion))
+
+
+@pytest.mark.parametrize('reference', [{'reference_rate': RATE}, {'reference_heading': HEADING}])
+def test_a_gyro_that_sees_nothing_of_a_motion_is_not_at_rest(reference):
+    assert not rests(replace(STILL, **reference))
+
+
+# what is refused
+
+def jumped(seconds):
+    """Return a log in the middle of which a clock was set."""
+    return replace(LOG, time=TIME + np.where(np.arange(COUNT) < COUNT // 2, 0.0, seconds))
+
+
+@pytest.mark.parametrize('log', [jumped(12.0 * 86400.0), jumped(1500.0), replace(jumped(12.0 * 86400.0), reference_rate=0.0 * RATE)],
+                         ids=['a clock that was set', 'two drives', 'at rest'])
+def test_a_log_that_is_a_gap_for_the_most_part_is_refused_with_where_it_is(log):
+    with pytest.raises(DataRefused, match=r'12000 samples can be used where .*begins at 59\.990 s: cut the log there'):
+        diagnose([log], np.random.default_rng(1))
+
+
+def test_a_log_of_which_a_limit_leaves_nothing_is_refused_in_a_sentence():
+    rate = 0.5 * np.sin(0.7 * TIME)
+    noise = 0.3 * np.random.default_rng(3).standard_normal(COUNT)
+    log = Log(output=np.clip(rate + noise, -1.0, 1.0), time=TIME, reference_rate=rate)
+    assert inspect(log).trusted.sum() < 100
+    with pytest.raises(DataRefused, match='samples can be used, at least 100 are needed'):
+        diagnose([log], np.random.default_rng(1))
+
+
+def test_samples_without_time_are_not_taken_for_a_rate_table():
+    rows = MOST_ROWS + 1
+    with pytest.raises(DataRefused, match=f'{rows} rows, where a rate table has at most {MOST_ROWS}: .*--rate'):
+        diagnose_table(Log(output=LOG.output[:rows], reference_rate=RATE[:rows]), None, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize('first', [0.0, -np.pi])
+@pytest.mark.parametrize('use', [refuse, calibrate_encoder])
+def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
+    heading = np.where(TIME % 7.0 < 0.1, np.nan, (TURNED - first) % (2.0 * np.pi) + first)
+    with pytest.raises(DataRefused, match='reference heading jumps by a full turn .*must be continuous'):
+        use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
+
+
+def test_turns_while_the_reference_was_lost_or_between_slow_samples_are_not_taken_for_a_wrapped_heading():
+    lost = np.where((TIME > 30.0) & (TIME < 37.0), np.nan, TURNED + 2.0 * np.pi * (TIME > 32.0))
+    refuse(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=lost))
+    slow = np.arange(1000) * 1.0
+    turned = np.cumsum(2.0 * np.pi * (np.sin(0.05 * slow) > 0.0))
+    rate = np.gradient(turned, slow)
+    refuse(Log(output=gyro(rate), time=slow, reference_heading=turned))
