@@ -4,6 +4,7 @@ import time
 from itertools import repeat
 
 import numpy as np
+import yaml
 
 try:
     from builtin_interfaces.msg import Time
@@ -60,11 +61,17 @@ class FakeGyro:
         """Let the gyro's time go on without a sample."""
         self.nanoseconds += round(seconds * 1e9)
 
-    def play(self, rates, temperature=None, until=lambda: False):
-        """Publish many samples, with one temperature or one each, at the pace of the test; return after the node has taken the last one."""
+    def play(self, rates, temperature=None, until=lambda: False, before=lambda number: None):
+        """
+        Publish many samples, with one temperature or one each, at the pace of the test; return after the node has taken the last one.
+
+        `before` is called before each sample with its number, and may publish what else the robot says.
+
+        """
         self._wait_for_quiet()
         heard, sent = len(self.heading), 0
         for rate, degc in zip(rates, temperature if isinstance(temperature, np.ndarray) else repeat(temperature)):
+            before(sent)
             self.send(rate, degc)
             sent += 1
             time.sleep(PACE)
@@ -73,6 +80,10 @@ class FakeGyro:
             if until():
                 break
         self.wait_until(lambda: len(self.heading) >= heard + sent, 5.0, f'{sent} headings; {len(self.heading) - heard} came')
+
+    def values(self):
+        """Return the values of the newest diagnostics."""
+        return {pair.key: pair.value for pair in self.diagnostics[-1].status[0].values}
 
     def says(self, words):
         """Tell whether the newest diagnostics hold the words."""
@@ -94,6 +105,15 @@ class FakeGyro:
     def calibrating(self):
         """Tell whether the node says that a calibration goes on."""
         return bool(self.status) and self.status[-1].message.startswith('calibrating')
+
+
+def start_with_gyro(start_node, ros, wait_until, folder, model, interval, **parameters):
+    """Start a compensation node with a model, its files in a folder, and return it with a gyro of an interval, s, that it hears."""
+    (folder / 'model.yaml').write_text(yaml.safe_dump(model))
+    given = {'calibration_file': folder / 'calibration.yaml', 'model_file': folder / 'model.yaml', **parameters}
+    node, gyro = start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until)
+    gyro.interval = interval
+    return node, gyro
 
 
 def _latched():

@@ -1,17 +1,19 @@
-"""
-The emulated gyro, read through a real pseudo-terminal.
-
-"""
+"""The emulated gyro, read through a real pseudo-terminal."""
 
 import itertools
 import math
 import os
+import subprocess
+import sys
 import threading
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from gyro_calibration.emulator import Emulator, emulate
+from gyro_calibration.line import Line
 from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
 from gyro_calibration.serial_port import PortError, SerialPort
 
@@ -38,10 +40,11 @@ def read_all(path, protocol, enough=None, settings=None):
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_reader_gets_every_sample(name, tmp_path):
-    emulator = Emulator(find(name), samples(200), speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
+    settings = Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
+    emulator = Emulator(find(name), samples(200), settings, speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
     with emulator:
-        received = read_all(emulator.path, name, enough=200)
-    resolution = find(name).sensitivity if name != 'csv' else 1e-9
+        received = read_all(emulator.path, name, 200, settings)
+    resolution = 1e-6 if name in ('csv', 'kvh_1750', 'fizoptika') else find(name).sensitivity
     assert [sample.output for sample in received] == pytest.approx([sample.output for sample in samples(200)], abs=resolution)
 
 
@@ -146,3 +149,88 @@ def test_settings_that_do_not_suffice_are_refused_before_the_start():
 def test_a_sample_without_a_time_is_refused():
     with pytest.raises(ValueError, match='set Sample.time'):
         emulate(Emulator(find('csv'), [Sample(0.5)]))
+
+
+def received_over(line, protocol, count, rate):
+    """Return the samples of a short drive over a bad line, as lists of those that came together, and the bytes alike."""
+    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, line=line, generator=np.random.default_rng(1))
+    with gyro:
+        port, decoder, received = SerialPort(gyro.path, 9600, timeout=0.5), protocol.decoder(), []
+        port.open()
+        chunks = [port.read()]
+        while chunks[-1]:
+            received.append(decoder.feed(chunks[-1]))
+            chunks.append(port.read())
+        port.close()
+    return received, chunks
+
+
+def test_lost_samples_leave_holes():
+    received = sum(received_over(Line(lost_samples=0.3), find('csv'), 200, 1000.0)[0], [])
+    numbers = [round((sample.time - 5.0) * 1000.0) for sample in received]
+    assert 100 < len(numbers) < 180 and numbers == sorted(set(numbers))
+    assert max(numbers) > 190
+
+
+def test_samples_are_numbered_before_any_is_lost():
+    sent = []
+    protocol = replace(find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
+    with Emulator(protocol, samples(100, 1e4), line=Line(lost_samples=0.5), generator=np.random.default_rng(1)) as gyro:
+        gyro.join()
+    assert set(sent) < set(range(100)) and sent == sorted(sent) and 30 < len(sent) < 70
+
+
+def test_an_adapter_hands_over_in_bursts():
+    """Sixteen samples of 1 ms each come together."""
+    received = [len(samples) for samples in received_over(Line(burst=0.016), find('csv'), 320, 1000.0)[0]]
+    assert sum(received) == 320
+    assert received.count(16) > 10
+
+
+def test_a_slow_line_gives_single_bytes():
+    received, chunks = received_over(Line(piece=1), replace(find('kvh_ecore'), baud=600), 10, 5.0)
+    assert sum(len(samples) for samples in received) == 10
+    assert sum(len(chunk) == 1 for chunk in chunks) > 0.5 * sum(map(len, chunks))
+
+
+def test_a_line_with_faults_needs_a_generator():
+    with pytest.raises(ValueError, match='give a numpy Generator'):
+        Emulator(find('csv'), samples(), line=Line(lost_bytes=0.1))
+
+
+def test_eleven_thousand_samples_a_second_are_sent_in_time():
+    """As fizoptika sends them. It waits for its reader, as replays do: the buffer of a pseudo-terminal holds no more than 40 ms of them."""
+    gyro = Emulator(find('kvh_ecore'), samples(11500, 5750.0), speed=2.0, wait_for_reader=True)
+    with gyro:
+        port, decoder, count, begin = SerialPort(gyro.path, 921600), find('kvh_ecore').decoder(), 0, math.inf
+        port.open()
+        while count < 11500 and time.monotonic() < begin + 20.0:
+            count += len(decoder.feed(port.read()))
+            begin = min(begin, time.monotonic())
+        elapsed = time.monotonic() - begin
+        port.close()
+    assert count == 11500
+    assert 0.9 < elapsed < 3.0  # a busy machine is late, but it must not fall behind for good
+
+
+@pytest.mark.parametrize('words, sentence', [(['--lose', '3'], 'lost_bytes is 3.0, but must be a probability'),
+                                             (['--burst', '-1'], 'burst is -0.001 s'), (['--piece', 'x'], 'invalid int value')])
+def test_a_line_that_is_not_possible_is_refused_by_the_verb(run, tmp_path, words, sentence):
+    (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
+    code, _, said = run('emulate', '--protocol', 'csv', '--model', tmp_path / 'model.yaml', *words)
+    assert code == 2 and sentence in said
+
+
+def test_the_verb_sends_over_a_bad_line(tmp_path):
+    """Three samples in ten are lost, and the same ones with the same seed."""
+    (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
+    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv', '--model', tmp_path / 'model.yaml', '--wait',
+               '--link', tmp_path / 'gyro', '--speed', '50', '--lose-samples', '0.3', '--seed', '7']
+    times = []
+    for _ in range(2):
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            process.stdout.readline()
+            times.append([sample.time for sample in read_all(tmp_path / 'gyro', 'csv', 100)][:100])
+            process.terminate()
+    assert times[0] == times[1]
+    assert times[0][-1] - times[0][0] == pytest.approx(1.0 / 0.7, rel=0.2)

@@ -1,21 +1,27 @@
-"""
-The wire formats: what each looks like on the line, that any bytes are survived, and that wrong settings are refused.
-
-"""
+"""The wire formats: what each looks like on the line, that any bytes are survived, and that wrong settings are refused."""
 
 import math
 import random
+import time
+from dataclasses import replace
 
 import pytest
 
-from gyro_calibration.protocols import PLANNED, PROTOCOLS, Sample, Settings, find
+from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
 
 ALL = sorted(PROTOCOLS)
 DPS = math.radians(1.0)
 
-SETTINGS = {name: Settings() for name in ALL}
-LARGEST = {'kvh_dsp3000': 500.0, 'kvh_ecore': 59.9, 'minimu9': 2293.0, 'csv': 1e6}  # deg/s
-RESOLUTION = {'kvh_dsp3000': 1e-6, 'kvh_ecore': 0.00183, 'minimu9': 0.07, 'csv': 1e-2}  # deg/s, the csv at 9 digits of 1e6
+FIZOPTIKA = Settings(sensitivity=DPS / 27880.0)  # as one unit has it
+SETTINGS = {name: Settings() for name in ALL} | {'fizoptika': FIZOPTIKA}
+LARGEST = {  # deg/s
+    'kvh_dsp3000': 500.0, 'kvh_1750': 500.0, 'kvh_ecore': 59.9, 'fizoptika': 300.0, 'minimu9': 2293.0, 'witmotion': 1999.9,
+    'razor': 2279.0, 'csv': 1e6,
+}
+RESOLUTION = {  # deg/s; that of the csv at 9 digits of 1e6, that of the 1750 at 24 bits of 500
+    'kvh_dsp3000': 1e-6, 'kvh_1750': 3e-5, 'kvh_ecore': 0.00183, 'fizoptika': 1.0 / 27880.0, 'minimu9': 0.07, 'witmotion': 0.0611,
+    'razor': 0.573, 'csv': 1e-2,
+}
 
 # Format, bytes, deg/s in the device's own sense of rotation.
 VECTORS = [
@@ -23,6 +29,10 @@ VECTORS = [
     ('kvh_dsp3000', b'    -120.500000   1\r\n', -120.5),
     ('kvh_ecore', bytes.fromhex('8A40000000000768'), 1.83),  # count +1000, worked out by hand from the layout of a public decoder
     ('minimu9', b'!ANG:0.10,-0.20,90.00,AN:1,2,-100,4,5,250,7,8,9\r\n', -7.0),  # as the firmware prints it; 0.07 deg/s a count
+    ('fizoptika', bytes.fromhex('DDE800 6C 02 13 0169'.replace(' ', '')), 1.0),  # 27880 counts, worked out by hand from the layout
+    ('fizoptika', bytes.fromhex('DD18FF 93 02 13 01BF'.replace(' ', '')), -1.0),
+    ('witmotion', bytes.fromhex('5552000000000002C40976'), 31.25),  # 512 of 32768 of 2000 deg/s, at 25 degC, worked out by hand
+    ('razor', b'#YPRAG=-142.28,-5.38,33.52,0.1,0.1,1.0,0.01,0.01,-0.01\r\n', 0.01 / DPS),  # but for a sign as its comments have it
     ('csv', b'12.5,-3.25,24.5\r\n', -3.25),
 ]
 
@@ -36,19 +46,19 @@ def stream(name, count=20, seed=1):
         for k in range(count)
     ]
     protocol = find(name)
-    return samples, protocol.awakening + b''.join(protocol.encode(sample) for sample in samples)
+    return samples, protocol.awakening + b''.join(map(protocol.encoder(SETTINGS[name]), samples))
 
 
 def opened(name, settings=None):
     """Return a decoder that knows where the next frame begins."""
-    decoder = find(name).decoder(settings)
+    decoder = find(name).decoder(settings or SETTINGS[name])
     decoder.feed(find(name).awakening)
     return decoder
 
 
 @pytest.mark.parametrize(('name', 'data', 'rate'), VECTORS)
 def test_frames_of_the_documented_layout_are_read(name, data, rate):
-    sample, = opened(name, Settings(invert=False)).feed(data)
+    sample, = opened(name, replace(SETTINGS[name], invert=False)).feed(data)
     assert sample.output == pytest.approx(rate * DPS, rel=1e-9)
 
 
@@ -65,7 +75,7 @@ def test_clockwise_on_a_dsp3000_is_negative():
 @pytest.mark.parametrize('name', ALL)
 @pytest.mark.parametrize('invert', [True, False])
 def test_decoding_undoes_encoding(name, invert):
-    settings = Settings(invert=invert)
+    settings = replace(SETTINGS[name], invert=invert)
     for part in (-1.0, -0.3, 0.0, 1e-3, 1.0):
         output = part * LARGEST[name] * DPS
         sample, = opened(name, settings).feed(find(name).encode(Sample(output), settings))
@@ -74,16 +84,32 @@ def test_decoding_undoes_encoding(name, invert):
 
 def test_csv_keeps_time_and_temperature():
     sample, = opened('csv').feed(find('csv').encode(Sample(0.5, 21.25, 1700000000.125)))
-    assert (sample.time, sample.temperature) == (1700000000.125, 21.25)
+    assert (sample.time, sample.temperature, sample.specific_force, sample.health) == (1700000000.125, 21.25, None, {})
+
+
+@pytest.mark.parametrize('name', ALL)
+@pytest.mark.parametrize('value', [math.nan, math.inf, 1e9, -1e9])
+def test_a_temperature_that_cannot_be_sent_does_not_stop_an_emulated_gyro(name, value):
+    """A log has nan where its sensor failed."""
+    sample, = opened(name).feed(find(name).encode(Sample(0.1, value, 0.1, specific_force=math.nan), SETTINGS[name]))
+    assert sample.output == pytest.approx(0.1, abs=RESOLUTION[name] * DPS)
+
+
+def test_csv_takes_acceleration_and_supply_by_the_words_of_the_log_format():
+    settings = Settings(columns=('supply_v', 'gyro_rad_s', 'acceleration_mps2'))
+    first, second = opened('csv', settings).feed(b'4.98,0.5,-9.81\nnan,0.5,\n')
+    assert (first.health, first.specific_force, second.health, second.specific_force) == ({'supply_v': 4.98}, -9.81, {}, None)
+    again, = opened('csv', settings).feed(find('csv').encode(first, settings))
+    assert again == first
 
 
 @pytest.mark.parametrize('name', ALL)
 def test_any_split_of_the_bytes_gives_the_same_samples(name):
     _, data = stream(name)
-    whole = find(name).decoder().feed(data)
+    whole = find(name).decoder(SETTINGS[name]).feed(data)
     generator = random.Random(2)
     for _ in range(50):
-        decoder, cuts = find(name).decoder(), sorted(generator.choices(range(len(data)), k=30))
+        decoder, cuts = find(name).decoder(SETTINGS[name]), sorted(generator.choices(range(len(data)), k=30))
         pieces = [data[start:end] for start, end in zip([0, *cuts], [*cuts, len(data)], strict=True)]
         assert [sample for piece in pieces for sample in decoder.feed(piece)] == whole
     assert len(whole) == 20
@@ -101,7 +127,7 @@ def test_garbage_costs_at_most_one_frame(name):
     assert decoder.discarded_bytes >= 100
 
 
-@pytest.mark.parametrize('name', ['kvh_dsp3000', 'csv'])
+@pytest.mark.parametrize('name', ['kvh_dsp3000', 'minimu9', 'razor', 'csv'])
 def test_half_a_number_is_no_number(name):
     """A port is opened in the middle of a line, where 120.5 looks like 20.5."""
     _, data = stream(name, 2)
@@ -110,15 +136,62 @@ def test_half_a_number_is_no_number(name):
         assert {sample.output for sample in find(name).decoder().feed(data[start:])} <= whole
 
 
-@pytest.mark.parametrize('bit', range(64))
-def test_a_flipped_bit_in_an_ecore_frame_gives_no_wrong_rate(bit):
-    frames = [bytearray(find('kvh_ecore').encode(Sample(rate * DPS))) for rate in (1.0, 2.0, 3.0)]
-    good = [find('kvh_ecore').decoder().feed(frame)[0] for frame in frames]
-    frames[1][bit // 8] ^= 1 << bit % 8
-    decoder = find('kvh_ecore').decoder()
-    received = decoder.feed(b''.join(frames))
-    assert received in ([good[0], good[2]], [good[0]], [good[2]])
-    assert decoder.discarded_bytes >= 8
+@pytest.mark.parametrize('name', ['kvh_1750', 'kvh_ecore', 'fizoptika', 'witmotion'])
+def test_a_flipped_bit_gives_no_wrong_rate(name):
+    encode = find(name).encoder(SETTINGS[name])
+    frames = [encode(Sample(rate * DPS, 20.0, None, number, 0, 9.8)) for number, rate in enumerate((1.0, -2.0, 3.0, 4.0, 5.0))]
+    good = [sample.output for sample in opened(name).feed(b''.join(frames))]
+    assert len(good) == 5
+    for bit in range(8 * len(frames[1])):
+        damaged = bytearray(frames[1])
+        damaged[bit // 8] ^= 1 << bit % 8
+        decoder = opened(name)
+        received = [sample.output for sample in decoder.feed(b''.join([frames[0], damaged, *frames[2:]]))]
+        if name == 'witmotion' and bit < 88:  # in the frame of the acceleration
+            assert received == good
+        else:
+            assert set(received) <= set(good) - {good[1]} and received[-2:] == good[-2:]
+        assert decoder.discarded_bytes >= len(frames[1]) / (1 + (name == 'witmotion'))
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_after_any_garbage_decoding_is_right_again_within_two_frames(name):
+    samples, data = stream(name, 6)
+    good = [sample.output for sample in opened(name).feed(data.removeprefix(find(name).awakening))]
+    whole, generator = data.removeprefix(find(name).awakening), random.Random(5)
+    for _ in range(200):
+        decoder, start = opened(name), generator.randrange(len(whole))
+        decoder.feed(garbage(generator, whole[:start]))
+        received = [sample.output for sample in decoder.feed(whole)]
+        assert received[-4:] == good[-4:], (received, good)
+
+
+def garbage(generator, begun):
+    """Return noise, the beginning of frames in it, and the most troublesome bytes."""
+    pieces = [
+        generator.randbytes(generator.randrange(60)),
+        begun,
+        bytes([generator.choice((0x00, 0x55, 0x80, 0xDD, 0xFE, 0xFF, 0x0A, 0x0D, 0x23, 0x2C))]) * generator.randrange(40),
+        generator.choice((b'', b'\xfe\x81\xff\x55', b'\xdd', b'\x55\x52', b'#YPRAG=1,2', b'!ANG:1', b'   12', b'0.1,')),
+    ]
+    generator.shuffle(pieces)
+    return b''.join(pieces)
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_samples_whose_frames_are_damaged_are_missing_before_the_next(name):
+    _, data = stream(name)
+    protocol, decoder = find(name), opened(name)
+    frames = [protocol.encode(Sample(0.1 * number, 20.0, 0.01 * number), SETTINGS[name]) for number in range(1, 9)]
+    frames[3] = frames[3][:2] + b'\x55' + frames[3][4:]
+    frames[4] = frames[4][:3] + b'\x55' + frames[4][3:]
+    assert [sample.missing for sample in decoder.feed(b''.join(frames))] == [0, 0, 0, 2, 0, 0]
+
+
+def test_a_sample_that_the_device_calls_invalid_is_missing():
+    protocol, decoder = find('kvh_dsp3000'), opened('kvh_dsp3000')
+    data = [protocol.encode(Sample(0.1), valid=valid) for valid in (True, False, False, True, True)]
+    assert [sample.missing for sample in decoder.feed(b''.join(data))] == [0, 2, 0] and decoder.faults == 2
 
 
 @pytest.mark.parametrize('name', ALL)
@@ -132,7 +205,38 @@ def test_a_megabyte_of_noise_raises_nothing_and_holds_no_memory(name):
     assert len(decoder._splitter._tail) <= 1024
 
 
-@pytest.mark.parametrize('name', ['kvh_dsp3000', 'minimu9', 'csv'])
+LENGTH = 300_000
+HOSTILE = {
+    'noise': random.Random(6).randbytes(LENGTH),
+    'zeros': bytes(LENGTH),
+    'line ends': b'\r\n' * (LENGTH // 2),
+    'blanks': b' ' * LENGTH,
+    'commas': b',' * LENGTH,
+    'digits': b'1' * LENGTH,
+    'headers of the 1750': b'\xfe\x81\xff\x55' * (LENGTH // 4),
+    'headers of fizoptika': b'\xdd' * LENGTH,
+    'headers of witmotion': b'\x55\x52' * (LENGTH // 2),
+    'headers of the ecore': b'\x80' * LENGTH,
+    'almost frames of the ecore': b'\x80' + b'\x01\x00\x00\x00\x00\x00\x00\x80' * (LENGTH // 8),
+    'almost lines of the razor': b'#YPRAG=1,1,1,1,1,1,1,1,\n' * (LENGTH // 24),
+    'a long number': b'#YPRAG=' + b'1' * 200 + b'\n',
+}
+
+
+@pytest.mark.parametrize('kind', sorted(HOSTILE))
+def test_anything_is_decoded_in_less_time_than_it_takes_to_come(kind):
+    """At 921600 baud it takes 3.3 s; all eight decoders together must be done by then, in one piece and in small ones."""
+    begin = time.process_time()
+    for name in ALL:
+        whole, pieces = opened(name), opened(name)
+        received = whole.feed(HOSTILE[kind])
+        small = [sample for start in range(0, 10_000) for sample in pieces.feed(HOSTILE[kind][start:start + 1])]
+        assert received[:len(small)] == small and all(math.isfinite(sample.output) for sample in received)
+        assert len(whole._splitter._tail) <= 1024
+    assert time.process_time() - begin < LENGTH / 92160
+
+
+@pytest.mark.parametrize('name', ['kvh_dsp3000', 'minimu9', 'razor', 'csv'])
 def test_an_endless_line_is_thrown_away(name):
     decoder = opened(name)
     for _ in range(1000):
@@ -160,6 +264,8 @@ def test_a_failed_temperature_sensor_does_not_cost_the_rate(text):
     ('kvh_dsp3000', b'     501.000000   1\r\n', Settings()),  # manual of the DSP-3000, table 2
     ('kvh_ecore', find('kvh_ecore').encode(Sample(59.0 * DPS)), Settings(full_scale=0.5)),
     ('minimu9', b'!ANG:0,0,0,AN:0,0,40000,0,0,0,0,0,0\r\n', Settings()),  # counts have 16 bits
+    ('kvh_1750', find('kvh_1750').encode(Sample(0.501 * DPS), Settings(increments=False)), Settings()),  # rad/s, taken for angles
+    ('razor', b'#YPRAG=0,0,0,0,0,0,0,0,2290.0\r\n', Settings()),
     ('csv', b'0.1,501.0,20.0\n', Settings(full_scale=500.0 * DPS)),
 ])
 def test_a_rate_that_the_device_cannot_mean_is_thrown_away(name, data, settings):
@@ -197,10 +303,10 @@ def test_full_scale_follows_the_sensitivity():
     assert sample.output == pytest.approx(280.0 * DPS, rel=1e-4)
 
 
-@pytest.mark.parametrize('name', ['kvh_dsp3000', 'kvh_ecore', 'minimu9'])
+@pytest.mark.parametrize('name', [name for name in ALL if name != 'csv'])
 def test_an_emulated_gyro_saturates_at_its_full_scale(name):
-    sample, = opened(name).feed(find(name).encode(Sample(-1000.0)))
-    assert sample.output == pytest.approx(-find(name).full_scale, rel=1e-4)
+    sample, = opened(name).feed(find(name).encode(Sample(-1000.0), SETTINGS[name]))
+    assert sample.output == pytest.approx(-find(name).limit(SETTINGS[name]), rel=2e-4)
 
 
 def test_a_lost_port_does_not_join_two_halves():
@@ -215,6 +321,7 @@ def test_a_lost_port_does_not_join_two_halves():
     ({'sensitivity': -1.0}, 'set invert'),
     ({'sensitivity': math.nan}, 'above 0'),
     ({'full_scale': math.inf}, 'above 0'),
+    ({'sample_rate': 0.0}, 'above 0'),
     ({'axis': 'w'}, 'x, y or z'),
     ({'columns': ('time_s',)}, 'exactly one'),
     ({'columns': ('gyro_dps', 'gyro_counts')}, 'exactly one'),
@@ -231,7 +338,13 @@ def test_csv_wants_a_sensitivity_for_counts_and_only_for_them(settings):
         find('csv').decoder(settings)
 
 
-@pytest.mark.parametrize('name', [*PLANNED, 'kvh_dsp_3000', ''])
+@pytest.mark.parametrize('name', [name for name in ALL if name != 'kvh_1750'])
+def test_increments_are_refused_where_the_device_sends_rates(name):
+    with pytest.raises(ValueError, match='sends rates'):
+        find(name).decoder(replace(SETTINGS[name], increments=True))
+
+
+@pytest.mark.parametrize('name', ['kvh_dsp_3000', ''])
 def test_an_unknown_protocol_is_refused_with_the_known_ones(name):
-    with pytest.raises(ValueError, match=r'^protocol .*: choose one of kvh_dsp3000, kvh_ecore, minimu9, csv'):
+    with pytest.raises(ValueError, match=rf'^protocol .*: choose one of {", ".join(PROTOCOLS)}$'):
         find(name)

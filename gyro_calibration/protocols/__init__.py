@@ -1,24 +1,27 @@
 """
-Wire formats of serial gyros: bytes to samples and back. No port, no ROS, no clock.
+Wire formats of serial gyros: bytes to samples and back, and which format it is (`listening`). No port, no ROS, no clock.
 
 >>> decoder = find('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
-[Sample(output=-0.00027459265121626786, temperature=None, time=None)]
+[Sample(output=-0.00027459265121626786, ...)]
 
 """
 
-from .csv_lines import CSV
-from .kvh_dsp3000 import KVH_DSP3000
-from .kvh_ecore import KVH_ECORE
-from .minimu9 import MINIMU9
-from .protocol import Decoder, Protocol, Sample, Settings
+from __future__ import annotations
 
-PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_ECORE, MINIMU9, CSV)}
+from gyro_calibration.protocols.csv_lines import CSV
+from gyro_calibration.protocols.fizoptika import FIZOPTIKA
+from gyro_calibration.protocols.kvh_1750 import KVH_1750
+from gyro_calibration.protocols.kvh_dsp3000 import KVH_DSP3000
+from gyro_calibration.protocols.kvh_ecore import KVH_ECORE
+from gyro_calibration.protocols.minimu9 import MINIMU9
+from gyro_calibration.protocols.protocol import Decoder, Protocol, Sample, Settings
+from gyro_calibration.protocols.razor import RAZOR
+from gyro_calibration.protocols.witmotion import WITMOTION
 
-PLANNED = ('kvh_1750', 'fizoptika', 'witmotion', 'razor')
-"""Formats that will stand here later."""
+PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
 
-__all__ = ['PLANNED', 'PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
+__all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
 
 
 def find(name: str) -> Protocol:
@@ -27,12 +30,9 @@ def find(name: str) -> Protocol:
 
     Raises
     ------
-    ValueError : there is none of that name, or not yet
+    ValueError : there is none of that name
 
     """
     if name in PROTOCOLS:
         return PROTOCOLS[name]
-    known = ', '.join(PROTOCOLS)
-    if name in PLANNED:
-        raise ValueError(f'protocol {name} is planned, but cannot be read yet: choose one of {known}, or send lines of the protocol csv')
-    raise ValueError(f'protocol {name!r} is not known: choose one of {known}')
+    raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}')

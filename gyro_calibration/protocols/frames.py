@@ -1,12 +1,11 @@
-"""
-Find binary frames of a fixed length in a stream of bytes.
-
-"""
+"""Find binary frames of a fixed length in a stream of bytes."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+
+from gyro_calibration.protocols.protocol import Frame
 
 
 class FrameSplitter:
@@ -29,29 +28,29 @@ class FrameSplitter:
         self._length = length
         self._is_intact = is_intact
         self._tail = b''
+        self._garbage = 0
         self.discarded_bytes = 0
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """
-        Return the frames that these bytes complete.
-
-        """
-        data, position, frames = self._tail + data, 0, []
-        total = len(data)
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the frames that these bytes complete."""
+        data, position, end, frames = self._tail + data, 0, 0, []
         while match := self._pattern.search(data, position):
+            position = match.start() + 1
             if self._is_intact(match.group()):
-                frames.append(match.group())
-                position = match.end()
-            else:
-                position = match.start() + 1
-        self._tail = data[max(position, total - self._length + 1):]
-        self.discarded_bytes += total - len(self._tail) - self._length * len(frames)
+                self._discard(match.start() - end)
+                frames.append(Frame(match.group(), self._garbage))
+                self._garbage = 0
+                position = end = match.end()
+        kept = max(position, len(data) - self._length + 1)
+        self._discard(kept - end)
+        self._tail = data[kept:]
         return frames
 
-    def reset(self) -> None:
-        """
-        Forget the frame that has begun.
+    def _discard(self, count: int) -> None:
+        self.discarded_bytes += count
+        self._garbage += count
 
-        """
-        self.discarded_bytes += len(self._tail)
-        self._tail = b''
+    def reset(self) -> None:
+        """Forget the frame that has begun."""
+        self._discard(len(self._tail))
+        self._tail, self._garbage = b'', 0

@@ -10,23 +10,25 @@ the output is unreliable, whatever the valid bit says (table 2).
 
 """
 
+from __future__ import annotations
+
 import math
 import re
 from functools import partial
 
-from .lines import LineSplitter
-from .protocol import Protocol, Reading
+from gyro_calibration.protocols.lines import LineSplitter
+from gyro_calibration.protocols.protocol import Protocol, Reading, Settings, Written, stateless
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
 
 
-def _parse(line, settings):
+def _parse(line: bytes, settings: Settings) -> Reading | None:
     match = _LINE.fullmatch(line)
     return match and Reading(float(match[1]), valid=match[2] == b'1')
 
 
-def _write(reading, settings):
-    return b'%15.6f   1\r\n' % reading.value
+def _write(reading: Written, settings: Settings) -> bytes:
+    return b'%15.6f   %d\r\n' % (reading.value, reading.valid)
 
 
 KVH_DSP3000 = Protocol(
@@ -36,8 +38,8 @@ KVH_DSP3000 = Protocol(
     rate=100.0,
     sensitivity=math.radians(1.0),
     splitter=partial(LineSplitter, 64, (b' ',)),
-    parse=_parse,
-    write=_write,
+    parser=stateless(_parse),
+    writer=stateless(_write),
     invert=True,
     full_scale=math.radians(500.0),
     startup=b'RRR',

@@ -7,31 +7,33 @@ for 30 deg/s. The RD2100 is assumed to speak alike. Baud and sense of rotation w
 
 """
 
+from __future__ import annotations
+
 import math
 from functools import partial
 
-from .frames import FrameSplitter
-from .protocol import Protocol, Reading
+from gyro_calibration.protocols.frames import FrameSplitter
+from gyro_calibration.protocols.protocol import Protocol, Reading, Settings, Written, stateless
 
 _COUNT = math.radians(0.00183)
 
 
-def _content(frame):
+def _content(frame: bytes) -> bytes:
     bits = 0
     for byte in frame:
         bits = bits << 7 | byte & 0x7F
     return bits.to_bytes(7, 'big')
 
 
-def _is_intact(frame):
+def _is_intact(frame: bytes) -> bool:
     return sum(_content(frame)) % 256 == 0
 
 
-def _parse(frame, settings):
+def _parse(frame: bytes, settings: Settings) -> Reading:
     return Reading(int.from_bytes(_content(frame)[5:], 'big', signed=True))
 
 
-def _write(reading, settings):
+def _write(reading: Written, settings: Settings) -> bytes:
     count = min(max(round(reading.value), -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
     bits = int.from_bytes(bytes([-sum(count) % 256, 0, 0, 0, 0]) + count, 'big')
     frame = bytes(bits >> shift & 0x7F for shift in range(49, -1, -7))
@@ -45,7 +47,7 @@ KVH_ECORE = Protocol(
     rate=10.0,
     sensitivity=_COUNT,
     splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8, _is_intact),
-    parse=_parse,
-    write=_write,
-    full_scale=0x8000 * _COUNT,
+    parser=stateless(_parse),
+    writer=stateless(_write),
+    largest_count=0x8000,
 )

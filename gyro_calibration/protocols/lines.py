@@ -1,11 +1,10 @@
-"""
-Find lines of text in a stream of bytes.
-
-"""
+"""Find lines of text in a stream of bytes."""
 
 from __future__ import annotations
 
 import re
+
+from gyro_calibration.protocols.protocol import Frame
 
 _LINE_END = re.compile(rb'[\r\n]')
 
@@ -32,37 +31,40 @@ class LineSplitter:
         self._tail = b''
         self._begun = False
         self._too_long = False
+        self._garbage = 0
         self.discarded_bytes = 0
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """
-        Return the lines that these bytes complete.
-
-        """
-        *lines, tail = _LINE_END.split(self._tail + data)
-        whole = [line for line in map(self._checked, lines) if line]
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the lines that these bytes complete."""
+        first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
+        *lines, tail = self._tail + first, *rest
+        whole = [self._framed(line) for line in lines if self._is_whole(line)]
         self._hold(tail)
         return whole
 
     def reset(self) -> None:
-        """
-        Forget the line that has begun.
+        """Forget the line that has begun."""
+        self._discard(len(self._tail))
+        self._tail, self._garbage, self._begun, self._too_long = b'', 0, False, False
 
-        """
-        self.discarded_bytes += len(self._tail)
-        self._tail, self._begun, self._too_long = b'', False, False
+    def _framed(self, line: bytes) -> Frame:
+        garbage, self._garbage = self._garbage, 0
+        return Frame(line, garbage)
 
-    def _checked(self, line):
+    def _is_whole(self, line: bytes) -> bool:
         good = not self._too_long and len(line) <= self._longest and (self._begun or line.startswith(self._beginnings))
         self._begun, self._too_long = True, False
         if not good:
-            self.discarded_bytes += len(line)
-            return b''
-        return line
+            self._discard(len(line))
+        return good and bool(line)
 
-    def _hold(self, tail):
+    def _discard(self, count: int) -> None:
+        self.discarded_bytes += count
+        self._garbage += count
+
+    def _hold(self, tail: bytes) -> None:
         if self._too_long or len(tail) > self._longest:
-            self.discarded_bytes += len(tail)
+            self._discard(len(tail))
             self._tail, self._too_long = b'', True
         else:
             self._tail = tail

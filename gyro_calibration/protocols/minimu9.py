@@ -6,23 +6,25 @@ the L3G4200D, typical). A line without ``AN`` holds no rate, so it is discarded.
 
 """
 
+from __future__ import annotations
+
 import math
 import re
 from functools import partial
 
-from .lines import LineSplitter
-from .protocol import Protocol, Reading
+from gyro_calibration.protocols.lines import LineSplitter
+from gyro_calibration.protocols.protocol import Protocol, Reading, Settings, Written, stateless
 
 _COUNT = math.radians(0.07)
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')
 
 
-def _parse(line, settings):
+def _parse(line: bytes, settings: Settings) -> Reading | None:
     match = _LINE.fullmatch(line)
     return match and Reading(int(match[1].split(b',')['xyz'.index(settings.axis)]))
 
 
-def _write(reading, settings):
+def _write(reading: Written, settings: Settings) -> bytes:
     counts = [min(max(round(reading.value), -0x8000), 0x7FFF) if axis == settings.axis else 0 for axis in 'xyz']
     return b'!ANG:0.00,0.00,0.00,AN:%d,%d,%d,0,0,0,0,0,0\r\n' % tuple(counts)
 
@@ -34,7 +36,7 @@ MINIMU9 = Protocol(
     rate=50.0,
     sensitivity=_COUNT,
     splitter=partial(LineSplitter, 256, (b'!',)),
-    parse=_parse,
-    write=_write,
-    full_scale=0x8000 * _COUNT,
+    parser=stateless(_parse),
+    writer=stateless(_write),
+    largest_count=0x8000,
 )

@@ -1,20 +1,31 @@
 """
 What every wire format shares: the records, and the decoder that turns bytes into samples and counts what it threw away.
 
-A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`lines`, `frames`), and two functions, frame to `Reading`
-and back. A reading is in the unit of the device; sign, sensitivity and full scale are applied here, for all formats alike.
+A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`lines`, `frames`), a parser that makes a `Reading` of a
+frame, and a function back. A reading is in the unit of the device; sign, sensitivity and full scale are applied here, for all formats
+alike, and so is the count of what was lost before a sample.
 
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple, TypeVar
 from typing import Protocol as Interface
+
+STANDARD_GRAVITY = 9.80665
+"""m/s²; what devices call one g."""
 
 GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
 """Columns of the log format that hold the output, and what their unit is in rad/s, or in counts."""
+
+KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
+"""Columns of the log format that may stand beside it."""
+
+_MOST_DEVIATION = 0.05  # of the sample rate; the clocks of gyros are 2 to 3 % off
 
 
 @dataclass(frozen=True)
@@ -27,15 +38,28 @@ class Sample:
     output : float
         rad/s, counter-clockwise positive.
     temperature : float or None
-        degC.
+        degC; None where the device says none with this sample.
     time : float or None
         Seconds, by the clock of the device.
+    sequence : int or None
+        Count of the device, modulo `Protocol.modulus`.
+    missing : int
+        So many samples seem to be lost directly before this one: damaged, called invalid by the device, or beyond full scale. The bytes
+        tell no more than that; a sequence, or the time that passed, knows better.
+    specific_force : float or None
+        m/s², along the input axis.
+    health : mapping of str to float
+        What else the device says of itself with this sample, by names with their units: ``supply_v``, ``source_current_a``.
 
     """
 
     output: float
     temperature: float | None = None
     time: float | None = None
+    sequence: int | None = None
+    missing: int = 0
+    specific_force: float | None = None
+    health: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -55,6 +79,10 @@ class Settings:
         Of the protocol ``csv``, in the words of the log format; columns with other names are skipped.
     full_scale : float or None
         rad/s; what is beyond it is thrown away, since the device cannot mean it.
+    increments : bool or None
+        Whether the device is set to send the angle since its last sample in place of the rate.
+    sample_rate : float or None
+        Hz, that the device is set to; an increment divided by the interval of this rate is the rate of turn.
 
     Raises
     ------
@@ -67,9 +95,11 @@ class Settings:
     axis: str = 'z'
     columns: tuple[str, ...] = ('time_s', 'gyro_dps', 'temperature_degc')
     full_scale: float | None = None
+    increments: bool | None = None
+    sample_rate: float | None = None
 
-    def __post_init__(self):
-        for name in ('sensitivity', 'full_scale'):
+    def __post_init__(self) -> None:
+        for name in ('sensitivity', 'full_scale', 'sample_rate'):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f'{name} is {value}, but must be above 0; for a gyro that counts the other way set invert')
@@ -79,10 +109,10 @@ class Settings:
         _check_columns(self.columns)
 
 
-def _check_columns(columns):
+def _check_columns(columns: tuple[str, ...]) -> None:
     if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
         raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be {", ".join(GYRO_COLUMNS)}')
-    for name in ('time_s', 'temperature_degc'):
+    for name in KNOWN_COLUMNS:
         if columns.count(name) > 1:
             raise ValueError(f'columns are {", ".join(columns)}, but {name} may stand there only once')
 
@@ -92,31 +122,89 @@ class Reading:
     """
     What one frame holds: the value in the unit of the device and in its own sense of rotation, and whether the device stands by it.
 
+    A frame without a value, None, is in order, but is none of a rate. The rest is as in `Sample`.
+
     """
 
-    value: float
+    value: float | None
     valid: bool = True
     temperature: float | None = None
     time: float | None = None
+    sequence: int | None = None
+    specific_force: float | None = None
+    health: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Written(Reading):
+    """A reading that a device writes: it has a value, and a sequence that counts from 0 on and never wraps."""
+
+    value: float
+    sequence: int = 0
+
+
+Parse = Callable[[bytes], 'Reading | None']
+"""Makes a reading of a frame, or None of one that is none; may remember what the frames directly before said."""
+
+Write = Callable[[Written], bytes]
+"""Makes the bytes of a reading; may remember the readings before."""
+
+Given = TypeVar('Given')
+Made = TypeVar('Made')
+
+
+def stateless(make: Callable[[Given, Settings], Made]) -> Callable[[Settings], Callable[[Given], Made]]:
+    """
+    Return the `Protocol.parser` or `Protocol.writer` of a format whose frames each stand for themselves, from ``make(given, settings)``.
+
+    """
+    return lambda settings: lambda given: make(given, settings)
+
+
+class Frame(NamedTuple):
+    """A frame, and how many bytes before it belong to none."""
+
+    data: bytes
+    garbage: int
 
 
 class Splitter(Interface):
-    """
-    Finds frames in bytes that come in any pieces; holds no more than one frame back, and counts the bytes that belong to none.
-
-    """
+    """Finds frames in bytes that come in any pieces; holds no more than one frame back, and counts the bytes that belong to none."""
 
     discarded_bytes: int
 
-    def feed(self, data: bytes) -> list[bytes]:
+    def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
 
     def reset(self) -> None:
         """Forget the frame that has begun: the next bytes do not continue it."""
 
 
-def _nothing_to_check(settings: Settings) -> None:
-    """Accept any settings: the format does not ask for more than `Settings` itself."""
+def check_rates(settings: Settings) -> None:
+    """
+    Accept the settings of a device that can only send rates: all, but that for increments.
+
+    Raises
+    ------
+    ValueError : increments are asked for
+
+    """
+    if settings.increments:
+        raise ValueError('increments is set, but this gyro sends rates, not angles: leave increments out')
+
+
+def check_counts(settings: Settings) -> None:
+    """
+    Accept the settings of a device that sends rates as counts, which mean something else in each unit.
+
+    Raises
+    ------
+    ValueError : no sensitivity is given, or increments are asked for
+
+    """
+    check_rates(settings)
+    if settings.sensitivity is None:
+        raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s of one count, which its data sheet gives')
 
 
 @dataclass(frozen=True)
@@ -130,25 +218,33 @@ class Protocol:
     baud : int
         Bits per second of the line, which has 8 data bits, no parity and 1 stop bit.
     rate : float
-        Nominal samples per second.
+        Nominal samples per second; see `nominal_rate`.
     sensitivity : float
-        rad/s per unit of the device.
+        rad/s per unit of the device, or rad where it sends increments.
     splitter : callable
         Returns a new `Splitter`.
-    parse : callable
-        ``parse(frame, settings)`` returns a `Reading`, or None when the frame is none.
-    write : callable
-        ``write(reading, settings)`` returns the bytes that a device sends.
+    parser : callable
+        ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and `stateless`.
+    writer : callable
+        ``writer(settings)`` returns what writes the frames of one device, see `Write` and `stateless`.
     invert : bool
         Whether the device counts clockwise turns positive.
     full_scale : float or None
-        rad/s, at the sensitivity above.
+        rad/s.
+    largest_count : int or None
+        Of a device that counts; its full scale is so many times the sensitivity.
+    increments : bool
+        Whether the device sends angles since its last sample, if nothing else is set.
     startup : bytes
         What makes the device send.
     awakening : bytes
         What the emulated device sends first, so that its first sample is not taken for the rest of a line.
     is_timed : bool
         Whether samples may carry the time of the device, in a column ``time_s``.
+    modulus : int
+        At which the sequence of the device begins anew; 0 where it has none.
+    good : mapping of str to (float, float)
+        Between which the values of `Sample.health` should be.
     check : callable
         ``check(settings)`` raises ValueError when the format needs more.
 
@@ -160,14 +256,18 @@ class Protocol:
     rate: float
     sensitivity: float
     splitter: Callable[[], Splitter]
-    parse: Callable[[bytes, Settings], Reading | None]
-    write: Callable[[Reading, Settings], bytes]
+    parser: Callable[[Settings], Parse]
+    writer: Callable[[Settings], Write]
     invert: bool = False
     full_scale: float | None = None
+    largest_count: int | None = None
+    increments: bool = False
     startup: bytes = b''
     awakening: bytes = b''
     is_timed: bool = False
-    check: Callable[[Settings], None] = _nothing_to_check
+    modulus: int = 0
+    good: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    check: Callable[[Settings], None] = check_rates
 
     def decoder(self, settings: Settings | None = None) -> Decoder:
         """
@@ -180,9 +280,11 @@ class Protocol:
         """
         return Decoder(self, settings or Settings())
 
-    def encode(self, sample: Sample, settings: Settings | None = None) -> bytes:
+    def encoder(self, settings: Settings | None = None) -> Callable[..., bytes]:
         """
-        Return the bytes that the device sends for a sample; beyond full scale it saturates.
+        Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends, whether it stands by the sample or not.
+
+        Beyond full scale it saturates.
 
         Raises
         ------
@@ -191,38 +293,70 @@ class Protocol:
         """
         settings = settings or Settings()
         self.check(settings)
-        limit = self.limit(settings)
-        output = min(max(sample.output, -limit), limit)
-        return self.write(Reading(output / self.factor(settings), True, sample.temperature, sample.time), settings)
+        limit, factor, write = self.limit(settings), self.factor(settings), self.writer(settings)
+
+        def encode(sample: Sample, valid: bool = True) -> bytes:
+            value = min(max(sample.output, -limit), limit) / factor
+            temperature, force = _finite(sample.temperature), _finite(sample.specific_force)
+            return write(Written(value, valid, temperature, sample.time, sample.sequence or 0, force, sample.health))
+
+        return encode
+
+    def encode(self, sample: Sample, settings: Settings | None = None, valid: bool = True) -> bytes:
+        """
+        Return what a device, just turned on, sends for a sample; see `encoder`.
+
+        Raises
+        ------
+        ValueError : the settings do not suffice for this format
+
+        """
+        return self.encoder(settings)(sample, valid)
 
     def gives_time(self, settings: Settings) -> bool:
-        """
-        Return whether samples carry the time of the device.
-
-        """
+        """Return whether samples carry the time of the device."""
         return self.is_timed and 'time_s' in settings.columns
 
-    def factor(self, settings: Settings) -> float:
-        """
-        Return the rad/s, counter-clockwise positive, of one unit of the device.
+    def nominal_rate(self, settings: Settings) -> float:
+        """Return the samples per second, as set or as the format says."""
+        return settings.sample_rate or self.rate
 
-        """
+    def sends_angles(self, settings: Settings) -> bool:
+        """Return whether the device sends angles since its last sample, as set or as the format says."""
+        return self.increments if settings.increments is None else settings.increments
+
+    def wrong_rate(self, settings: Settings, period: float) -> str:
+        """Return a warning where rates are wrong by the factor of the interval, since angles come at another period, s; else nothing."""
+        rate = self.nominal_rate(settings)
+        if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
+            return ''
+        return f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are made rates: set sample_rate'
+
+    def factor(self, settings: Settings) -> float:
+        """Return the rad/s, counter-clockwise positive, of one unit of the device."""
         invert = self.invert if settings.invert is None else settings.invert
-        return (-1.0 if invert else 1.0) * (settings.sensitivity or self.sensitivity)
+        factor = (settings.sensitivity or self.sensitivity) * (self.nominal_rate(settings) if self.sends_angles(settings) else 1.0)
+        return -factor if invert else factor
 
     def limit(self, settings: Settings) -> float:
-        """
-        Return the full scale in rad/s: as set, or that of the device at the sensitivity that is set.
-
-        """
+        """Return the full scale in rad/s: as set, or that of the device, which for one that counts depends on the sensitivity."""
         if settings.full_scale is not None:
             return settings.full_scale
-        return math.inf if self.full_scale is None else self.full_scale * abs(self.factor(settings)) / self.sensitivity
+        if self.largest_count is not None:
+            return self.largest_count * (settings.sensitivity or self.sensitivity)
+        return math.inf if self.full_scale is None else self.full_scale
+
+
+def _finite(value: float | None) -> float | None:
+    """Return a value, or None in place of nan: a log has it where its sensor failed."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 class Decoder:
     """
     Turns the bytes of one gyro into samples; raises on no input, and holds no more than one frame.
+
+    What a format says in several frames is put together only of frames with nothing lost between them.
 
     Attributes
     ----------
@@ -236,47 +370,65 @@ class Decoder:
     def __init__(self, protocol: Protocol, settings: Settings):
         protocol.check(settings)
         self._splitter = protocol.splitter()
-        self._parse = protocol.parse
-        self._settings = settings
+        self._parser = partial(protocol.parser, settings)
+        self._parse = self._parser()
         self._factor = protocol.factor(settings)
         self._limit = protocol.limit(settings)
         self._refused_bytes = 0
+        self._garbage, self._skipped, self._length = 0, 0, 0.0
+        self._begun = False
         self.faults = 0
         self.out_of_range = 0
 
     @property
     def discarded_bytes(self) -> int:
-        """
-        Number of bytes that belonged to no frame.
-
-        """
+        """Number of bytes that belonged to no frame."""
         return self._splitter.discarded_bytes + self._refused_bytes
 
     def feed(self, data: bytes) -> list[Sample]:
-        """
-        Return the samples that these bytes complete, the oldest first.
-
-        """
+        """Return the samples that these bytes complete, the oldest first."""
         samples = (self._sample(frame) for frame in self._splitter.feed(data))
         return [sample for sample in samples if sample is not None]
 
     def reset(self) -> None:
-        """
-        Forget the frame that has begun, as after the port was lost; the counts go on.
-
-        """
+        """Forget the frame that has begun, as after the port was lost; the counts go on."""
         self._splitter.reset()
+        self._parse = self._parser()
+        self._garbage, self._skipped, self._begun = 0, 0, False
 
-    def _sample(self, frame):
-        reading = self._parse(frame, self._settings)
+    def _sample(self, frame: Frame) -> Sample | None:
+        if frame.garbage:
+            self._parse = self._parser()  # the last frame is not the one directly before
+            self._garbage += frame.garbage
+        reading = self._parse(frame.data)
         if reading is None:
-            self._refused_bytes += len(frame)
+            self._refused_bytes += len(frame.data)
+            self._garbage += len(frame.data)
             return None
-        if not reading.valid:
-            self.faults += 1
+        if reading.value is None:
             return None
         output = reading.value * self._factor
+        if not self._is_good(reading, output):
+            self._skipped += 1
+            return None
+        missing = self._missing(len(frame.data))
+        return Sample(output, reading.temperature, reading.time, reading.sequence, missing, reading.specific_force, reading.health)
+
+    def _is_good(self, reading: Reading, output: float) -> bool:
+        if not reading.valid:
+            self.faults += 1
+            return False
         if not (math.isfinite(output) and abs(output) <= self._limit):
             self.out_of_range += 1
-            return None
-        return Sample(output, reading.temperature, reading.time)
+            return False
+        return True
+
+    def _missing(self, length: int) -> int:
+        """Return how many frames the garbage since the last sample was, and those that were skipped; none before the first sample."""
+        self._length = self._length + _LEARNING * (length - self._length) if self._length else float(length)
+        missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
+        self._garbage, self._skipped, self._begun = 0, 0, True
+        return missing
+
+
+_LEARNING = 0.05  # of the average length of a frame, a frame

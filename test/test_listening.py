@@ -1,0 +1,178 @@
+"""Listening: each format is recognized from few bytes and never taken for another; noise and a wrong baud are none."""
+
+import math
+import random
+
+import pytest
+
+from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.protocols.listening import BAUDS, recognize
+
+ALL = sorted(PROTOCOLS)
+SETTINGS = {name: Settings() for name in ALL} | {'fizoptika': Settings(sensitivity=1e-6)}
+MOTIONS = {
+    'rest': lambda k: 1e-4 * math.sin(7.0 * k),
+    'stillness': lambda k: 0.0,  # an emulated gyro without noise
+    'turn': lambda k: 0.8,
+    'shaking': lambda k: 5.0 * math.sin(k),
+}
+
+
+def frames(name, count, rate=MOTIONS['rest'], force=None):
+    """Return what a device sends, one sample after the other."""
+    encode = find(name).encoder(SETTINGS[name])
+    return [find(name).awakening, *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))]
+
+
+def received(data, ratio, idle=0):
+    """
+    Return what a receiver makes of bytes, whose bits are ``ratio`` times shorter than those of the sender.
+
+    Each byte is 10 bits: low, the data from the lowest bit on, high. The receiver waits for a falling edge and takes the middle of each
+    of its bits; a missing stop bit, as in a break, it passes over, as terminals do in raw mode.
+
+    """
+    line = [1]
+    for byte in data:
+        line += [0, *(byte >> bit & 1 for bit in range(8)), *[1] * (1 + idle)]
+    result, start, step = bytearray(), 0.0, 1.0 / ratio
+    while start + 9.5 * step < len(line):
+        if line[int(start)]:
+            start = math.floor(start) + 1.0
+            continue
+        bits = [line[int(start + (1.5 + bit) * step)] for bit in range(8)]
+        result.append(sum(value << bit for bit, value in enumerate(bits)))
+        start += 9.5 * step
+        while start < len(line) and not line[int(start)]:
+            start = math.floor(start) + 1.0
+    return bytes(result)
+
+
+@pytest.mark.parametrize('motion', sorted(MOTIONS))
+@pytest.mark.parametrize('name', ALL)
+def test_every_format_is_recognized_from_five_samples_and_as_no_other(name, motion):
+    for force in (None, 9.8):
+        recognition = recognize(b''.join(frames(name, 5, MOTIONS[motion], force)))
+        assert recognition.protocol is find(name), recognition.words
+        assert recognition.explained > 0.99 and recognition.words.startswith(f'{name} explains 100% of')
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_it_does_not_matter_where_the_bytes_begin_and_end(name):
+    data = b''.join(frames(name, 8))
+    generator = random.Random(1)
+    length = len(data) // 8
+    for _ in range(50):
+        recognition = recognize(data[generator.randrange(2 * length):-generator.randrange(1, length)])
+        assert recognition.protocol is find(name), recognition.words
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_a_line_that_damages_a_byte_in_a_hundred_is_recognized(name):
+    generator, data = random.Random(2), bytearray(b''.join(frames(name, 100)))
+    for place in generator.sample(range(len(data)), len(data) // 100):
+        data[place] ^= 1 << generator.randrange(8)
+    recognition = recognize(bytes(data))
+    assert recognition.protocol is find(name) and 0.5 < recognition.explained < 1.0, recognition.words
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_the_bits_are_read_at_the_right_baud(name):
+    data = b''.join(frames(name, 10))
+    assert received(data, 1.0) == data
+
+
+@pytest.mark.parametrize('idle', [0, 30])
+@pytest.mark.parametrize('name', ALL)
+def test_a_wrong_baud_is_no_format(name, idle):
+    data = b''.join(frames(name, 300))[:1500]
+    for baud in set(BAUDS) - {find(name).baud}:
+        recognition = recognize(received(data, baud / find(name).baud, idle))
+        assert recognition.protocol is None, (baud, recognition)
+
+
+def test_a_device_of_another_kind_is_no_format_at_any_baud():
+    """Frames with zeros in them come closest, since at a wrong baud they look like frames of the E-Core."""
+    generator = random.Random(7)
+    for ratio in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0):
+        for _ in range(10):
+            content = bytes(generator.choice((0x00, 0x00, 0x01, 0x55, 0x80, 0xFF, 0xA5)) for _ in range(generator.randrange(4, 30)))
+            data = b''.join(content + generator.randbytes(1) for _ in range(30))
+            recognition = recognize(received(data[:400], ratio, generator.choice((0, 3, 30))))
+            assert recognition.protocol is None, (ratio, content, recognition.words)
+
+
+def test_frames_that_are_always_the_same_must_be_almost_all_there_is():
+    """Zeros pass the check of the E-Core."""
+    zeros = b'\x80' + bytes(7)
+    assert recognize((4 * zeros + b'\xff' * 8) * 10).protocol is None
+    assert recognize((39 * zeros + b'\xff' * 8) * 10).protocol is find('kvh_ecore')
+
+
+def test_a_few_frames_in_much_noise_are_not_enough():
+    recognition = recognize(random.Random(8).randbytes(4000) + b''.join(frames('fizoptika', 50)))
+    assert recognition.protocol is None and 'too few of which are frames of fizoptika' in recognition.words
+
+
+def test_noise_is_no_format():
+    generator = random.Random(3)
+    for _ in range(50):
+        recognition = recognize(generator.randbytes(8192))
+        assert recognition.protocol is None and recognition.explained < 0.01
+        assert 'no format' in recognition.words or 'too few' in recognition.words
+
+
+@pytest.mark.parametrize('byte', [0x00, 0x55, 0x80, 0xDD, 0xFE, 0xFF, 0x0A, 0x20, 0x30])
+def test_one_byte_again_and_again_is_no_format(byte):
+    assert recognize(bytes([byte]) * 8192).protocol is None
+
+
+def test_nothing_and_little_are_said_to_be_that():
+    assert recognize(b'').words == 'nothing came: check the power and the wires of the gyro'
+    recognition = recognize(frames('kvh_1750', 1)[1])
+    assert recognition.protocol is None and recognition.frames == 1 and 'listen longer' in recognition.words
+
+
+def test_two_formats_at_once_are_said_to_be_ambiguous():
+    """Eleven frames of 8 bytes are as many bytes as eight frames of 11."""
+    recognition = recognize(b''.join(frames('fizoptika', 11) + frames('witmotion', 8)))
+    assert recognition.protocol is None and recognition.runner_up is not None
+    assert 'may be fizoptika or witmotion' in recognition.words or 'may be witmotion or fizoptika' in recognition.words
+
+
+def test_a_format_in_which_a_tenth_looks_like_another_is_recognized():
+    recognition = recognize(b''.join(frames('kvh_1750', 20) + frames('fizoptika', 9)))
+    assert recognition.protocol is find('kvh_1750') and recognition.runner_up is find('fizoptika')
+    assert 'next is fizoptika with 9%' in recognition.words
+
+
+def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
+    recognition = recognize(b'0.1,2.0,3.0,4.0\r\n' * 5)
+    assert recognition.protocol is None and 'lines of 4 numbers came, but columns names 3' in recognition.words
+    assert recognize(b'0.1,2.0,3.0,4.0\r\n' * 5, Settings(columns=('time_s', 'gyro_dps', 'a', 'b'))).protocol is find('csv')
+    assert recognize(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol is find('csv')
+
+
+def test_lines_of_a_dsp3000_are_no_columns():
+    """Two numbers in a line, and with one column a line is one number."""
+    data = b'       0.015733   1\r\n' * 8
+    for columns in (('gyro_dps',), ('gyro_dps', 'valid')):
+        assert recognize(data, Settings(columns=columns)).protocol is find('kvh_dsp3000')
+
+
+def test_a_gyro_that_counts_is_recognized_before_its_sensitivity_is_set():
+    for name in ('fizoptika', 'csv'):
+        settings = Settings(columns=('time_s', 'gyro_counts', 'temperature_degc'))
+        protocol = recognize(b''.join(frames(name, 5)), settings).protocol
+        assert protocol is find(name)
+        with pytest.raises(ValueError, match='sensitivity is not set'):
+            protocol.check(settings)
+
+
+def test_a_razor_that_was_not_yet_asked_for_rates_is_recognized():
+    assert recognize(b'#YPR=-142.28,-5.38,33.52\r\n' * 5).protocol is find('razor')
+
+
+def test_what_came_long_ago_does_not_count():
+    data = random.Random(4).randbytes(1_000_000) + b''.join(frames('minimu9', 300))
+    assert recognize(data).protocol is find('minimu9')

@@ -1,0 +1,107 @@
+"""Fizoptika: signs, and values that are spread over two frames."""
+
+import itertools
+import math
+
+import pytest
+
+from gyro_calibration.protocols import Sample, Settings, find
+
+PROTOCOL = find('fizoptika')
+ONE_COUNT = Settings(sensitivity=1.0)
+HEALTH = {'supply_v': 5.0, 'source_current_a': 0.1, 'diagnostic_v': 1.0}
+
+
+def frame(count, number=8, data=0):
+    """Return a frame; the numbers from 8 on are reserved and hold nothing."""
+    high, middle, low = count.to_bytes(3, 'big', signed=True)
+    content = bytes([low, high, middle, number, data])
+    return b'\xdd' + content + sum(content).to_bytes(2, 'big')
+
+
+def decoded(*frames):
+    """Return the samples of frames."""
+    return PROTOCOL.decoder(ONE_COUNT).feed(b''.join(frames))
+
+
+def values(*frames):
+    """Return what the frames say of the unit itself, in their order."""
+    return [(sample.temperature, dict(sample.health)) for sample in decoded(*frames)]
+
+
+@pytest.mark.parametrize('count', [0, 1, -1, 0x7FFFFF, -0x7FFFFF, -0x800000, 0x8000, -0x8000, 0x010203])
+def test_counts_have_a_sign(count):
+    sample, = decoded(frame(count))
+    assert sample.output == count
+    assert decoded(PROTOCOL.encode(Sample(float(count)), ONE_COUNT))[0].output == count
+
+
+@pytest.mark.parametrize('raw, degrees', [(0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0)])
+def test_the_temperature_comes_in_two_frames(raw, degrees):
+    high, low = raw.to_bytes(2, 'big', signed=True)
+    (first, _), (second, _) = values(frame(1, 0, high), frame(2, 1, low))
+    assert first is None and second == pytest.approx(degrees, abs=0.01)
+
+
+@pytest.mark.parametrize('number, name, raw, value', [
+    (2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1), (6, 'diagnostic_v', 13107, 1.0),
+    (2, 'supply_v', -16384, -5.0),
+])
+def test_each_other_value_comes_in_two_frames(number, name, raw, value):
+    high, low = raw.to_bytes(2, 'big', signed=True)
+    (_, first), (temperature, second) = values(frame(1, number, high), frame(2, number + 1, low))
+    assert first == {} and temperature is None and second == {name: pytest.approx(value, abs=1e-4)}
+
+
+def test_all_values_come_round_and_are_good():
+    encode = PROTOCOL.encoder(ONE_COUNT)
+    samples = decoded(*(encode(Sample(0.0, -12.5, sequence=number)) for number in range(16)))
+    assert [sample.temperature for sample in samples if sample.temperature is not None] == pytest.approx([-12.5] * 2, abs=0.01)
+    health = {name: value for sample in samples for name, value in sample.health.items()}
+    assert health == pytest.approx(HEALTH, abs=1e-4) and health.keys() == PROTOCOL.good.keys()
+    assert all(low < health[name] < high for name, (low, high) in PROTOCOL.good.items())
+
+
+@pytest.mark.parametrize('count', [1, 2, 3])
+def test_a_lost_frame_never_joins_halves_of_two_values(count):
+    """Each byte of each value is another, so that any wrong pair would show."""
+    frames = [frame(k, k % 8, 0x0F * k + 1) for k in range(16)]
+    right = values(*frames)
+    for lost in itertools.combinations(range(16), count):
+        rest = [k for k in range(16) if k not in lost]
+        heard = values(*(frames[k] for k in rest))
+        assert all(said in (right[k], (None, {})) for k, said in zip(rest, heard, strict=True))
+        assert sum(said != (None, {}) for said in heard) == sum({2 * pair, 2 * pair + 1}.isdisjoint(lost) for pair in range(8))
+
+
+def test_halves_with_garbage_between_are_not_joined():
+    """Eight lost frames bring the right number back, but the low byte is of a later value."""
+    assert values(frame(1, 2, 0x40), b'\xdd\x00', frame(2, 3, 0x01)) == [(None, {}), (None, {})]
+    decoder = PROTOCOL.decoder(ONE_COUNT)
+    first, = decoder.feed(frame(1, 2, 0x40))
+    decoder.reset()
+    second, = decoder.feed(frame(2, 3, 0x01))
+    assert first.health == second.health == {}
+
+
+def test_an_emulated_unit_takes_both_halves_at_one_instant():
+    """From one sample to the next the high byte changes, and halves of two would be 2 degC off."""
+    step = 250.0 / 0x8000
+    encode = PROTOCOL.encoder(ONE_COUNT)
+    warmer = -50.0 + 0x2600 * step
+    _, sample = decoded(encode(Sample(0.0, warmer - step, sequence=0)), encode(Sample(0.0, warmer, sequence=1)))
+    assert sample.temperature == pytest.approx(warmer - step, abs=0.1 * step)
+
+
+def test_an_emulated_unit_says_of_itself_what_the_sample_says():
+    encode = PROTOCOL.encoder(ONE_COUNT)
+    samples = decoded(*(encode(Sample(0.0, sequence=number, health={'source_current_a': 0.2})) for number in range(8)))
+    currents = [sample.health['source_current_a'] for sample in samples if 'source_current_a' in sample.health]
+    assert currents == pytest.approx([0.2], abs=1e-4)
+
+
+def test_a_sensitivity_is_asked_for():
+    with pytest.raises(ValueError, match='sensitivity is not set.*rad/s of one count'):
+        PROTOCOL.decoder()
+    sample, = PROTOCOL.decoder(Settings(sensitivity=math.radians(1.0) / 27880.0)).feed(frame(27880))
+    assert sample.output == pytest.approx(math.radians(1.0))

@@ -1,0 +1,142 @@
+"""The KVH 1750: the frame of the manual field by field, what a CRC keeps out, and what the settings do."""
+
+import math
+import struct
+
+import pytest
+
+from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.protocols.frames import FrameSplitter
+
+#: Interface control document 56-0298, section 5.2.1.
+GOLDEN = bytes.fromhex('FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC773D00284BFA34D8')
+ROTATION = {'x': 2.019593e-5, 'y': 5.159911e-5, 'z': -1.3111248e-5}  # rad since the last sample
+FORCE = {'x': -1.00191, 'y': -0.003495, 'z': 0.002109}  # g
+GRAVITY = 9.80665
+PROTOCOL = find('kvh_1750')
+
+
+def with_status(status, axis='z'):
+    """Return what the golden frame says with another status, and a CRC of its own."""
+    return decoded(sealed(GOLDEN[:28] + bytes([status]) + GOLDEN[29:32]), axis)
+
+
+def sealed(data):
+    """Return data with its CRC, worked out bit by bit."""
+    remainder = 0xFFFFFFFF
+    for byte in data:
+        remainder ^= byte << 24
+        for _ in range(8):
+            remainder = (remainder << 1 ^ (0x04C11DB7 if remainder >> 31 else 0)) & 0xFFFFFFFF
+    return data + remainder.to_bytes(4, 'big')
+
+
+def decoded(data, axis='z', **settings):
+    """Return the samples of bytes."""
+    return PROTOCOL.decoder(Settings(axis=axis, **settings)).feed(data)
+
+
+@pytest.mark.parametrize('axis', ['x', 'y', 'z'])
+def test_the_frame_of_the_manual_is_read_field_by_field(axis):
+    sample, = decoded(GOLDEN, axis)
+    assert sample.output == pytest.approx(ROTATION[axis] * 1000.0, rel=1e-6)  # 1000 Hz is what a new unit sends
+    assert sample.specific_force == pytest.approx(FORCE[axis] * GRAVITY, rel=2e-4)
+    assert (sample.temperature, sample.sequence, sample.missing, sample.time, sample.health) == (40.0, 61, 0, None, {})
+
+
+def test_the_crc_is_the_one_of_the_manual():
+    assert sealed(GOLDEN[:32]) == GOLDEN
+
+
+def test_a_frame_is_written_as_the_manual_has_it():
+    """But for the axes that are not read, which an emulated unit leaves at zero."""
+    sample, = decoded(GOLDEN)
+    written = PROTOCOL.encode(sample)
+    assert written[:4] == GOLDEN[:4] and written[12:16] == GOLDEN[12:16] and written[24:32] == GOLDEN[24:32]
+    assert written == sealed(written[:32])
+
+
+@pytest.mark.parametrize('settings, factor', [
+    ({}, 1000.0),
+    ({'sample_rate': 250.0}, 250.0),
+    ({'increments': True, 'sample_rate': 3600.0}, 3600.0),
+    ({'increments': False}, 1.0),
+    ({'increments': False, 'sample_rate': 250.0}, 1.0),
+    ({'increments': False, 'sensitivity': math.radians(1.0)}, math.radians(1.0)),
+    ({'invert': True}, -1000.0),
+])
+def test_the_rate_is_the_angle_by_the_interval_that_the_unit_is_set_to(settings, factor):
+    sample, = decoded(GOLDEN, 'y', **settings)
+    assert sample.output == pytest.approx(ROTATION['y'] * factor, rel=1e-6)
+    assert decoded(PROTOCOL.encode(Sample(0.25), Settings(**settings)), **settings)[0].output == pytest.approx(0.25, rel=1e-6)
+
+
+def test_the_nominal_rate_is_the_one_that_is_set():
+    assert [PROTOCOL.nominal_rate(Settings(sample_rate=rate)) for rate in (None, 250.0)] == [1000.0, 250.0]
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_only_the_bits_of_the_axis_count(axis):
+    gyro, accelerometer, name = 1 << axis, 1 << 4 + axis, 'xyz'[axis]
+    sample, = with_status(gyro | accelerometer, name)
+    assert sample.specific_force is not None
+    sample, = with_status(0x77 & ~accelerometer, name)
+    assert sample.specific_force is None and sample.output == pytest.approx(ROTATION[name] * 1000.0, rel=1e-6)
+    assert with_status(0x77 & ~gyro, name) == []
+
+
+def test_an_invalid_sample_is_counted_and_missing():
+    decoder = PROTOCOL.decoder()
+    frames = [PROTOCOL.encode(Sample(0.1, sequence=k), valid=k not in (3, 4)) for k in range(7)]
+    samples = decoder.feed(b''.join(frames))
+    assert [sample.missing for sample in samples] == [0, 0, 0, 2, 0] and decoder.faults == 2
+    assert [sample.sequence for sample in samples] == [0, 1, 2, 5, 6]
+
+
+@pytest.mark.parametrize('temperature', [-40, -1, 0, 25, 85])
+def test_the_temperature_has_a_sign(temperature):
+    sample, = decoded(sealed(GOLDEN[:30] + struct.pack('>h', temperature)))
+    assert sample.temperature == temperature
+    assert decoded(PROTOCOL.encode(Sample(0.1, temperature + 0.3)))[0].temperature == temperature
+
+
+@pytest.mark.parametrize('force', [9.81, -9.81, 0.0, 98.0665, None])
+def test_the_specific_force_keeps_its_sign(force):
+    sample, = decoded(PROTOCOL.encode(Sample(0.1, specific_force=force)))
+    assert sample.specific_force == (force if force is None else pytest.approx(force, rel=1e-6))
+
+
+def test_the_sequence_wraps_at_128():
+    samples = decoded(b''.join(PROTOCOL.encode(Sample(0.1, sequence=number)) for number in range(300)))
+    assert [sample.sequence for sample in samples] == [number % 128 for number in range(300)] and PROTOCOL.modulus == 128
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 3e38])
+def test_a_float_that_is_no_rate_is_out_of_range(value):
+    decoder = PROTOCOL.decoder(Settings(increments=False))
+    assert decoder.feed(sealed(GOLDEN[:12] + struct.pack('>f', value) + GOLDEN[16:32])) == []
+    assert (decoder.out_of_range, decoder.discarded_bytes) == (1, 0)
+
+
+def test_an_acceleration_that_is_no_number_gives_no_force():
+    sample, = decoded(sealed(GOLDEN[:24] + struct.pack('>f', math.nan) + GOLDEN[28:32]))
+    assert sample.specific_force is None
+
+
+def test_no_two_flipped_bits_get_past_the_crc():
+    """All 41 thousand pairs."""
+    splitter = PROTOCOL.splitter()
+    assert isinstance(splitter, FrameSplitter)
+    whole, past = int.from_bytes(GOLDEN, 'big'), 0
+    flips = [1 << bit for bit in range(8 * len(GOLDEN))]
+    for place, first in enumerate(flips):
+        past += sum(splitter._is_intact((whole ^ first ^ second).to_bytes(36, 'big')) for second in flips[:place])
+    assert past == 0
+
+
+def test_what_the_unit_answers_between_frames_costs_no_sample():
+    """The built-in test of the manual, section 5.3.1."""
+    answer = bytes.fromhex('FE8100AA777F7B7F7F7F1E')
+    decoder = PROTOCOL.decoder()
+    samples = decoder.feed(answer + GOLDEN + answer + GOLDEN)
+    assert len(samples) == 2 and decoder.discarded_bytes == 22 and samples[1].missing == 0

@@ -1,0 +1,47 @@
+"""The Razor firmware: axes that point right and down, accelerations that are negated, lines of other kinds."""
+
+import pytest
+
+from gyro_calibration.protocols import Sample, Settings, find
+
+PROTOCOL = find('razor')
+#: At rest and level the axis that points down has 256.
+LINE = b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
+
+
+def decoded(data, axis='z'):
+    """Return the samples of bytes."""
+    return PROTOCOL.decoder(Settings(axis=axis)).feed(data)
+
+
+@pytest.mark.parametrize('axis, rate, force', [
+    ('x', 0.01, -0.05),  # forward in both frames; what is sent is negated
+    ('y', -0.02, -0.1),  # right becomes left
+    ('z', 0.03, 1.0),  # down becomes up, and what holds the sensor up is up
+])
+def test_axes_and_accelerations_are_turned_as_in_ros(axis, rate, force):
+    """As the ROS driver of the firmware does: x and -y and -z of the rates, -x and y and z of the accelerations."""
+    sample, = decoded(LINE, axis)
+    assert sample.output == pytest.approx(rate) and sample.specific_force == pytest.approx(force * 9.80665)
+    again, = decoded(PROTOCOL.encode(sample, Settings(axis=axis)), axis)
+    assert again.output == pytest.approx(sample.output) and again.specific_force == pytest.approx(sample.specific_force, abs=0.001)
+
+
+def test_a_line_is_written_as_the_firmware_prints_it():
+    assert PROTOCOL.encode(Sample(-0.25, specific_force=9.80665)) == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n'
+
+
+@pytest.mark.parametrize('line', [
+    b'#YPRAG=1,2,3,4,5,6,7,8', b'#YPRAG=1,2,3,4,5,6,7,8,9,10', b'#YPRAG=1,2,3,4,5,6,7,8,nan', b'#YPRAG=1,2,3,4,5,6,7,8,',
+    b'YPRAG=1,2,3,4,5,6,7,8,9', b'#YPRAGM=1,2,3,4,5,6,7,8,9,10,11,12', b'#YPRAG=1,2,3,4,5,6,7,8,0x9', b'#A-C=1,2,3',
+])
+def test_other_lines_are_discarded(line):
+    decoder = PROTOCOL.decoder()
+    assert decoder.feed(line + b'\r\n') == [] and decoder.discarded_bytes == len(line)
+
+
+def test_angles_alone_are_in_order_but_no_sample():
+    """So the firmware sends at the start, until it is asked for more."""
+    decoder = PROTOCOL.decoder()
+    assert decoder.feed(b'#YPR=-142.28,-5.38,33.52\r\n') == [] and decoder.discarded_bytes == 0
+    assert PROTOCOL.startup == b'#ox#o1'
