@@ -1,0 +1,84 @@
+"""Stamps of a clock that is set: one axis of time, whoever sees the step first."""
+
+import numpy as np
+import pytest
+
+from gyro_calibration.host_clock import Stamps, both
+
+INTERVAL = 0.01
+
+
+def driven(step, seen=0, lost=0, others=0.0):
+    """Return times of samples and of what comes beside them; the clock is set in the middle, and the node sees it some samples sooner."""
+    stamps, times, beside = Stamps(), [], []
+    for number in range(200):
+        now = INTERVAL * number
+        if 100 <= number < 100 + lost:
+            continue
+        stamps.watch(now + 1e-4, 1e9 + now + (step if number >= 100 - seen else 0.0))
+        stamp = 5.0 + now + (step if number >= 100 else 0.0)
+        beside.append(stamps.of_other(stamp + others, times[-1] if times else stamp))
+        times.append(stamps.of_sample(stamp, times[-1] if times else -np.inf, INTERVAL))
+    return np.array(times), np.array(beside), stamps
+
+
+@pytest.mark.parametrize('step', [3600.0, -3600.0, 2e7, 0.5, -0.3])
+@pytest.mark.parametrize('seen', [0, 5])
+def test_times_go_on_where_the_clock_is_set(step, seen):
+    times, beside, stamps = driven(step, seen)
+    assert np.diff(times) == pytest.approx(np.full(199, INTERVAL), abs=1e-6) and stamps.steps == 1
+    assert beside == pytest.approx(times, abs=1e-6) and stamps.last == pytest.approx(step, abs=1e-6)
+
+
+def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length():
+    times, _, _ = driven(3600.0, lost=30)
+    assert np.diff(times).max() == pytest.approx(31 * INTERVAL, abs=1e-6)
+
+
+def test_another_jump_of_the_stamps_is_one():
+    stamps, before = Stamps(), 0.0
+    for number in range(100):
+        stamps.watch(INTERVAL * number, 1e9 + INTERVAL * number)
+        before = stamps.of_sample(INTERVAL * number, before, INTERVAL)
+    assert stamps.of_sample(3600.0, before, INTERVAL) == 3600.0 and stamps.steps == 0
+    assert stamps.of_other(-50.0, before) == -50.0
+
+
+def test_a_clock_that_is_slewed_is_not_set_and_an_old_step_explains_nothing():
+    stamps = Stamps()
+    for number in range(20000):
+        assert stamps.watch(0.01 * number, 1e9 + 0.01 * number * 1.0005) == 0.0
+    assert stamps.watch(200.0, 1e9 + 3800.0) > 3500.0
+    stamps.watch(211.0, 1e9 + 3811.0)
+    stamps.watch(212.0, 1e9 + 3812.0)
+    assert stamps.of_sample(3812.0, 200.0, 0.01) == 3812.0
+
+
+def test_a_step_before_the_first_sample_swallows_no_gap():
+    stamps = Stamps()
+    stamps.watch(0.0, 1000.0)
+    assert stamps.watch(1.0, 1001.3) == pytest.approx(0.3)
+    times = [-np.inf]
+    for stamp in (5.0, 5.01, 5.31):
+        times.append(stamps.of_sample(stamp, times[-1], 0.01))
+    assert times[1:] == [5.0, 5.01, 5.31]
+
+
+@pytest.mark.parametrize('step', [3600.0, -3600.0])
+def test_a_step_between_the_first_samples_leaves_times_that_go_on(step):
+    stamps = Stamps()
+    stamps.watch(0.0, 1000.0)
+    first = stamps.of_sample(5.0, -np.inf, np.inf)
+    stamps.watch(0.1, 1000.1 + step)
+    times = [first]
+    for stamp in (5.01, 5.02):
+        times.append(stamps.of_sample(stamp + step, times[-1], np.inf if len(times) == 1 else 0.01))
+    assert times == pytest.approx([5.0, 5.01, 5.02])
+
+
+@pytest.mark.parametrize('pause, read', [(0.001, (10.0, 1e9)), (0.3, None)])
+def test_clocks_are_not_compared_over_a_pause_between_them(monkeypatch, pause, read):
+    now = iter((10.0, 10.0 + pause))
+    monkeypatch.setattr('gyro_calibration.host_clock.steady', lambda: next(now))
+    monkeypatch.setattr('time.time', lambda: 1e9)
+    assert both() == read

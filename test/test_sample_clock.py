@@ -1,0 +1,312 @@
+"""Stamps, against simulated gyros whose true times are known: clocks that are off, bursts, busy hosts, stalls, lost samples."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gyro_calibration.protocols import Sample
+from gyro_calibration.sample_clock import ClockDifference, LowerLine, SampleClock
+
+BURST = 0.016  # s; latency_timer of an FTDI adapter
+BUFFER = 113  # samples of 36 bytes that a port holds at most
+LEARNED = 5.0  # s; "after the first seconds"
+HOUR = 3600.0
+
+
+@dataclass
+class Run:
+    """What a clock made of a gyro: true times and stamps of the samples that came, and the number of those that did not."""
+
+    clock: SampleClock
+    times: np.ndarray
+    stamps: np.ndarray
+    arrivals: np.ndarray
+    truly_lost: int
+
+    def error(self, begin=LEARNED):
+        """Return the root mean square of the error of the stamps after a time, s."""
+        return np.sqrt(np.mean((self.stamps - self.times)[self.times > begin] ** 2))
+
+
+def true_times(rate, off, seconds, drift=1e-4):
+    """Return when samples are sent: by a clock that is off, and drifts to and fro in ten minutes."""
+    number = np.arange(int(rate * seconds))
+    return 0.003 + np.cumsum((1.0 + off + drift * np.sin(2.0 * np.pi * number / rate / 600.0)) / rate)
+
+
+def arrivals_of(times, generator, burst=BURST, stalls=()):
+    """Return when samples arrive: at the end of bursts, late by a host with a long tail, and after stalls of a second all at once."""
+    sent = np.ceil(times / burst) * burst if burst else times
+    _, first, which = np.unique(sent, return_index=True, return_inverse=True)
+    late = generator.exponential(1e-4, first.size) + (generator.random(first.size) < 0.02) * generator.exponential(0.01, first.size)
+    arrivals = np.maximum.accumulate(sent[first] + late)
+    for stall in stalls:
+        arrivals[(arrivals > stall) & (arrivals < stall + 1.0)] = stall + 1.0
+    return arrivals[which]
+
+
+def chunks(arrivals):
+    """Give slices of samples that arrive together, no more than the buffer holds, each with its arrival."""
+    begins = np.flatnonzero(np.diff(arrivals, prepend=-1.0) > 0.0)
+    for begin, end in pairwise([*begins, arrivals.size]):
+        for number, part in enumerate(range(begin, end, BUFFER)):
+            yield slice(part, min(part + BUFFER, end)), float(arrivals[begin]) + 1e-3 * number
+
+
+def play(clock, times, arrivals, kept=None, **said):
+    """Let a clock stamp the samples that are kept; they say what arrays in `said` hold for each."""
+    kept = np.ones(times.size, bool) if kept is None else kept
+    columns = {name: values[kept].tolist() for name, values in said.items()}
+    samples = [Sample(0.0, **dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+    samples = samples or [Sample(0.0)] * int(kept.sum())
+    stamps = []
+    for part, arrival in chunks(arrivals[kept]):
+        stamps += clock.stamp(samples[part], arrival)
+    return Run(clock, times[kept], np.array(stamps), arrivals[kept], int(times.size - kept.sum()))
+
+
+def sequence(times, modulus=128):
+    """Return the sequence that the device numbers its samples by."""
+    return np.arange(times.size) % modulus
+
+
+@pytest.fixture
+def generator():
+    """Return a generator of random numbers."""
+    return np.random.default_rng(6)
+
+
+@pytest.mark.parametrize('off', [-0.03, 0.002, 0.03])
+@pytest.mark.parametrize('rate', [10, 100, 500, 1000])
+def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off, generator):
+    """Far below the 16 ms and the period; time is conserved. Where bursts beat with samples, a few of 30000 may seem lost."""
+    times = true_times(rate, off, 60.0)
+    run = play(SampleClock(rate), times, arrivals_of(times, generator, stalls=(20.0, 40.3)))
+    assert run.error() < min(0.0015, 0.35 / rate)
+    assert (np.diff(run.stamps) > 0.0).all()
+    assert run.clock.lost <= 3
+    assert run.stamps[-1] - run.stamps[0] == pytest.approx(times[-1] - times[0], abs=BURST)
+    assert run.clock.period == pytest.approx(np.diff(times)[-1], rel=3e-4)
+    assert run.clock.jitter_before > 0.005 > 0.001 > run.clock.jitter_after
+
+
+def test_a_host_without_bursts_costs_nothing_but_its_latency(generator):
+    times = true_times(1000, 0.01, 20.0)
+    assert play(SampleClock(1000.0), times, arrivals_of(times, generator, burst=0.0)).error() < 5e-5
+
+
+def test_nothing_drifts_in_an_hour(generator):
+    times = true_times(10, 0.03, HOUR)
+    run = play(SampleClock(10.0), times, arrivals_of(times, generator))
+    error = run.stamps - times
+    assert abs(error[-600:].mean() - error[600:1200].mean()) < 0.001
+    assert run.error() < 0.002
+
+
+def test_a_rate_far_from_the_nominal_one_is_found(generator):
+    times = true_times(800, 0.0, 10.0)
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator))
+    assert run.error(2.0) < 0.0005
+    assert run.clock.lost == 0
+
+
+def lose(times, runs):
+    """Return which samples are kept where so many are lost at these times."""
+    kept = np.ones(times.size, bool)
+    for begin, count in runs:
+        first = np.searchsorted(times, begin)
+        kept[first:first + count] = False
+    return kept
+
+
+RUNS = ((10.0, 1), (11.0, 2), (20.0, 50), (40.0, 300))
+
+
+@pytest.mark.parametrize('rate', [100, 1000])
+def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
+    times = true_times(rate, 0.02, 60.0)
+    kept = lose(times, RUNS) & (generator.random(times.size) >= 0.01)
+    run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(30.0,)), kept, sequence=sequence(times))
+    assert run.clock.lost == run.truly_lost
+    late = (run.times > 45.0) | (run.times < 40.0)  # for 0.3 s nobody knows how often the sequence has wrapped
+    assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.35 / rate
+
+
+@pytest.mark.parametrize('rate', [10, 100, 1000])
+def test_samples_lost_without_a_trace_are_counted_by_the_time_that_passed(rate, generator):
+    times = true_times(rate, 0.02, 80.0)
+    kept = lose(times, ((10.0, 1), (20.0, 50), (40.0, 300)))
+    run = play(SampleClock(rate), times, arrivals_of(times, generator), kept)
+    assert run.clock.lost == run.truly_lost
+    assert np.abs(run.stamps - run.times)[run.times > 78.0].max() < 0.35 / rate
+
+
+@pytest.mark.parametrize(('rate', 'tolerance'), [(10, 0.0), (100, 0.06), (1000, 0.1)])
+def test_one_percent_lost_without_a_trace_is_counted_nearly(rate, tolerance, generator):
+    """The jitter of the host hides a single period of 1 ms now and then."""
+    times = true_times(rate, 0.02, 60.0)
+    kept = (generator.random(times.size) >= 0.01) | (times < 10.0)
+    run = play(SampleClock(rate), times, arrivals_of(times, generator), kept)
+    assert run.clock.lost == pytest.approx(run.truly_lost, rel=tolerance, abs=1)
+
+
+@pytest.mark.parametrize('rate', [10, 100, 500])
+def test_what_was_counted_too_often_is_taken_back(rate, generator):
+    """A sample cannot arrive before it is sent."""
+    times = true_times(rate, -0.01, 60.0)
+    missing = ((generator.random(times.size) < min(0.05, 2.5 / rate)) & (times > LEARNED)).astype(int)
+    run = play(SampleClock(rate), times, arrivals_of(times, generator), missing=missing)
+    assert run.clock.lost <= 1 + 0.05 * missing.sum() < missing.sum()
+    assert run.error() < 0.003
+
+
+def test_what_damage_hides_is_counted_as_the_decoder_says(generator):
+    times = true_times(100, 0.01, 30.0)
+    kept = generator.random(times.size) >= 0.03
+    kept[0] = True
+    missing = np.zeros(times.size, int)
+    missing[kept] = np.diff(np.flatnonzero(kept), prepend=-1) - 1
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=missing)
+    assert run.clock.lost == pytest.approx(run.truly_lost, abs=2)
+    assert run.error() < 0.0015
+
+
+def test_the_time_of_the_device_is_fitted_like_a_number(generator):
+    """Here it tells of lost samples, too, and of the uneven loop of a microcontroller."""
+    times = true_times(100, 0.0, 30.0) + generator.uniform(-5e-4, 5e-4, 3000)
+    kept = generator.random(times.size) >= 0.01
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, time=50.0 + times / 1.02)
+    assert run.error() < 0.001
+    assert run.clock.lost == run.truly_lost
+
+
+@pytest.mark.parametrize('jump', [-20.0, 1.0, 2000.0])
+def test_a_damaged_time_of_the_device_harms_for_a_moment_only(jump, generator):
+    times = true_times(100, 0.0, 30.0)
+    said = times.copy()
+    said[1500] += jump
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
+    assert run.error(25.0) < 0.001
+    assert run.clock.lost <= 1
+    assert (np.diff(run.stamps) > 0.0).all()
+
+
+def test_a_device_that_was_restarted_begins_anew(generator):
+    times = true_times(100, 0.0, 30.0)
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=np.where(times < 15.0, times + 500.0, times - 15.0))
+    assert run.error() < 0.003
+
+
+@pytest.mark.parametrize(('outage', 'first'), [(0.0, 0), (0.3, 64), (0.55, 0), (1.0, 64)])
+def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(outage, first, generator):
+    """As where the power of a gyro failed for a moment."""
+    before, after = true_times(1000, 0.01, 20.0), true_times(1000, 0.01, 20.0)
+    times = np.concatenate([before, before[-1] + outage + after])
+    said = np.concatenate([sequence(before), (first + sequence(after)) % 128])
+    run = play(SampleClock(1000.0, 128), times, arrivals_of(times, generator), sequence=said)
+    assert np.abs(run.stamps - run.times)[run.times > after[0] + before[-1] + outage + 3.0].max() < 0.02
+    assert (np.diff(run.stamps) > 0.0).all()
+
+
+def test_a_pause_of_the_port_is_no_loss_and_the_stamps_go_on_behind_it(generator):
+    times = true_times(100, 0.03, 60.0)
+    arrivals = arrivals_of(times, generator)
+    clock = SampleClock(100.0)
+    first = play(clock, times[:2000], arrivals[:2000])
+    clock.interrupt()
+    second = play(clock, times[3000:], arrivals[3000:])
+    assert clock.lost == 0
+    assert second.stamps[0] > first.stamps[-1]
+    assert np.abs(second.stamps - times[3000:])[500:].max() < 0.002
+
+
+def test_a_gyro_that_becomes_ten_times_slower_or_faster_has_lost_nothing(generator):
+    """One or two periods of the old rate may be taken for lost until it shows."""
+    slow, fast = true_times(100, 0.0, 20.0), true_times(1000, 0.0, 20.0)
+    for first, second in ((fast, slow), (slow, fast)):
+        times = np.concatenate([first, first[-1] + second])
+        run = play(SampleClock(1000.0), times, arrivals_of(times, generator))
+        assert run.clock.lost <= 2
+        assert run.error(30.0) < 0.002
+        assert (np.diff(run.stamps) > 0.0).all()
+
+
+def test_many_samples_at_one_instant_still_increase():
+    clock = SampleClock(1000.0)
+    stamps = [stamp for _ in range(100) for stamp in clock.stamp([Sample(0.0)] * 3, 17.0)]
+    assert all(later > earlier for earlier, later in pairwise(stamps))
+
+
+def test_no_samples_have_no_stamps():
+    assert SampleClock(100.0).stamp([], 1.0) == []
+
+
+def test_device_time_keeps_its_intervals_in_a_fast_replay():
+    """Rounded to double precision at each sample, the intervals would add up to 1e-4 less or more."""
+    clock = SampleClock(100.0, use_device_time=True)
+    stamps = [clock.stamp([Sample(0.0, time=50.0 + 0.001 * k)], 1e6 + 1e-4 * k)[0] for k in range(100_000)]
+    assert [stamps[1000 * k] - 1e6 for k in range(100)] == pytest.approx([float(k) for k in range(100)], abs=1e-6)
+
+
+def test_device_time_tells_of_lost_samples_in_a_replay_too():
+    clock = SampleClock(100.0, use_device_time=True)
+    for k in range(1000):
+        if k not in (500, 600, 601):
+            clock.stamp([Sample(0.0, time=0.01 * k)], 1e-3 * k)
+    assert clock.lost == 3
+    assert clock.period == pytest.approx(0.01, rel=0.01)
+
+
+@pytest.mark.parametrize('speed', [0.5, 10.0])
+def test_a_sample_without_a_device_time_is_a_usual_interval_after_the_one_before(speed):
+    clock = SampleClock(50.0, use_device_time=True)
+    samples = [Sample(0.0, time=None if k == 500 else 0.01 * k) for k in range(1000)]
+    stamps = [clock.stamp([sample], 5.0 + 0.01 * k / speed)[0] for k, sample in enumerate(samples)]
+    assert stamps == pytest.approx([5.0 + 0.01 * k for k in range(1000)], abs=1e-3)
+    assert clock.lost == 0
+
+
+@pytest.mark.parametrize('jump', [-100.0, -0.5, 100.0])
+def test_a_jump_of_device_time_never_puts_a_stamp_back(jump):
+    clock = SampleClock(100.0, use_device_time=True)
+    before = clock.stamp([Sample(0.0, time=time) for time in (10.0, 10.01, 10.02)], 500.0)[-1]
+    after = clock.stamp([Sample(0.0, time=10.03 + jump), Sample(0.0, time=10.04 + jump)], 502.0)
+    assert after == pytest.approx([502.0, 502.01], abs=1e-5)
+    replayed = clock.stamp([Sample(0.0, time=0.0)], 495.0)
+    assert before < after[0] < after[1] < replayed[0]
+
+
+def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):
+    """Compared with every line through two of the points."""
+    x = np.arange(30.0)
+    y = np.maximum.accumulate(2.0 * x + generator.exponential(1.0, 30))
+    line = LowerLine(1.0)
+    for point in zip(x, y, strict=True):
+        line.add(*point)
+    sums = [(y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i))).sum() for i in range(30) for j in range(i + 1, 30)
+            if (y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i)) > -1e-9).all()]
+    assert sum(y - [line.at(each) for each in x]) == pytest.approx(min(sums))
+
+
+@pytest.mark.parametrize('by', [-HOUR, HOUR])
+def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
+    difference, others = ClockDifference(), []
+    for k in range(2000):
+        steady = 100.0 + 0.01 * k
+        difference.follow(steady, 1.7e9 + 1.0005 * steady + by * (k >= 1000))
+        others.append(difference.other(steady))
+    true = [1.7e9 + 1.0005 * (100.0 + 0.01 * k) + by * (k >= 1000) for k in range(2000)]
+    assert others == pytest.approx(true, rel=0.0, abs=0.002)
+    steps = np.diff(others)
+    assert (np.delete(steps, 999) > 0.0).all() and steps[999] == pytest.approx(by, abs=0.02)
+
+
+def test_another_clock_that_runs_at_half_speed_or_stands_puts_no_stamp_back():
+    difference, others = ClockDifference(), []
+    for k in range(2000):
+        difference.follow(0.01 * k, min(0.005 * k, 8.0))
+        others.append(difference.other(0.01 * k - 0.002))
+    assert (np.diff(others) > 0.0).all()
+    assert others[1500] == pytest.approx(7.5, abs=0.15)
