@@ -1,0 +1,487 @@
+"""Recording with real processes: from a port and from topics, interrupted, killed, and on a disk that is full."""
+
+import contextlib
+import json
+import math
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import rosbags
+
+from gyro_calibration import command_line
+from gyro_calibration.emulator import Emulator
+from gyro_calibration.log import read_log
+from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.recording import Topics, read_recording
+from gyro_calibration.verbs import record as record_verb
+
+RATE = 200.0
+KINDS = ['a.csv', 'a.csv.gz', 'a.mcap']
+
+
+@contextlib.contextmanager
+def gyro(link, rate=RATE):
+    """Be a gyro that counts: its outputs rise by 1e-4 rad/s a sample, so that each tells which one it is."""
+    samples = (Sample(1e-4 * (number % 10_000), 25.0, time=number / rate) for number in range(10 ** 6))
+    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')), link=link):
+        yield
+
+
+def words_for(link, out, *more):
+    return ['record', '--port', str(link), '--protocol', 'csv', '--columns', 'gyro_rad_s,temperature_degc', '--out', str(out), *more]
+
+
+def _record(words, output, error, environment, limit):
+    """Run the program in a process of its own, with its output in files, and maybe with a limit for the size of files, in bytes."""
+    os.environ.update(environment)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run without a terminal, where it is ignored
+    for path, number in ((output, 1), (error, 2)):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
+    if limit is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    sys.exit(command_line.main(words))
+
+
+class Recording:
+    """The program in a process, which is forked from one that has imported all it needs: that takes a tenth of the time."""
+
+    def __init__(self, folder, words, limit=None):
+        forks = multiprocessing.get_context('forkserver')
+        forks.set_forkserver_preload(['gyro_calibration.command_line', 'gyro_calibration.recorder_node', __name__])
+        self._files = [Path(tempfile.mkstemp(dir=folder)[1]) for _ in range(2)]
+        self.process = forks.Process(target=_record, args=(list(map(str, words)), *self._files, dict(os.environ), limit))
+        self.process.start()
+
+    def end(self, number=None, timeout=20.0):
+        """Send a signal, if one is given, and return exit code, standard output and standard error."""
+        if number is not None:
+            os.kill(self.process.pid, number)
+        self.process.join(timeout)
+        out, error = (file.read_text() for file in self._files)
+        assert self.process.exitcode is not None and 'Traceback' not in error, error
+        return self.process.exitcode, out, error
+
+    @property
+    def error(self):
+        """What it has printed on standard error so far."""
+        return self._files[1].read_text()
+
+
+@pytest.fixture
+def record(tmp_path_factory):
+    """Return a function that starts the program; it is killed after the test if it still runs."""
+    started, folder = [], tmp_path_factory.mktemp('printed')
+
+    def record(*words, **how):
+        started.append(Recording(folder, words, **how))
+        return started[-1]
+    yield record
+    for each in started:
+        each.process.kill()
+        each.process.join()
+
+
+def read(path, **topics):
+    return read_recording(path, Topics(**topics)) if str(path).endswith('.mcap') else read_log(path)
+
+
+def is_unbroken(log):
+    """Return whether no sample is missing in the middle, by what the samples say themselves."""
+    steps = np.diff(np.round(1e4 * np.asarray(log.output)))
+    return bool(np.isin(steps, (1, -9999)).all())
+
+
+# From the port
+
+
+@pytest.mark.parametrize(('name', 'number'), [('a.csv', signal.SIGINT), ('a.csv.gz', signal.SIGTERM), ('a.mcap', signal.SIGINT),
+                                              ('b.mcap', signal.SIGHUP)])
+def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
+    with gyro(tmp_path / 'gyro'):
+        recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
+        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 15.0, 'a first piece')
+        time.sleep(1.0)
+        code, out, _ = recording.end(number)
+    answer, log = json.loads(out), read(tmp_path / name)
+    assert code == 0
+    assert (answer['samples'], answer['lost'], answer['protocol']) == (len(log), 0, 'csv')
+    assert is_unbroken(log) and (log.temperature == 25.0).all()
+    assert not name.endswith('.mcap') or len(_messages(tmp_path / name, '/imu/data_raw')) == len(log)  # it has its closing part
+    assert np.median(np.diff(log.time)) == pytest.approx(1.0 / RATE, rel=0.05)
+    assert {'protocol: csv', f'port: {tmp_path / "gyro"}'} <= set(log.notes)
+
+
+def test_where_a_hangup_is_ignored_a_recording_goes_on():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with record_verb._stopping(None) as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.is_set() and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.wait(5.0)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
+    with gyro(tmp_path / 'gyro'):
+        code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
+        assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
+        before = (tmp_path / 'a.csv').read_bytes()
+        code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
+    assert code == 2 and 'is there already' in error and (tmp_path / 'a.csv').read_bytes() == before
+
+
+@pytest.mark.parametrize(('words', 'sentence'), [
+    (['--out', 'a.txt', '--port', '/dev/x'], 'a recording ends in .csv, .csv.gz or .mcap'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--topic', 'imu'], '--port and topics were both given'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--protocol', 'morse'], 'morse'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--baud', '-5'], '--baud is -5, but must be from 0 to 4000000'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--baud', '9' * 30], 'but must be from 0 to 4000000'),
+    (['--out', 'a.csv', '--protocol', 'csv'], 'without --port'),
+    (['--out', 'a.csv', '--sample-rate', '100'], 'without --port'),
+    (['--out', 'a.csv', '--increments', 'never'], 'without --port'),
+    (['--out', 'a.csv', '--topic', 'imu', '--reference-topic', '/imu'], 'one topic was named twice'),
+    (['--out', 'a.csv', '--all'], 'record several topics into .mcap'),
+    (['--out', 'a.csv', '--reference-topic', 'a', '--reference-topic', 'b'], 'record several topics into .mcap'),
+])
+def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch, words, sentence):
+    monkeypatch.chdir(tmp_path)
+    code, out, error = run('record', *words)
+    assert (code, out) == (2, '') and sentence in error and error.count('\n') == 1
+    assert not list(tmp_path.iterdir())
+
+
+@contextlib.contextmanager
+def angles(link, rate=100.0):
+    """Be a gyro that turns at 0.1 rad/s, and sends the angles since its last sample at another rate than a new one."""
+    samples = (Sample(0.1, 25.0, time=number / rate) for number in range(10 ** 6))
+    with Emulator(find('kvh_1750'), samples, Settings(sample_rate=rate), link=link):
+        yield
+
+
+@pytest.mark.parametrize(('options', 'rate', 'factor', 'is_warned'), [
+    ([], 1.0, 1000.0, True),
+    (['--sample-rate', '100'], 0.1, 100.0, False),
+    (['--increments', 'never'], 0.001, 1.0, False),
+])
+def test_angles_at_another_rate_than_set_are_told(run, tmp_path, options, rate, factor, is_warned):
+    with angles(tmp_path / 'gyro'):
+        code, out, error = run('record', '--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--out', tmp_path / 'a.csv',
+                               '--seconds', '6', '--json', *options)
+    log, remarks = read(tmp_path / 'a.csv'), ' '.join(json.loads(out)['remarks'])
+    assert code == 0 and log.output == pytest.approx(rate, rel=1e-6), error
+    assert ('samples a second are not the 1000 by which angles are made rates: set sample_rate.' in remarks) == is_warned
+    assert any(note.startswith(f'sensitivity: {factor!r} rad/s a unit of the device') for note in log.notes), log.notes
+
+
+@pytest.mark.parametrize(('first', 'is_kept'), [(1.8, True), (4.5, False)])
+def test_a_temperature_of_a_port_gets_its_column_or_is_told(run, tmp_path, first, is_kept):
+    samples = (Sample(0.1, 25.0 if number >= first * RATE else None, time=number / RATE) for number in range(10 ** 6))
+    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')), link=tmp_path / 'gyro', wait_for_reader=True):
+        code, out, _ = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '6', '--json'))
+    told = [remark for remark in json.loads(out)['remarks'] if 'temperature_degc came too late for a column of a log' in remark]
+    assert code == 0 and (read(tmp_path / 'a.csv').temperature is not None, not told) == (is_kept, is_kept)
+
+
+def test_columns_with_a_unit_have_no_sensitivity_beside_it(run, tmp_path):
+    with gyro(tmp_path / 'gyro'):
+        assert run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))[0] == 0
+    notes = read(tmp_path / 'a.csv').notes
+    assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
+
+
+def test_a_port_that_is_not_there_is_told_and_leaves_no_file(run, tmp_path):
+    code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '1'))
+    assert (code, out) == (1, '') and 'nothing came within' in error and str(tmp_path / 'gyro') in error
+    assert not (tmp_path / 'a.csv').exists()
+
+
+def test_a_gyro_that_is_unplugged_leaves_a_gap(record, wait_until, tmp_path):
+    with gyro(tmp_path / 'gyro'):
+        recording = record(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--json'))
+        wait_until(lambda: (tmp_path / 'a.csv').exists() and (tmp_path / 'a.csv').stat().st_size, 15.0, 'a first piece')
+    time.sleep(1.0)
+    size = (tmp_path / 'a.csv').stat().st_size
+    with gyro(tmp_path / 'gyro'):
+        wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > size + 1000, 15.0, 'samples after the gap')
+        code, out, error = recording.end(signal.SIGINT)
+    steps = np.diff(read_log(tmp_path / 'a.csv').time)
+    assert code == 0 and json.loads(out)['openings'] >= 2 and 'samples of csv come' in error
+    assert np.count_nonzero(steps > 0.5) == 1
+
+
+@pytest.mark.parametrize('name', KINDS)
+def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until, tmp_path, name):
+    # 7 of each kind make more than 20; each is killed at another time.
+    generator, lateness = np.random.default_rng(KINDS.index(name)), []
+    with contextlib.ExitStack() as stack:
+        running = []
+        for number in range(7):
+            (tmp_path / str(number)).mkdir()
+            link, out = tmp_path / str(number) / 'gyro', tmp_path / str(number) / name
+            stack.enter_context(gyro(link))
+            running.append((out, record(*words_for(link, out)).process))
+        wait_until(lambda: all(out.exists() and out.stat().st_size for out, _ in running), 30.0, 'first pieces')
+        for out, process in running:
+            time.sleep(0.3 * generator.random())
+            killed = time.time()
+            process.kill()
+            process.join()
+            log = read(out)
+            assert is_unbroken(log), out
+            lateness.append(killed - _begin(log) - log.time[-1])
+    assert np.median(lateness) < 1.0 and max(lateness) < 2.0, lateness  # the machine may be busy
+
+
+def _begin(log):
+    """Return when the first sample of a log was taken, in s since 1970, as its notes say."""
+    word = next(note for note in log.notes if 'time_s ' in note).replace('time_s counts from: ', 'time_s from ')
+    return float(word.partition('time_s from ')[2].split()[0])
+
+
+@pytest.mark.parametrize(('name', 'limit'), [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 60_000)])
+def test_a_file_that_may_not_grow_stays_readable(record, tmp_path, name, limit):
+    with gyro(tmp_path / 'gyro', 1000.0):
+        code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=limit).end()
+    log, size = read(tmp_path / name), (tmp_path / name).stat().st_size
+    assert code == 1 and f'{size} bytes stay in {tmp_path / name}' in error and 'make room' in error
+    assert size <= limit and len(log) > 500 and is_unbroken(log)
+
+
+@pytest.mark.parametrize('name', KINDS)
+def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
+    with gyro(tmp_path / 'gyro'):
+        code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=1000).end()
+    assert code == 1 and 'nothing was written' in error and not (tmp_path / name).exists()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """Return a folder on a disk of its own, of 64 kB; skip where none may be mounted."""
+    folder = tmp_path / 'small'
+    folder.mkdir()
+    mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs', folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip('this needs the right to mount a small disk')
+    yield folder
+    subprocess.run(['umount', '-l', folder], check=True)
+
+
+@pytest.mark.parametrize('name', ['a.csv', 'a.mcap'])
+def test_on_a_full_disk_what_was_recorded_stays(record, small_disk, tmp_path, name):
+    with gyro(tmp_path / 'gyro', 1000.0):
+        code, out, error = record(*words_for(tmp_path / 'gyro', small_disk / name)).end()
+    log = read(small_disk / name)
+    assert (code, out) == (1, '') and 'No space left on device' in error and 'make room' in error
+    assert len(log) > 500 and is_unbroken(log)
+    if name == 'a.mcap':
+        assert len(_messages(small_disk / name, '/imu/data_raw')) == len(log)
+
+
+# From topics
+
+
+class Robot:
+    """Publishes what a robot has, with stamps of its own, at many times the pace of them."""
+
+    def __init__(self, ros):
+        from geometry_msgs.msg import PoseStamped
+        from nav_msgs.msg import Odometry
+        from sensor_msgs.msg import Imu, Temperature
+        self.kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry, 'pose': PoseStamped}
+        self._ros, self._publishers = ros, {}
+
+    def offer(self, *topics, quality=None):
+        """Publish on some topics from now on."""
+        for topic in topics:
+            self._publishers[topic] = self._ros.publisher(self.kinds[topic], topic, quality or reliable())
+
+    def is_heard(self, count=1):
+        return all(each.get_subscription_count() >= count for each in self._publishers.values())
+
+    def send(self, time, rate, heading):
+        """Publish one sample on all topics."""
+        for topic, publisher in self._publishers.items():
+            message = self.kinds[topic]()
+            message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000 + int(time), round(time % 1.0 * 1e9)
+            message.header.frame_id = 'gyro'
+            if topic == 'imu/data_raw':
+                message.angular_velocity.z, message.linear_acceleration_covariance[0] = rate, -1.0
+            elif topic == 'imu/temperature':
+                message.temperature = 25.0 + 0.01 * time
+            else:
+                pose = message.pose.pose if topic == 'odom' else message.pose
+                pose.orientation.z, pose.orientation.w = math.sin(heading / 2.0), math.cos(heading / 2.0)
+            if topic == 'odom':
+                message.twist.twist.angular.z = rate
+            publisher.publish(message)
+
+    def drive(self, begin=0.0, duration=40.0):
+        """Turn to and fro between rests, and return how many samples that were."""
+        times = np.arange(round(begin * 50), round((begin + duration) * 50)) / 50.0
+        for number, at in enumerate(times.tolist()):
+            rate = math.sin(0.5 * at) * (at % 20.0 > 6.0)
+            self.send(at, rate, 2.0 * (1.0 - math.cos(0.5 * at)))
+            if number % 20 == 0:
+                time.sleep(0.01)  # or a subscriber on a busy machine loses some
+        return len(times)
+
+
+def reliable(**how):
+    """Return a quality that loses nothing."""
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
+
+
+def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(ros, record, run, wait_until, tmp_path):
+    robot = Robot(ros)
+    robot.offer('imu/data_raw', 'imu/temperature', 'odom')
+    both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json') for name in ('a.csv', 'a.mcap')]
+    wait_until(lambda: robot.is_heard(2), 20.0, 'both recorders')
+    count = robot.drive()
+    wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > 60 * count, 10.0, 'the last piece')
+    answers = [each.end(signal.SIGINT) for each in both]
+    for code, out, error in answers:
+        assert code == 0 and (json.loads(out)['samples'], json.loads(out)['lost']) == (count, 0), error
+    log, recording = read(tmp_path / 'a.csv'), read(tmp_path / 'a.mcap', reference='odom')
+    for name in ('output', 'time', 'temperature', 'reference_rate'):
+        np.testing.assert_array_equal(getattr(log, name), getattr(recording, name), name)
+    np.testing.assert_allclose(log.reference_heading, recording.reference_heading, atol=1e-9)
+    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 0.0001}\n')
+    model = ['--model', tmp_path / 'm.yaml']
+    for words in (['fit'], ['diagnose', *model], ['compensate', *model, '--out', tmp_path / 'o.csv'], ['allan']):
+        results = [run(*words, tmp_path / 'a.csv'), run(*words, tmp_path / 'a.mcap', '--reference-topic', 'odom')]
+        assert results[0][0] == results[1][0], results
+        if results[0][0]:  # a refusal is the same sentence
+            assert results[0][2].splitlines()[-1].replace('a.csv', 'a.mcap') == results[1][2].splitlines()[-1]
+        else:
+            assert results[0][1].replace('a.csv', 'a.mcap') == results[1][1]
+
+
+def test_publishers_that_come_late_or_with_another_quality_are_heard(ros, record, wait_until, tmp_path):
+    from rclpy.qos import DurabilityPolicy
+    from std_msgs.msg import String
+    robot = Robot(ros)
+    recording = record('record', '--reference-topic', 'pose', '--reference-topic', 'note', '--out', tmp_path / 'a.mcap', '--json')
+    wait_until(lambda: 'nobody publishes /imu/data_raw, /imu/temperature, /pose, /note so far' in recording.error, 20.0, 'a remark')
+    note = ros.publisher(String, 'note', reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    note.publish(String(data='said before anybody listened'))
+    robot.offer('imu/data_raw')
+    wait_until(robot.is_heard, 10.0, 'the recorder')
+    robot.drive(0.0, 4.0)
+    robot.offer('pose', quality=ros_quality())  # best effort
+    wait_until(robot.is_heard, 10.0, 'the recorder')
+    robot.drive(4.0, 6.0)
+    wait_until(lambda: (tmp_path / 'a.mcap').exists() and len(read(tmp_path / 'a.mcap')) >= 490, 10.0, 'the last piece')
+    code, out, error = recording.end(signal.SIGTERM)
+    answer, log = json.loads(out), read(tmp_path / 'a.mcap', reference='pose')
+    assert code == 0, error
+    assert answer['messages'] > answer['samples'] > 0
+    known = np.isfinite(log.reference_heading)
+    assert known.any() and not known[log.time < 3.9].any()
+    assert b'said before anybody listened' in b''.join(_messages(tmp_path / 'a.mcap', '/note'))
+
+
+def ros_quality():
+    from gyro_calibration.node import SENSOR_QUALITY
+    return SENSOR_QUALITY
+
+
+def _messages(path, topic):
+    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    with open(path, 'rb') as file:
+        return [message.data for _, _, message in reading.make_reader(file).iter_messages(topics=[topic])]
+
+
+def test_everything_is_recorded_with_definitions_that_others_understand(ros, record, wait_until, tmp_path):
+    rosbag2, typesys = rosbags()
+    robot = Robot(ros)
+    robot.offer('imu/data_raw', 'imu/temperature', 'odom', 'pose')
+    recording = record('record', '--all', '--out', tmp_path / 'a.mcap')
+    wait_until(robot.is_heard, 20.0, 'the recorder')
+    robot.drive(0.0, 2.0)
+    time.sleep(1.0)
+    assert recording.end(signal.SIGINT)[0] == 0
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    with rosbag2.Reader(tmp_path / 'a.mcap') as reader:
+        for connection in reader.connections:
+            store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        found = {connection.topic: store.deserialize_cdr(data, connection.msgtype) for connection, _, data in reader.messages()}
+    assert {'/imu/data_raw', '/imu/temperature', '/odom', '/pose'} <= set(found)
+    assert found['/odom'].twist.twist.angular.z == pytest.approx(math.sin(0.5 * 1.98) * 0.0)
+    assert found['/imu/data_raw'].header.stamp.sec == 1_700_000_001
+
+
+def test_a_log_of_a_topic_of_another_kind_is_refused(ros, record, wait_until, tmp_path):
+    robot = Robot(ros)
+    robot.offer('odom')
+    recording = record('record', '--topic', 'odom', '--out', tmp_path / 'a.csv')
+    wait_until(robot.is_heard, 20.0, 'the recorder')
+    robot.drive(0.0, 1.0)
+    code, out, error = recording.end()
+    assert (code, out) == (2, '') and '/odom is nav_msgs/msg/Odometry; --topic wants sensor_msgs/msg/Imu' in error
+    assert not (tmp_path / 'a.csv').exists()
+
+
+@pytest.mark.parametrize(('topic', 'domain', 'sentence'), [
+    ('1x', None, '/1x is no name of a topic (failed to resolve name'),
+    ('a b', None, '/a b is no name of a topic (failed to resolve name'),
+    ('imu', 'x', 'ROS 2 cannot be started (failed to initialize rcl: ROS_DOMAIN_ID is not an integral number)'),
+    ('imu', '999', 'ROS_DOMAIN_ID is 999, but the largest is 232'),
+])
+def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(ros_domain, record, tmp_path, monkeypatch, topic, domain, sentence):
+    if domain is not None:
+        monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+    code, out, error = record('record', '--topic', topic, '--out', tmp_path / 'a.csv', '--seconds', 2).end()
+    assert (code, out) == (2, '') and sentence in error and error.count('\n') == 1
+    assert not (tmp_path / 'a.csv').exists()
+
+
+def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_domain):
+    import rclpy
+    from rclpy.clock import ClockType
+
+    from gyro_calibration.recorder_node import RecorderNode
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    node = RecorderNode([], False, print, context)
+    assert [timer.clock.clock_type for timer in node.timers] == [ClockType.STEADY_TIME]
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_topics_that_nobody_publishes_are_told(ros_domain, record, tmp_path):
+    code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
+    assert (code, out) == (1, '') and 'nothing came within' in error and 'ROS_DOMAIN_ID' in error
+    assert not (tmp_path / 'a.csv').exists()
+
+
+def test_a_driver_is_recorded_from_its_topics(start_node, ros, record, wait_until, tmp_path):
+    with gyro(tmp_path / 'gyro'):
+        start_node('driver_node', parameters={'port': tmp_path / 'gyro', 'protocol': 'csv', 'columns': '[gyro_rad_s, temperature_degc]'})
+        both = [record('record', '--out', tmp_path / name, '--json') for name in ('a.csv', 'a.mcap')]
+        files = [tmp_path / 'a.csv', tmp_path / 'a.mcap']
+        wait_until(lambda: all(file.exists() and file.stat().st_size for file in files), 25.0, 'first pieces')
+        time.sleep(1.5)
+        ends = [each.end(signal.SIGINT) for each in both]
+    logs = [read(file) for file in files]
+    for (code, out, error), log in zip(ends, logs, strict=True):
+        assert code == 0 and json.loads(out)['samples'] == len(log) > 200, error
+        assert is_unbroken(log) and json.loads(out)['lost'] == 0 and (log.temperature == 25.0).all()
+
+
+def test_without_ros_the_way_out_is_said(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'gyro_calibration.recorder_node', None)
+    code, _, error = run('record', '--out', tmp_path / 'a.csv')
+    assert code == 2 and 'topics need ROS 2' in error and 'record from --port' in error
