@@ -1,22 +1,26 @@
 """
-What the ROS nodes share: parameters, diagnostics, qualities of service, and how a node starts and ends.
+What the ROS nodes share: parameters, qualities of service, calls at intervals, and how a node starts and ends.
 
 A node is a subclass of `rclpy.node.Node` that declares its table of `Parameter` records in its constructor, and joins threads of its
 own in `destroy_node`. Its ``main`` is ``return run(TheNode)``.
 
 """
 
+from __future__ import annotations
+
+import faulthandler
 import math
+import reprlib
 import signal
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -34,8 +38,11 @@ filter gives x and y no weight, and the matrix can still be inverted in double p
 
 """
 
-SENSOR_QUALITY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
-"""Best effort, as sensors are; 1000 deep, so that a subscriber that is busy for a second loses nothing at 1 kHz."""
+SENSOR_QUALITY = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+"""Best effort, as sensors are; 5000 deep, so that a subscriber that is busy for five seconds loses nothing at 1 kHz."""
+
+ENDING = 10.0
+"""A node that has not ended after so long is killed, s."""
 
 LATCHED_QUALITY = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last state, also for those who come later."""
@@ -58,6 +65,8 @@ class Parameter:
         Lowest and highest value, both allowed.
     dynamic : bool
         Whether it may be set while the node runs.
+    choices : tuple of str
+        The values that a text may have; empty for any.
 
     """
 
@@ -67,21 +76,19 @@ class Parameter:
     unit: str = ''
     range: tuple[float, float] | None = None
     dynamic: bool = False
+    choices: tuple[str, ...] = ()
 
     def descriptor(self) -> ParameterDescriptor:
-        """
-        Return what ``ros2 param describe`` shows.
-
-        """
+        """Return what ``ros2 param describe`` shows."""
         text = f'{self.description} Unit: {self.unit}.' if self.unit else self.description
-        descriptor = ParameterDescriptor(description=text, read_only=not self.dynamic)
+        descriptor = ParameterDescriptor(description=text, read_only=not self.dynamic, additional_constraints=_one_of(self.choices))
         if self.range and isinstance(self.default, float):
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(self.range[0]), to_value=float(self.range[1]))]
         elif self.range:
             descriptor.integer_range = [IntegerRange(from_value=int(self.range[0]), to_value=int(self.range[1]))]
         return descriptor
 
-    def check(self, value):
+    def check(self, value: object) -> object:
         """
         Return the value as the type of the default; a whole number may stand for a float, as in ``-p rate:=100``.
 
@@ -90,21 +97,30 @@ class Parameter:
         ValueError : the value has another type, is not finite or is out of range
 
         """
-        if isinstance(self.default, float) and type(value) is int:
+        if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
             value = float(value)
-        wanted = list if isinstance(self.default, Sequence) and not isinstance(self.default, str) else type(self.default)
-        if type(value) is not wanted or (wanted is list and not all(isinstance(item, str) for item in value)):
-            raise ValueError(f'parameter {self.name} is {value!r}, but must be {_WORDS[wanted]}, for example {self.default!r}')
-        if wanted is float and not math.isfinite(value):
+        wanted: type = list if isinstance(self.default, Sequence) and not isinstance(self.default, str) else type(self.default)
+        if type(value) is not wanted or (isinstance(value, list) and not all(isinstance(item, str) for item in value)):
+            words = _one_of(self.choices) or f'{_WORDS[wanted]}, for example {self.default!r}'
+            raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {words}')
+        if any('\0' in text for text in ([value] if isinstance(value, str) else value if isinstance(value, list) else ())):
+            raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be without a zero byte, as all names are')
+        if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f'parameter {self.name} is {value!r}, but must be finite, for example {self.default!r}')
-        if self.range and not self.range[0] <= value <= self.range[1]:
+        if self.range and isinstance(value, (int, float)) and not self.range[0] <= value <= self.range[1]:
             low, high = self.range
-            raise ValueError(f'parameter {self.name} is {value!r}, but must be from {low} to {high} {self.unit}'.rstrip())
+            raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be from {low} to {high} {self.unit}'.rstrip())
+        if self.choices and value not in self.choices:
+            raise ValueError(f'parameter {self.name} is {reprlib.repr(value)}, but must be {_one_of(self.choices)}')
         return value
 
 
+def _one_of(choices: Sequence[str]) -> str:
+    return f'{", ".join(choices[:-1])} or {choices[-1]}' if choices else ''
+
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_WORDS = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text', list: 'a list of texts'}
+_WORDS: dict[type, str] = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text', list: 'a list of texts'}
 
 
 def declare(node: Node, table: Sequence[Parameter]) -> SimpleNamespace:
@@ -116,10 +132,23 @@ def declare(node: Node, table: Sequence[Parameter]) -> SimpleNamespace:
     ValueError : an override has the wrong type or is out of range; the message is one sentence
 
     """
-    return SimpleNamespace(**{parameter.name: _declare(node, parameter) for parameter in table})
+    values = SimpleNamespace(**{parameter.name: _declare(node, parameter) for parameter in table})
+    node.add_on_set_parameters_callback(lambda given: _checked({parameter.name: parameter for parameter in table}, given))
+    return values
 
 
-def _declare(node, parameter):
+def _checked(table: Mapping[str, Parameter], given: Sequence[rclpy.Parameter]) -> SetParametersResult:
+    """Refuse values that are not possible; they are taken on after they are set, see `current`."""
+    try:
+        for each in given:
+            if each.name in table:
+                table[each.name].check(each.value)
+    except ValueError as error:
+        return SetParametersResult(successful=False, reason=str(error))
+    return SetParametersResult(successful=True)
+
+
+def _declare(node: Node, parameter: Parameter) -> object:
     # Declared first with any type, since rclpy itself refuses 100 for 100.0, and with a message in several sentences.
     default = parameter.default if isinstance(parameter.default, (bool, int, float, str)) else list(parameter.default)
     given = node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True)).value
@@ -130,38 +159,22 @@ def _declare(node, parameter):
 
 
 def current(node: Node, table: Sequence[Parameter]) -> SimpleNamespace:
-    """
-    Return the values that the declared parameters of a table have now: dynamic ones may have been set since.
-
-    """
+    """Return the values that the declared parameters of a table have now: dynamic ones may have been set since."""
     return SimpleNamespace(**{parameter.name: node.get_parameter(parameter.name).value for parameter in table})
 
 
-def diagnostic(node: Node, level: bytes, name: str, message: str, values: Mapping[str, object]) -> DiagnosticArray:
+def call_every(node: Node, period: float, callback: Callable[[], None]) -> None:
     """
-    Return a message for ``/diagnostics`` with one status.
+    Call again and again while the node spins, each time after a period, s, of the steady clock.
 
-    Parameters
-    ----------
-    node : Node
-        Gives the stamp and the first half of the name.
-    level : bytes
-        ``DiagnosticStatus.OK``, ``WARN`` or ``ERROR``.
-    name : str
-        What is reported on, for example ``'gyro'``.
-    message : str
-        One sentence.
-    values : mapping of names to anything that has a text
+    By the clock of the node, as rclpy's timers go by themselves, all would rest for an hour when somebody sets the clock back by one,
+    and for ever where a simulation does not go on.
 
     """
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    status = DiagnosticStatus(level=level, name=f'{node.get_name()}: {name}', message=message, values=pairs)
-    array = DiagnosticArray(status=[status])
-    array.header.stamp = node.get_clock().now().to_msg()
-    return array
+    node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def run(node_class: type[Node]) -> int:
+def run(node_class: Callable[[], Node]) -> int:
     """
     Start a node, spin it until SIGINT or SIGTERM, and return the exit code of the process.
 
@@ -185,7 +198,7 @@ def run(node_class: type[Node]) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-def _start(node_class):
+def _start(node_class: Callable[[], Node]) -> Node | None:
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         return node_class()
@@ -194,7 +207,7 @@ def _start(node_class):
         return None
 
 
-def _stop_on_signals():
+def _stop_on_signals() -> threading.Event:
     """
     Return an event that SIGINT and SIGTERM set.
 
@@ -208,10 +221,7 @@ def _stop_on_signals():
 
 
 def spin(node: Node, stop: threading.Event) -> None:
-    """
-    Serve the callbacks of a node until an event is set, then close it.
-
-    """
+    """Serve the callbacks of a node until an event is set, then close it."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -221,4 +231,7 @@ def spin(node: Node, stop: threading.Event) -> None:
         pass  # somebody else shut rclpy down: the same end
     finally:
         executor.shutdown()
+        # Fast DDS 2.14 waits for ever where it hears of another node's end at the moment of its own, as after Ctrl-C, with the GIL held.
+        faulthandler.dump_traceback_later(ENDING, exit=True)
         node.destroy_node()
+        faulthandler.cancel_dump_traceback_later()

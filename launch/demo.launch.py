@@ -19,13 +19,10 @@ PROTOCOL = 'kvh_dsp3000'
 
 
 def generate_launch_description():
-    """
-    Return the emulated gyro and what gyro.launch.py starts, on the emulator's port.
-
-    """
+    """Return the emulated gyro and what gyro.launch.py starts, on the emulator's port."""
     port = os.path.join(tempfile.gettempdir(), f'gyro_calibration_demo_{os.getpid()}')
     discovery = EnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', default_value='LOCALHOST')
-    arguments = {'port': port, 'protocol': PROTOCOL, 'model_file': _model()}
+    arguments = {'port': port, 'protocol': PROTOCOL, 'model_file': _model(), 'calibration_file': f'{port}.yaml'}
     nodes = IncludeLaunchDescription(_share('launch', 'gyro.launch.py'), launch_arguments=arguments.items())
     return LaunchDescription([SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', discovery), _emulator(port), nodes])
 

@@ -1,8 +1,8 @@
 """
 The driver of a gyro and the compensation of its output, with their parameters from the files in config.
 
-Topics: ``imu/data_raw``, ``imu/temperature``, ``imu/data``, ``yaw_rate``, ``heading``. A launch argument that is given goes before the
-file, one that is left empty changes nothing.
+Topics: ``imu/data_raw``, ``imu/temperature``, ``imu/data``, ``yaw_rate``, ``heading``, ``heading_with_covariance``. A launch argument that
+is given goes before the file, one that is left empty changes nothing.
 
 """
 
@@ -21,15 +21,18 @@ COMPENSATION = {
     'model_file': 'model of the gyro, see docs/error_model.md',
     'calibration_file': 'where the last self-calibration is kept',
     'profile_file': 'motion profile of the self-calibration',
+    'wheels': 'what tells of the wheels: none, odom, cmd_vel or both',
+}
+ENCLAVES = {
+    'driver_enclave': 'enclave of driver_node in a secured graph, for example /gyro_calibration/driver_node; see docs/security.md',
+    'compensation_enclave': 'enclave of compensation_node, for example /gyro_calibration/compensation_node',
 }
 
 
 def generate_launch_description():
-    """
-    Return the arguments and the two nodes.
-
-    """
-    arguments = [DeclareLaunchArgument(name, default_value='', description=text) for name, text in (DRIVER | COMPENSATION).items()]
+    """Return the arguments and the two nodes."""
+    texts = DRIVER | COMPENSATION | ENCLAVES
+    arguments = [DeclareLaunchArgument(name, default_value='', description=text) for name, text in texts.items()]
     arguments.append(DeclareLaunchArgument('namespace', default_value='', description='namespace of both nodes and their topics'))
     return LaunchDescription([*arguments, _file('driver'), _file('compensation'), OpaqueFunction(function=_nodes)])
 
@@ -48,4 +51,6 @@ def _node(name, arguments, given):
     overrides = {argument: ParameterValue(given[argument], value_type=str) for argument in arguments if given[argument]}
     parameters = [given[f'{name}_config'], *([overrides] if overrides else [])]
     executable = f'{name}_node'
-    return Node(package='gyro_calibration', executable=executable, name=executable, namespace=given['namespace'], parameters=parameters)
+    enclave = given[f'{name}_enclave']
+    return Node(package='gyro_calibration', executable=executable, name=executable, namespace=given['namespace'], parameters=parameters,
+                ros_arguments=['--enclave', enclave] if enclave else [])

@@ -28,7 +28,8 @@ def output(rates):
     return (1 + SCALE_FACTOR_ERROR) * np.asarray(rates) + BIAS
 
 
-def profile_rates(motion=CALIBRATION, after=1.1):
+def profile_rates(motion=CALIBRATION, after=4.1):
+    """Return what it says of a motion, and of the rest after it: 1 s for a delay, 1 s to settle, 2 s for the check."""
     return output(motion.rate_at(np.arange(0.0, motion.duration + after, INTERVAL)))
 
 
@@ -69,13 +70,14 @@ def test_the_heading_is_not_wrapped_and_stands_as_yaw_in_the_orientation(start):
 def test_covariances_follow_rep_145(start, tmp_path):
     model = tmp_path / 'model.yaml'
     model.write_text('effects: {bias: {bias: 0.01}}\nnoise: {angle_random_walk: 7.0e-4}')
-    _, gyro = start(model_file=model, threshold=0.0)
+    _, gyro = start(model_file=model, standing='none')
     gyro.play(np.full(201, 0.5))
     message = gyro.imu[-1]
     assert message.linear_acceleration_covariance[0] == -1.0
-    assert message.angular_velocity_covariance[8] == pytest.approx(7.0e-4 ** 2 / INTERVAL, rel=1e-3)
+    scale, bias = 0.03 * 0.5, 0.5 * DEGREE  # of a gyro that nobody calibrated, at 0.5 rad/s
+    assert message.angular_velocity_covariance[8] == pytest.approx(7.0e-4 ** 2 / INTERVAL + scale ** 2 + bias ** 2, rel=0.05)
     grown = message.orientation_covariance[8] - gyro.imu[0].orientation_covariance[8]
-    assert grown == pytest.approx(7.0e-4 ** 2 * 2.0, rel=1e-3)
+    assert grown == pytest.approx(7.0e-4 ** 2 * 2.0 + (2.0 * scale) ** 2 + (2.0 * bias) ** 2, rel=0.05)
     assert message.orientation_covariance[0] == message.orientation_covariance[4] == 1e6
     assert message.header.frame_id == 'gyro'
 
@@ -127,10 +129,10 @@ def test_a_calibration_behind_another_model_is_not_used_and_this_is_said(start, 
 
 
 @pytest.mark.parametrize('rates, reason', [
-    (np.zeros(2200), 'same value'),
-    (BIAS + 1e-4 * np.random.default_rng(1).standard_normal(2200), 'did the robot move'),
+    (np.zeros(2500), 'same value'),
+    (BIAS + 1e-4 * np.random.default_rng(1).standard_normal(2500), 'did the robot move'),
     (-profile_rates(), 'invert'),
-    (np.where(np.arange(2110) // 30 == 11, 0.0, profile_rates()), 'a slip or a bump'),
+    (np.where(np.arange(2410) // 30 == 11, 0.0, profile_rates()), 'a slip or a bump'),
 ], ids=['dead', 'not moved', 'wrong sign', 'slip'])
 def test_a_run_that_cannot_be_believed_is_refused_and_changes_nothing(start, tmp_path, rates, reason):
     _, gyro = start(threshold=0.0)
@@ -192,7 +194,9 @@ def test_calibrate_bias_refuses_a_gyro_that_is_moved(start):
 def test_the_node_drives_the_profile_and_stops_the_robot_at_the_end(start):
     _, gyro = start(drive_profile=True)
     commands = gyro.ros.collect(Twist, 'cmd_vel', 10)
-    assert calibrate(gyro).success
+    answers = (calibrate(gyro) for _ in range(3))  # where this machine is busy elsewhere, samples may stop for 0.25 s
+    answer = next(answer for answer in answers if 'no sample came' not in answer.message)
+    assert answer.success, answer.message
     gyro.wait_until(lambda: commands and commands[-1].angular.z == 0.0)
     driven = np.array([command.angular.z for command in commands])
     assert driven.max() == pytest.approx(45 * DEGREE, abs=1e-6) and driven.min() == pytest.approx(-45 * DEGREE, abs=1e-6)
@@ -210,6 +214,19 @@ def test_the_robot_is_stopped_on_cancel_signal_and_silence(start, end):
     elif end == 'signal':
         assert node.stop(signal.SIGTERM) == 0
     gyro.wait_until(lambda: commands[-1].angular.z == 0.0, 3.0)
+
+
+def test_a_robot_is_not_driven_on_when_samples_stop_whatever_the_timeout(start):
+    _, gyro = start(drive_profile=True)
+    commands = gyro.ros.collect(Twist, 'cmd_vel', 10)
+    answer = gyro.call_later('calibrate')
+    gyro.wait_until(gyro.calibrating)
+    gyro.play(profile_rates()[:250], until=lambda: commands and commands[-1].angular.z > 0.5)
+    before = len(commands)
+    gyro.wait_until(answer.done, 4.0, 'the end of the run')
+    assert 'while the robot was driven' in answer.result().message, answer.result().message
+    gyro.wait_until(lambda: commands[-1].angular.z == 0.0)
+    assert sum(command.angular.z != 0.0 for command in commands[before:]) < 25, 'half a second at 50 Hz'
 
 
 def test_reset_heading_makes_the_heading_zero(start):
@@ -324,7 +341,7 @@ def test_the_threshold_filter_deletes_rates_at_rest_and_can_be_switched_off_whil
     _, gyro = start()
     gyro.play(np.full(50, 0.1 * DEGREE))
     assert gyro.heading[-1].data == 0.0
-    gyro.wait_until(lambda: gyro.diagnostics and any(value.key == 'deleted_by_threshold_deg' and float(value.value) > 0.03
+    gyro.wait_until(lambda: gyro.diagnostics and any(value.key == 'deleted_heading_deg' and float(value.value) > 0.03
                     for value in gyro.diagnostics[-1].status[0].values), what='the deleted heading')
     _set_parameter(gyro.ros, 'threshold', 0.0)
     gyro.wait_until(lambda: gyro.play([0.1 * DEGREE] * 2) or gyro.rate[-1].data > 0.0)

@@ -1,11 +1,11 @@
 """The live check on a robot: what the diagnostics say of a gyro that is no longer what its model claims, and of one that is."""
 
 from datetime import datetime, timezone
+from functools import partial
 
 import numpy as np
 import pytest
-import yaml
-from fake_gyro import FakeGyro
+from fake_gyro import start_with_gyro
 
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
@@ -19,13 +19,7 @@ MODEL = {'effects': {'bias': {'bias': 0.01}}, 'covariance': [[1e-8]],
 
 @pytest.fixture
 def start(start_node, ros, wait_until, tmp_path):
-    def start(**parameters):
-        (tmp_path / 'model.yaml').write_text(yaml.safe_dump(MODEL))
-        given = {'calibration_file': tmp_path / 'calibration.yaml', 'model_file': tmp_path / 'model.yaml', **parameters}
-        node, gyro = start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until)
-        gyro.interval = INTERVAL
-        return node, gyro
-    return start
+    return partial(start_with_gyro, start_node, ros, wait_until, tmp_path, MODEL, INTERVAL)
 
 
 def outputs(seconds, scale=1.0, bias=0.01, seed=0):

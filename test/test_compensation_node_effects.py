@@ -51,7 +51,7 @@ def test_effects_with_a_past_gain_in_a_drive_what_they_promise(start, tmp_path, 
     log, errors = thermal_drive, {}
     for name, effects in (('plain', PLAIN), ('extended', PLAIN | REMEMBERS)):
         model = written(tmp_path / f'{name}.yaml', effects)
-        node, gyro = start(model_file=tmp_path / f'{name}.yaml', threshold=0.0, calibration_file=tmp_path / 'none.yaml')
+        node, gyro = start(model_file=tmp_path / f'{name}.yaml', standing='none', calibration_file=tmp_path / 'none.yaml')
         gyro.interval = 0.1
         gyro.play(log.output, log.temperature)
         headings = np.array([message.data for message in gyro.heading])[-len(log):]

@@ -1,7 +1,4 @@
-"""
-The launch files as users start them: the nodes come up, the heading follows the gyro, and all ends well.
-
-"""
+"""The launch files as users start them: the nodes come up, the heading follows the gyro, and all ends well."""
 
 import random
 import time

@@ -1,0 +1,141 @@
+"""A calibration that goes on: when it is complete, what it is compared with, and what comes of it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.calibration_run import LONGEST, MARKED, ODOMETRY, PROFILE, REST, TURNS, Rules, Run, calibrated, wanted_after
+from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.motion import CALIBRATION, turns
+from gyro_calibration.noise import Noise
+from gyro_calibration.self_calibration import Limits, Reference
+
+INTERVAL, S, B = 0.02, 0.0373, 0.75 * DEGREE / 60
+ROUND = turns([(3.0, 0.0), (12.0, 60.0), (3.0, 0.0)])
+BEGIN = 1000.0
+
+
+def rules(turned=2, check=True):
+    return Rules(Limits(), Reference(0.01), turned, check)
+
+
+def ran(kind, motion, given, duration=None, drift=0.0):
+    """Return a run over a motion and the rest after it, and what it answered; from the end of the motion on it may drift, rad/s."""
+    answers = []
+    profile = motion if kind == PROFILE else None
+    run = Run(kind, motion.duration if duration is None else duration, wanted_after(kind, given), 0.0, answers.append, profile)
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(2000)
+    for number in range(2000):
+        time = number * INTERVAL
+        rate = (1 + S) * float(motion.rate_at(np.array(time))) + B + noise[number] + (drift if time > motion.duration else 0.0)
+        if number % 3 == 0:
+            run.odometry.append((BEGIN + time, float(motion.heading_at(np.array(time))), float(motion.rate_at(np.array(time)))))
+        run.add(BEGIN + time, rate, rate, 25.0, time)
+        if run.has_button and time >= motion.duration:
+            run.finish()
+        if answers:
+            return run, answers[0]
+    return run, None
+
+
+@pytest.mark.parametrize('kind, motion, duration, takes', [
+    (PROFILE, CALIBRATION, None, 24.0), (ODOMETRY, CALIBRATION, 20.0, 24.0), (ODOMETRY, CALIBRATION, 600.0, 24.0),
+    (TURNS, ROUND, math.inf, 18.0 + MARKED)], ids=['profile', 'odometry', 'odometry until it is finished', 'turns'])
+def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration, takes):
+    run, answer = ran(kind, motion, rules(), duration)
+    assert answer == '' and run.elapsed == pytest.approx(takes, abs=0.1) and run.progress > 0.99
+    calibration, said = calibrated(run, rules(), Noise(), '2026-01-01')
+    assert (calibration.scale_factor_error, calibration.bias) == (pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said
+    assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
+
+
+def test_turns_that_nobody_finishes_are_given_up():
+    run = Run(TURNS, math.inf, MARKED, 0.0, (answers := []).append)
+    for time in (0.0, LONGEST, LONGEST + 1.0):
+        run.add(time, 0.0, 0.0, None, time)
+    assert 'finish_calibration' in answers[0] and 'rest on the mark' in run.says()
+
+
+@pytest.mark.parametrize('kind, duration', [(ODOMETRY, 600.0), (PROFILE, 700.0), (TURNS, 599.0)])
+def test_a_run_of_known_length_may_take_longer_than_one_that_waits_for_a_button(kind, duration):
+    run = Run(kind, math.inf if kind == TURNS else duration, 4.0, 0.0, (answers := []).append)
+    run.add(0.0, 0.0, 0.0, None, 0.0)
+    run.add(duration, 0.0, 0.0, None, duration)
+    if kind == TURNS:
+        run.finish()
+    run.add(duration + 2.0, 0.0, 0.0, None, duration + 2.0)
+    assert not answers and run.progress < 1.0
+    run.add(duration + 4.0, 0.0, 0.0, None, duration + 4.0)
+    assert answers == ['']
+
+
+def test_the_button_acts_once_and_tells_how_long_to_wait():
+    run = Run(TURNS, math.inf, 2.5, 0.0, (answers := []).append)
+    for time in (0.0, 10.0):
+        run.add(time, 0.0, 0.0, None, time)
+    assert run.finish() == 'leave the robot at rest for 2.5 s more'
+    run.add(11.0, 0.0, 0.0, None, 11.0)
+    assert run.finish() == 'leave the robot at rest for 1.5 s more' and run.duration == 10.0 and not answers
+
+
+def test_a_profile_and_a_rest_have_no_button():
+    assert [Run(kind, 20.0, 4.0, 0.0, print).has_button for kind in (PROFILE, REST, ODOMETRY, TURNS)] == [False, False, True, True]
+
+
+def test_odometry_without_a_yaw_is_taken_by_its_rates():
+    run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
+    run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
+    assert calibrated(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(S, abs=5e-3)
+
+
+def test_a_scale_is_no_better_known_than_that_of_the_odometry():
+    run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
+    assert calibrated(run, rules(), Noise(), '')[0].standard_deviations[0] == pytest.approx(0.01 * (1 + S), rel=0.05)
+
+
+@pytest.mark.parametrize('spoil, reason', [
+    (lambda told: [], '0 messages came on odom'), (lambda told: told[:20], '20 messages came'), (lambda told: told[::-1], 'that increase')],
+    ids=['none', 'too few', 'out of order'])
+def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
+    run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
+    run.odometry = spoil(run.odometry)
+    with pytest.raises(DataRefused, match=reason):
+        calibrated(run, rules(), Noise(), '')
+
+
+def test_the_gyro_may_count_the_turns_and_a_wrong_count_is_refused():
+    run, _ = ran(TURNS, ROUND, rules(), math.inf)
+    assert '2 whole turns' in calibrated(run, rules(turned=0), Noise(), '')[1]
+    with pytest.raises(DataRefused, match='3 were said|turns'):
+        calibrated(run, rules(turned=3), Noise(), '')
+
+
+def test_a_drift_after_a_profile_refuses_it_unless_nobody_looks():
+    run, _ = ran(PROFILE, CALIBRATION, rules(), drift=0.05 * DEGREE)
+    with pytest.raises(DataRefused, match='after the run'):
+        calibrated(run, rules(), Noise(), '')
+    run, answer = ran(PROFILE, CALIBRATION, rules(check=False), drift=2.0 * DEGREE)
+    assert answer == '' and run.elapsed == pytest.approx(21.0, abs=0.1)
+
+
+def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
+    run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0, drift=20.0 * DEGREE)
+    run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
+    assert 'at rest after it' not in calibrated(run, Rules(Limits(time_offset=0.5), Reference(0.01), 2, True), Noise(), '')[1]
+
+
+def test_a_rest_gives_the_bias_alone():
+    run = Run(REST, 10.0, 0.0, 0.0, (answers := []).append)
+    for number, noise in enumerate(1e-4 * np.random.default_rng(1).standard_normal(520)):
+        run.add(number * INTERVAL, B + noise, B + noise, None, 0.0)
+    calibration, said = calibrated(run, rules(), Noise(), '')
+    assert answers[0] == '' and calibration.bias == pytest.approx(B, abs=1e-5) and calibration.method == 'rest' and not said
+
+
+def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
+    run = Run(REST, 10.0, 0.0, 0.0, print)
+    for number, noise in enumerate(1e-5 * np.random.default_rng(1).standard_normal(520)):
+        run.add(number * INTERVAL, B, B + noise, 25.0, 0.0)
+    with pytest.raises(DataRefused, match='the gyro is dead'):
+        calibrated(run, rules(), Noise(), '')
