@@ -16,7 +16,6 @@ import itertools
 import math
 import os
 import random
-import signal
 import statistics
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from processes import end, processor_time
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from sensor_msgs.msg import Imu, Temperature
@@ -107,17 +107,7 @@ def running(name: str, folder: Path, **parameters: object) -> Iterator[int]:
     try:
         yield process.pid
     finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(10.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def processor_time(process: int) -> float:
-    """Return what a process has used so far, s; by the clock of clock_getcpuclockid(3), which is finer than the ticks in /proc."""
-    return time.clock_gettime(~process << 3 | 2)
+        end(process)
 
 
 class Probe:
@@ -256,7 +246,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
         os.environ.update(ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
-                          FASTDDS_BUILTIN_TRANSPORTS='UDPv4', ROS_LOG_DIR=folder)
+                          ROS_LOG_DIR=folder)
         rclpy.init()
         try:
             print(f'{os.cpu_count()} cores; load average of the minute before: {os.getloadavg()[0]:.1f}\n')

@@ -1,0 +1,511 @@
+"""
+What is fuzzed: each target takes any bytes, and raises where a claim about its reader or decoder is broken.
+
+The documented errors (LogError, ModelError, MotionError, UsageError, ValueError of a parameter) are the right answer to bytes that are
+wrong; any other exception is a fault, and so is a message of several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
+
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import json
+import math
+import os
+import random
+import struct
+import tempfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from gyro_calibration.bias_table import BiasTable, carry, read_bias_table, write_bias_table
+from gyro_calibration.command_line import _parser
+from gyro_calibration.compensation import compensate
+from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
+from gyro_calibration.files import LARGEST
+from gyro_calibration.log import QUANTITIES, Log, LogError, read_log, read_log_blocks, write_log
+from gyro_calibration.messages import IMU, LAYOUTS, TEMPERATURE, serialize
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model_file import ModelError, model_text, read_model, write_model
+from gyro_calibration.motion import CALIBRATION, MotionError, read_motion
+from gyro_calibration.noise import Noise
+from gyro_calibration.protocols import PROTOCOLS, Protocol, Sample, Settings
+from gyro_calibration.protocols.lines import LineSplitter
+from gyro_calibration.protocols.listening import recognize
+from gyro_calibration.protocols.protocol import Splitter
+from gyro_calibration.recording import Topics, read_recording
+from gyro_calibration.sample_clock import SampleClock
+from gyro_calibration.verbs.plan import read_limits, write_motion
+from gyro_calibration.verbs.verb import UsageError
+
+#: Longest message of an error, in characters without the path; s that an input may take; bytes that a decoder may hold back.
+MESSAGE, SECONDS, HELD = 1000, 5.0, 1024
+#: In memory, where the machine has such a folder: a fuzzer writes a file thousands of times a second.
+_FOLDER = tempfile.TemporaryDirectory(prefix='gyro_calibration_fuzz_', dir='/dev/shm' if os.access('/dev/shm', os.W_OK) else None)
+HAS_ROS = importlib.util.find_spec('rclpy') is not None
+
+
+@dataclass(frozen=True)
+class Target:
+    """
+    Something that reads bytes.
+
+    Attributes
+    ----------
+    check : takes any bytes, raises where a claim is broken, and tells whether they were read
+    seeds : returns inputs to begin with, as the project writes them
+    longest : bytes of an input
+    words : what such inputs are made of
+    weight : of its share of the time
+
+    """
+
+    check: Callable[[bytes], object]
+    seeds: Callable[[], Sequence[bytes]]
+    longest: int = 2048
+    words: Sequence[bytes] = ()
+    weight: float = 1.0
+
+
+def path_of(suffix: str) -> Path:
+    """Return where an input is written, of which there is only one at a time in a process."""
+    return Path(_FOLDER.name) / f'{os.getpid()}{suffix}'
+
+
+def _file(data: bytes, suffix: str) -> Path:
+    path = path_of(suffix)
+    path.write_bytes(data)
+    return path
+
+
+def _said(error: Exception | str, path: object = '') -> None:
+    """Check that an error is one line and names its file."""
+    text = str(error)
+    assert text.startswith(str(path)), text
+    assert len(text.splitlines()) == 1 and len(text.replace(str(path), '')) <= MESSAGE, text[:2 * MESSAGE]
+
+
+# Decoders
+
+def settings_of(protocol: Protocol) -> Settings:
+    """Return settings that suffice for a protocol."""
+    try:
+        protocol.check(Settings())
+    except ValueError:
+        return Settings(sensitivity=1e-5)
+    return Settings()
+
+
+@dataclass(frozen=True)
+class _Wire:
+    """A protocol with settings, and good frames of it with the rates that they hold."""
+
+    protocol: Protocol
+    settings: Settings
+    frames: list[bytes]
+    rates: list[float]
+
+
+def _wire(protocol: Protocol) -> _Wire:
+    settings, decoder = settings_of(protocol), protocol.decoder(settings_of(protocol))
+    encode = protocol.encoder(settings)
+    frames = [encode(Sample(0.01 * number - 0.05, 20.0, 0.01 * number, number)) for number in range(1, 5)]
+    decoder.feed(protocol.awakening)
+    return _Wire(protocol, settings, frames, [sample.output for frame in frames for sample in decoder.feed(frame)])
+
+
+def pieces(data: bytes) -> list[bytes]:
+    """Cut bytes at places that follow from them, so that a failure is repeated by the same bytes."""
+    chosen = zlib.crc32(data)
+    cuts = sorted((chosen >> 4 * number) * 2654435761 % (len(data) + 1) for number in range(chosen % 6))
+    return [data[begin:end] for begin, end in zip([0, *cuts], [*cuts, len(data)])]
+
+
+def check_decoder(wire: _Wire, data: bytes) -> int:
+    """Any bytes in any pieces: the same samples, all of them finite; every byte is accounted for; then two frames suffice."""
+    whole, parted = (wire.protocol.decoder(wire.settings) for _ in range(2))
+    samples = whole.feed(data)
+    assert [sample for piece in pieces(data) for sample in parted.feed(piece)] == samples
+    counts = [(each.discarded_bytes, each.faults, each.out_of_range) for each in (whole, parted)]
+    assert counts[0] == counts[1], counts
+    for sample in samples:
+        numbers = (sample.output, sample.temperature, sample.time, sample.specific_force, *sample.health.values())
+        assert all(number is None or math.isfinite(number) for number in numbers) and sample.missing >= 0, sample
+    _check_account(wire, data, len(samples) + whole.faults + whole.out_of_range)
+    after = [(sample.output, sample.missing) for sample in whole.feed(b''.join(wire.frames))]
+    assert after[-len(wire.rates) + 2:] == [(rate, 0) for rate in wire.rates[2:]], 'not right again after two frames'
+    return len(samples)
+
+
+def _check_account(wire: _Wire, data: bytes, used: int) -> None:
+    """Every byte is in a frame, or discarded, or the end of a line; little is held back; garbage costs no frame, or one line."""
+    good, splitter = b''.join(wire.frames), wire.protocol.splitter()
+    splitter.feed(data)
+    found, wanted = len(splitter.feed(good)), len(_clean(wire).feed(good))
+    assert found >= wanted - isinstance(splitter, LineSplitter), 'garbage costs more than itself'
+    splitter = wire.protocol.splitter()
+    if zlib.crc32(data) % 16 == 0:
+        data += data[-40:] * 50
+    frames = splitter.feed(data)
+    before = splitter.discarded_bytes
+    splitter.reset()
+    ends = data.count(b'\r') + data.count(b'\n') if isinstance(splitter, LineSplitter) else 0
+    framed = sum(len(frame.data) for frame in frames)
+    assert framed + splitter.discarded_bytes + ends == len(data), (framed, splitter.discarded_bytes, ends, len(data))
+    assert splitter.discarded_bytes - before <= HELD and sum(frame.garbage for frame in frames) <= before and used <= len(frames)
+
+
+def _clean(wire: _Wire) -> Splitter:
+    """Return a splitter that knows where the next frame begins."""
+    splitter = wire.protocol.splitter()
+    splitter.feed(wire.protocol.awakening)
+    return splitter
+
+
+def _decoder_seeds(wire: _Wire) -> list[bytes]:
+    frames, garbage = wire.frames, random.Random(0).randbytes(20)
+    return [wire.protocol.awakening + b''.join(frames), frames[0] + garbage + frames[1], frames[0][:-1] + b''.join(frames[1:]), frames[2]]
+
+
+#: Every protocol, also those to come.
+WIRES = {name: _wire(protocol) for name, protocol in PROTOCOLS.items()}
+
+
+def _parts(wire: _Wire) -> tuple[bytes, ...]:
+    """Return whole frames with their checks, which no fuzzer guesses, and their beginning."""
+    return (wire.frames[0][:4], *(frame[:64] for frame in wire.frames[:2]))
+
+
+def check_listening(data: bytes) -> bool:
+    found = recognize(data)
+    assert 0.0 <= found.explained <= 1.0 and found.words
+    _said(found.words)
+    return found.protocol is not None
+
+
+def _listening_seeds() -> list[bytes]:
+    return [seed for wire in WIRES.values() for seed in _decoder_seeds(wire)[:2]]
+
+
+def check_clock(data: bytes) -> int:
+    """Any samples at any times: stamps are finite and increase strictly, and the count of what was lost is one."""
+    head, data = (data[:2] + b'\0\0')[:2], data[2:]
+    clock = SampleClock((1.0, 10.0, 100.0, 1000.0, 11000.0)[head[0] % 5], (0, 128, 256, 65536)[head[1] % 4], bool(head[1] & 4))
+    arrival, last = 1000.0, -math.inf
+    for sequence, late, count, missing in struct.iter_unpack('<HBBB', data[:len(data) // 5 * 5]):
+        arrival += 10.0 ** (late / 32.0 - 5.0)
+        samples = [Sample(0.0, None, struct.unpack('<d', struct.pack('<HHHH', sequence, missing, count, sequence))[0] if late & 8 else
+                          0.001 * sequence + index, sequence + index, missing % 64) for index in range(1 + count % 4)]
+        samples = [sample for sample in samples if math.isfinite(sample.time)]
+        if missing == 255:
+            clock.interrupt()
+        stamps = clock.stamp(samples, arrival)
+        assert len(stamps) == len(samples)
+        for stamp in stamps:
+            assert math.isfinite(stamp) and stamp > last, (stamp, last)
+            last = stamp
+    assert math.isfinite(clock.period) and clock.period > 0.0 and math.isfinite(clock.jitter_before + clock.jitter_after)
+    assert isinstance(clock.lost, int) and clock.lost >= 0, clock.lost
+    return len(data)
+
+
+def _clock_seeds() -> list[bytes]:
+    even = b''.join(struct.pack('<HBBB', number, 96, 0, 0) for number in range(60))
+    bursts = b''.join(struct.pack('<HBBB', 4 * number, 112, 3, number % 7 == 0) for number in range(60))
+    return [b'\2\0' + even, b'\3\1' + even, b'\3\1' + bursts, b'\2\4' + even]
+
+
+# Files
+
+def _full_model() -> GyroModel:
+    terms = (Term(CATALOGUE['bias'], (0.002,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)),
+             Term(rate_temperature_polynomial(1, 1), (0.1, 2.0, 25.0, 10.0, 0.01, 0.02, -0.03, 0.04)))
+    noise = Noise(7.3e-4, 8.7e-5, 1e-6)
+    calibration = SelfCalibration(0.01, -0.002, ((1e-6, 1e-8), (1e-8, 1e-7)), '2026-11-21T12:00:00+00:00', 21.5, 'likelihood')
+    return GyroModel(terms, np.diag([1e-8, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8]), (-1.0, 1.0), (0.0, 50.0), 25.0, noise,
+                     {'name': 'a gyro', 'serial_number': '0012e3'}, {'date': '2026-11-21', 'files': [{'name': 'a.csv'}]}, calibration)
+
+
+def check_log(data: bytes, suffix: str = '.csv') -> bool:
+    """A log is refused in a line, or read the same at once and in blocks, and again after it was written."""
+    path = _file(data, suffix)
+    try:
+        log = read_log(path)
+    except LogError as error:
+        _said(error, path)
+        log = None
+    try:
+        blocks = list(read_log_blocks(path, rows=2))
+    except LogError as error:
+        _said(error, path)
+        assert log is None, 'refused in blocks only'
+        return False
+    assert log is not None, 'refused as a whole only'
+    assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1), _values(log), equal_nan=True)
+    assert not (np.abs(_values(log)) > LARGEST).any()
+    assert all(np.isfinite(values).all() for values in (log.time, log.temperature, log.specific_force, log.supply) if values is not None)
+    again = path_of('_again.csv')
+    write_log(again, log)
+    other = read_log(again)
+    assert np.array_equal(_values(other), _values(log), equal_nan=True) and list(other.others) == list(log.others)
+    return True
+
+
+def _values(log: Log) -> np.ndarray:
+    arrays = [getattr(log, quantity) for quantity in QUANTITIES]
+    return np.array([values for values in arrays if values is not None])
+
+
+def _log_seeds(suffix: str = '.csv') -> list[bytes]:
+    path, generator = path_of(f'_seed{suffix}'), np.random.default_rng(0)
+    time = 0.01 * np.arange(12)
+    seeds = []
+    for log in (Log(output=generator.normal(size=12), time=time, temperature=20.0 + time, notes=('a log',)),
+                Log(counts=np.arange(12.0), reference_rate=np.full(12, math.nan), others={'lap': tuple('ab"\n,fghijkl')}),
+                Log(output=time, reference_heading=time, specific_force=time, supply=time, moving=time)):
+        write_log(path, log)
+        seeds.append(path.read_bytes())
+    return seeds
+
+
+def check_model(data: bytes) -> bool:
+    """A model is refused in a line, or it compensates, and is the same after it was written."""
+    path = _file(data, '.yaml')
+    try:
+        model = read_model(path)
+    except ModelError as error:
+        _said(error, path)
+        return False
+    noise, values = vars(model.noise).values(), [value for term in model.terms for value in term.values]
+    assert all(abs(value) <= LARGEST for value in (*noise, *values, model.reference_temperature)), values
+    text = model_text(model)
+    again = path_of('_again.yaml')
+    write_model(again, model)
+    assert model_text(read_model(again)) == text
+    with np.errstate(all='ignore'):
+        if not model.looks_around:
+            compensate(model, np.array([-1.0, 0.0, 1.0]), np.array([-20.0, 20.0, 60.0]))
+        model.noise.heading_variance(60.0)
+    if model.self_calibration is not None:
+        json.dumps([str(model.self_calibration), model.self_calibration.figures()], allow_nan=False)
+    return True
+
+
+def _model_seeds() -> list[bytes]:
+    lag = GyroModel((Term(CATALOGUE['thermal_lag'], (120.0, 1e-4)), Term(CATALOGUE['sine_response'], (1.0, 0.01))))
+    by_hand = b'effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3, 4]]}}\nself_calibration: {scale_factor_error: 0, bias: 0}'
+    return [*(model_text(model).encode() for model in (_full_model(), GyroModel(), lag)), by_hand]
+
+
+def check_bias_table(data: bytes) -> bool:
+    """A bias table is read or told of in a line; what is read is of use."""
+    path = _file(data, '.yaml')
+    table, said = read_bias_table(path, GyroModel())
+    if said:
+        _said(said, '' if said.startswith('the bias') else path)
+        return False
+    with np.errstate(all='ignore'):
+        bias, variance = table.predict(25.0, 1.7e9)
+        change, spread = table.difference(10.0, 30.0, 1.7e9)
+        carried = carry(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0), table, 3600.0, 1.7e9, 25.0)
+    assert all(map(math.isfinite, (bias, change, spread, carried.change))) and variance > 0.0 and spread >= 0.0
+    table.add(24.0, bias, 1e-8, 1.7e9)
+    write_bias_table(path, table, 1.7e9)
+    assert not read_bias_table(path, GyroModel())[1]
+    return True
+
+
+def _bias_table_seeds() -> list[bytes]:
+    path, table = path_of('_seed.yaml'), BiasTable(GyroModel())
+    for number in range(8):
+        table.add(20.0 + 3.0 * number, 0.001 * number, 1e-8, 1.6e9 + 1e5 * number)
+        table.begin_run()
+    write_bias_table(path, table, 1.7e9)
+    return [path.read_bytes()]
+
+
+def check_profile(data: bytes) -> bool:
+    path = _file(data, '.csv')
+    try:
+        motion = read_motion(path)
+    except MotionError as error:
+        _said(error, path)
+        return False
+    times = np.linspace(-1.0, motion.duration + 1.0, 9)
+    assert np.isfinite(motion.heading_at(times)).all() and np.isfinite(motion.rate_at(times)).all() and motion.duration > 0.0
+    return True
+
+
+def _profile_seeds() -> list[bytes]:
+    path = path_of('_seed.csv')
+    write_motion(str(path), CALIBRATION)
+    return [path.read_bytes(), b'\xef\xbb\xbftime_s,heading_deg\r\n0,0\r\n1,90\r\n2,0\r\n']
+
+
+def check_limits(data: bytes) -> bool:
+    path = _file(data, '.yaml')
+    try:
+        ability = read_limits(str(path))
+    except UsageError as error:
+        _said(error, path)
+        return False
+    assert all(not math.isnan(value) for value in vars(ability).values())
+    return True
+
+
+def _limits_seeds() -> list[bytes]:
+    return [(Path(__file__).parents[1] / 'config' / 'limits.yaml').read_bytes(), b'maximum_rate_dps: 90\nmaximum_acceleration_dps2: 180\n']
+
+
+def check_recording(suffix: str, data: bytes) -> bool:
+    path = _file(data, suffix)
+    try:
+        with np.errstate(all='ignore'):
+            log = read_recording(path, Topics(reference='table'))
+    except LogError as error:
+        _said(error, path)
+    try:
+        log = read_recording(path)
+    except LogError as error:
+        _said(error, path)
+        return False
+    assert log.time is not None and (np.diff(log.time) > 0.0).all() and np.isfinite(log.time).all()
+    assert not np.isinf(log.output).any()
+    return True
+
+
+def _messages() -> list[tuple[str, str, int, bytes]]:
+    """Return topic, kind, time and bytes of some messages."""
+    found = []
+    for number in range(5):
+        stamp = 1_700_000_000_000_000_000 + 10_000_000 * number
+        for topic, kind in (('imu/data_raw', IMU), ('imu/temperature', TEMPERATURE), ('table', 'geometry_msgs/msg/PoseStamped')):
+            found.append((topic, kind, stamp + 1000, serialize(stamp, 'gyro', [0.1 * number] * LAYOUTS[kind].numbers)))
+    return found
+
+
+def _mcap_seeds() -> list[bytes]:
+    """Return a recording as the format lays it out: a magic, records of one byte, a length of eight and content, and the magic again."""
+    def record(code: int, body: bytes) -> bytes:
+        return struct.pack('<BQ', code, len(body)) + body
+
+    def text(words: str) -> bytes:
+        return struct.pack('<I', len(words)) + words.encode()
+    channels = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
+    declared = b''.join(record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
+                        + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr') + struct.pack('<I', 0))
+                        for topic, (number, kind) in channels.items())
+    messages = b''.join(record(5, struct.pack('<HIQQ', channels[topic][0], 0, time, time) + data) for topic, _, time, data in _messages())
+    chunk = record(6, struct.pack('<QQQI', 0, 1, len(declared + messages), zlib.crc32(declared + messages)) + text('')
+                   + struct.pack('<Q', len(declared + messages)) + declared + messages)
+    magic, head, end = b'\x89MCAP0\r\n', record(1, text('ros2') + text('')), record(15, bytes(4)) + record(2, bytes(20))
+    return [magic + head + declared + messages + end + magic, magic + head + chunk + end + magic, magic + head + chunk[:-40]]
+
+
+def _database_seeds() -> list[bytes]:
+    import sqlite3
+    path = path_of('_seed.db3')
+    path.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute('PRAGMA page_size = 512')
+        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
+        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)')
+        topics = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
+        rows = [(number, name, kind, 'cdr') for name, (number, kind) in topics.items()]
+        database.executemany('INSERT INTO topics VALUES (?, ?, ?, ?)', rows)
+        messages = [(topics[name][0], time, data) for name, _, time, data in _messages()]
+        database.executemany('INSERT INTO messages VALUES (NULL, ?, ?, ?)', messages)
+        database.commit()
+    return [path.read_bytes()]
+
+
+# What people and launch files give
+
+def wild_value(data: bytes) -> object:
+    """Return a value of any of the types that a parameter may be given, made of bytes."""
+    kind, rest = data[0] % 9 if data else 0, data[1:]
+    text = rest.decode('utf-8', 'surrogateescape')
+    number = struct.unpack('<d', rest[:8].ljust(8, b'\0'))[0]
+    return (None, bool(rest[:1] > b'\x7f'), int.from_bytes(rest[:40], 'little', signed=True), number, text, rest, text.split('\n'),
+            list(rest), [number, text, None])[kind]
+
+
+def check_parameters(data: bytes) -> bool:
+    from gyro_calibration.compensation_settings import PARAMETERS
+    from gyro_calibration.driver_node import PARAMETERS as OF_DRIVER
+    table = [*PARAMETERS, *OF_DRIVER]
+    parameter, value = table[(data[0] if data else 0) % len(table)], wild_value(data[1:])
+    try:
+        accepted = parameter.check(value)
+    except ValueError as error:
+        _said(error, f'parameter {parameter.name}')
+        return False
+    assert isinstance(accepted, (bool, int, float, str, list)) and not (isinstance(accepted, str) and '\0' in accepted)
+    return True
+
+
+def _parameter_seeds() -> list[bytes]:
+    values = [b'\0', b'\1\xff', b'\2\x01', b'\3' + struct.pack('<d', 0.5), b'\4rest', b'\4/dev/ttyUSB0', b'\6time_s\ngyro_dps']
+    return [bytes([place]) + value for place in range(0, 60, 4) for value in values]
+
+
+_program = cache(_parser)
+
+
+def check_arguments(data: bytes) -> bool:
+    """The program takes its arguments, or ends with 0 or 2; nothing is run."""
+    words = data.replace(b'\0', b'').decode('utf-8', 'surrogateescape').split('\n')
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+        try:
+            _program().parse_args(words)
+        except SystemExit as end:
+            assert end.code in (0, 2), end.code
+            assert end.code == 0 or 'error: ' in said.getvalue()
+            return False
+    return True
+
+
+_ARGUMENTS = (
+    'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json', 'diagnose a.csv --model b.yaml --out c',
+    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --window 0.2 --rest', 'allan rest.csv --rate 100 --sensitivity 1e-3',
+    'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3', 'emulate --protocol csv --model m.yaml --speed 2 --repeat',
+    'simulate --model m.yaml --motion robot --out l.csv --seed 1 --temperature 25 --sample-rate 100', 'plan --limits l.yaml --seconds 20',
+    'record --port /dev/ttyUSB0 --out x.csv', 'reproduce hong_park --seed 3', 'demo --out d', '--version', 'fit --help')
+
+
+def _argument_seeds() -> list[bytes]:
+    return [words.replace(' ', '\n').encode() for words in _ARGUMENTS]
+
+
+_YAML = (b'[' * 60, b'- ' * 30, b': ', b'- ', b'{', b'}', b'[', b']', b'&a ', b'*a', b'!!int', b'"', b"'", b'|', b'>', b'? ', b'---',
+         b'...', b'#', b'%', b'.nan', b'.inf', b'1e300', b'9' * 30, b'null', b'true', b'\\x00', b'<<')
+_MODEL = (b'effects', b'covariance', b'valid', b'rate', b'temperature', b'reference_temperature', b'noise', b'gyro', b'origin',
+          b'self_calibration', b'standard_deviations', b'orders', b'matrix_dps', b'version', b'format',
+          *(name.encode() for name in CATALOGUE))
+_CSV = (b',', b'\n', b'\r\n', b'"', b'#', b'nan', b'inf', b'1e300', b'-0', b'1_0', b'time_s', b'gyro_dps', b'gyro_rad_s', b'gyro_counts',
+        b'temperature_degc', b'reference_rate_dps', b'reference_heading_deg', b'heading_deg', b'rate_dps', b'\xef\xbb\xbf')
+_TABLE = (b'entries', b'jumps', b'standard_deviation', b'time', b'run', b'bias', b'temperature', b'model', b'1e-9', b'1e9')
+
+TARGETS: dict[str, Target] = {
+    **{f'decoder {name}': Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256, _parts(wire), 2.0)
+       for name, wire in WIRES.items()},
+    'listening': Target(check_listening, _listening_seeds, 1024),
+    'sample clock': Target(check_clock, _clock_seeds, 512),
+    'log': Target(check_log, _log_seeds, 1024, _CSV),
+    'compressed log': Target(partial(check_log, suffix='.csv.gz'), partial(_log_seeds, '.csv.gz'), 1024),
+    'model': Target(check_model, _model_seeds, 2048, (*_YAML, *_MODEL)),
+    'bias table': Target(check_bias_table, _bias_table_seeds, 2048, (*_YAML, *_TABLE)),
+    'motion profile': Target(check_profile, _profile_seeds, 1024, _CSV),
+    'motion limits': Target(check_limits, _limits_seeds, 1024, _YAML),
+    'recording .mcap': Target(partial(check_recording, '.mcap'), _mcap_seeds, 4096),
+    'recording .db3': Target(partial(check_recording, '.db3'), _database_seeds, 8192),
+    'arguments': Target(check_arguments, _argument_seeds, 256, (b'\n', b'--', b'nan', b'1e999', b'-1')),
+    **({'parameters': Target(check_parameters, _parameter_seeds, 128, weight=2.0)} if HAS_ROS else {}),
+}

@@ -1,0 +1,45 @@
+"""
+Subscribers in a process of their own, as many as are asked for, each a participant of its own: they take all that the nodes say.
+
+    python listeners.py NUMBER
+
+"""
+
+import signal
+import sys
+import threading
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Imu
+
+from gyro_calibration.node import SENSOR_QUALITY
+
+
+def listener(number):
+    """Return an executor with a subscriber of its own context."""
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node(f'listener_{number}', context=context)
+    node.create_subscription(Imu, 'imu/data', lambda message: None, SENSOR_QUALITY)
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda message: None, 10)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    return executor
+
+
+def main():
+    """Listen until a signal comes."""
+    stop = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    executors = [listener(number) for number in range(int(sys.argv[1]))]
+    print('listening', flush=True)
+    while not stop.is_set():
+        for executor in executors:
+            executor.spin_once(timeout_sec=0.001)
+
+
+if __name__ == '__main__':
+    main()
