@@ -1,0 +1,310 @@
+"""What the package may do, and what it cannot: the policy of a secured graph is what the nodes really have, none drives unasked."""
+
+import ast
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from fake_gyro import FakeGyro
+from test_compensation_node import profile_rates
+
+import gyro_calibration
+
+try:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from geometry_msgs.msg import Twist
+    from nav_msgs.msg import Odometry
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+    from sensor_msgs.msg import Imu, Temperature
+except ImportError:
+    pass  # the fixture `ros` skips every test that needs them, and says why
+
+ROOT, PACKAGE = Path(__file__).parents[1], Path(gyro_calibration.__file__).parent
+POLICY = ElementTree.parse(ROOT / 'config/sros2/policy.xml').getroot()
+ENCLAVES = {enclave.get('path').rpartition('/')[2]: enclave for enclave in POLICY.iter('enclave')}
+FILES = sorted(PACKAGE.rglob('*.py'))
+
+# What the package may import, run and start
+
+
+def names(path):
+    """Return what a file imports, and what it calls, with its dots: ``yaml.load``."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {node.module or '' for node in nodes if isinstance(node, ast.ImportFrom)}
+    imported |= {f'{node.module}.{alias.name}' for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    return imported, {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
+
+
+def belongs(name, roots):
+    """Tell whether a dotted name is one of the roots or below one."""
+    return any(name == root or name.startswith(f'{root}.') for root in roots)
+
+
+NETWORK = {'socket', 'socketserver', 'ssl', 'asyncio', 'http', 'urllib.request', 'xmlrpc', 'ftplib', 'smtplib', 'telnetlib', 'requests',
+           'urllib3', 'zmq', 'websockets', 'multiprocessing'}
+CODE_FROM_DATA = {'pickle', 'cPickle', 'dill', 'joblib', 'marshal', 'shelve', 'runpy', 'imp', 'code', 'ctypes'}
+RUNS_CODE = {'eval', 'exec', 'compile', '__import__', 'yaml.load_all', 'yaml.unsafe_load', 'yaml.full_load', 'os.system',
+             'os.popen', 'numpy.load', 'np.load'}
+each_file = pytest.mark.parametrize('path', FILES, ids=[str(path.relative_to(PACKAGE)) for path in FILES])
+
+
+@each_file
+def test_no_file_opens_the_network(path):
+    assert not {name for name in names(path)[0] if belongs(name, NETWORK)}
+
+
+@each_file
+def test_no_file_makes_code_of_data(path):
+    imported, called = names(path)
+    assert not {name for name in imported if belongs(name, CODE_FROM_DATA)} and not called & RUNS_CODE
+
+
+def test_what_is_imported_late_is_named_in_the_code():
+    late = {path.name: path for path in FILES if 'importlib.import_module' in names(path)[1]}
+    assert set(late) <= {'storage.py', 'recorder_node.py'}
+    calls = [node for node in ast.walk(ast.parse(late['storage.py'].read_text())) if isinstance(node, ast.Call)]
+    asked = [call.args[0] for call in calls if ast.unparse(call.func) == '_library']
+    assert asked and all(isinstance(name, ast.Constant) for name in asked)
+
+
+@pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'os/path', 'a.b/msg/Imu', '../msg/Imu', 'sensor_msgs/srv/SetCameraInfo', ''])
+def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
+    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
+    from gyro_calibration.recorder_node import load
+    with pytest.raises(ImportError, match='no kind of messages'):
+        load(kind)
+
+
+def test_yaml_is_read_as_plain_data_at_one_place():
+    assert {path.name for path in FILES if 'yaml.load' in names(path)[1]} <= {'settings_file.py'}
+    from gyro_calibration import settings_file
+    assert 'yaml.load(read_bytes(path, most).decode(\'utf-8-sig\'), _Loader)' in Path(settings_file.__file__).read_text()
+    assert issubclass(settings_file._Loader, yaml.SafeLoader)
+    assert not [tag for tag in settings_file._Loader.yaml_constructors if tag and 'python' in tag]
+    assert not [tag for tag in settings_file._Loader.yaml_multi_constructors if tag]
+
+
+@each_file
+def test_only_the_demonstration_starts_processes(path):
+    imported, called = names(path)
+    starts = {name for name in imported | called if belongs(name, {'subprocess', 'pty.spawn'}) or name.startswith(('os.exec', 'os.spawn'))}
+    assert path.name == 'demo.py' or not starts
+
+
+# The policy of a secured graph
+
+ACCESS = {('topics', 'publish'): 'publisher', ('topics', 'subscribe'): 'subscriber', ('services', 'reply'): 'service',
+          ('services', 'request'): 'client'}
+
+
+def resolved(name, namespace, node):
+    """Return a name with its namespace, as the policy means it."""
+    if name.startswith('~'):
+        return f'{namespace.rstrip("/")}/{node}{name[1:]}'
+    return name if name.startswith('/') else f'{namespace.rstrip("/")}/{name}'
+
+
+def allowed(enclave, namespace='/'):
+    """Return what the profile of an enclave allows its node in a namespace: pairs of a kind of end point and a name."""
+    profile, = ENCLAVES[enclave].iter('profile')
+    assert profile.get('ns') == '/'
+    return {(ACCESS[rules.tag, key], resolved(rule.text, namespace, profile.get('node')))
+            for rules in profile for key, value in rules.items() if value == 'ALLOW' for rule in rules}
+
+
+def really(node, name, namespace):
+    """Return what a node of the graph has, alike."""
+    ways = {'publisher': node.get_publisher_names_and_types_by_node, 'subscriber': node.get_subscriber_names_and_types_by_node,
+            'service': node.get_service_names_and_types_by_node, 'client': node.get_client_names_and_types_by_node}
+    return {(kind, topic) for kind, ask in ways.items() for topic, _ in ask(name, namespace)}
+
+
+def test_the_policy_has_the_form_that_the_tools_read():
+    """As the schema of sros2 wants it; the schema itself is not part of this package."""
+    assert (POLICY.tag, POLICY.get('version')) == ('policy', '0.2.0')
+    forms = {'policy': {'enclaves'}, 'enclaves': {'enclave'}, 'enclave': {'profiles'}, 'profiles': {'profile'},
+             'profile': {'topics', 'services'}, 'topics': {'topic'}, 'services': {'service'}, 'topic': set(), 'service': set()}
+    assert all(child.tag in forms[element.tag] for element in POLICY.iter() for child in element)
+    assert all(profile.get('ns') and profile.get('node') for profile in POLICY.iter('profile'))
+    rules = [(element.tag, key, value) for element in POLICY.iter() for key, value in element.items()
+             if element.tag in ('topics', 'services')]
+    assert rules and all((tag, key) in ACCESS and value == 'ALLOW' for tag, key, value in rules)
+
+
+def test_among_the_enclaves_stands_nothing_else():
+    """The tools of sros2 take a comment there for an enclave, and give up."""
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    enclaves, = ElementTree.parse(ROOT / 'config/sros2/policy.xml', parser).getroot().iter('enclaves')
+    assert {child.tag for child in enclaves} == {'enclave'}
+
+
+def test_no_rule_is_a_pattern_or_stands_twice():
+    for enclave in ENCLAVES.values():
+        for profile in enclave.iter('profile'):
+            rules = [(tuple(kind.attrib), rule.text) for kind in profile for rule in kind]
+            assert len(rules) == len(set(rules))
+            assert not [text for _, text in rules if set(text) & set('*?[]')]
+
+
+#: Of each enclave the node, and settings of its parameters that together bring everything that it may have.
+SETTINGS = {
+    'driver_node': [{}, {'use_sim_time': True}],
+    'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}, {'reference': 'odometry'}],
+    'compensation_node_that_drives': [{'drive_profile': True, 'wheels': 'both', 'use_sim_time': True}],
+}
+#: What a node has only where it is asked for.
+ONLY_THEN = {('subscriber', '/clock'), ('subscriber', 'odom'), ('subscriber', 'cmd_vel'), ('publisher', 'cmd_vel')}
+
+
+def begun(start_node, tmp_path, enclave):
+    """Start the node of an enclave with each of its settings, each in a namespace of its own; return name, namespaces and processes."""
+    name = next(ENCLAVES[enclave].iter('profile')).get('node')
+    namespaces = [f'/{enclave}_{number}' for number in range(len(SETTINGS[enclave]))]
+    processes = []
+    for namespace, settings in zip(namespaces, SETTINGS[enclave], strict=True):
+        files = {'calibration_file': tmp_path / f'{namespace[1:]}.yaml'} if name == 'compensation_node' else {}
+        processes.append(start_node(name, {**files, **settings}, {'__ns': namespace}))
+    return name, namespaces, processes
+
+
+def test_the_policy_allows_each_node_exactly_what_it_has(start_node, ros, wait_until, tmp_path):
+    heard = ros.collect(DiagnosticArray, '/diagnostics', 100)
+    nodes = {enclave: begun(start_node, tmp_path, enclave) for enclave in SETTINGS}
+    count = sum(map(len, SETTINGS.values()))
+    wait_until(lambda: len(heard) > 3 * count, 30.0, 'diagnostics of all nodes')
+    for enclave, (name, namespaces, processes) in nodes.items():
+        have = [really(ros.node, name, namespace) for namespace in namespaces]
+        rights = [allowed(enclave, namespace) for namespace in namespaces]
+        assert not [ends - right for ends, right in zip(have, rights, strict=True) if not ends <= right], f'{enclave} has more than it may'
+        used = {(kind, topic.replace(namespace, '', 1)) for ends, namespace in zip(have, namespaces, strict=True) for kind, topic in ends}
+        assert used == allowed(enclave), f'{enclave} may more than it has: {allowed(enclave) - used}'
+        if not SETTINGS[enclave][0]:
+            special = {(kind, resolved(topic, namespaces[0], name)) for kind, topic in ONLY_THEN}
+            assert have[0] == rights[0] - special
+        for process in processes:
+            process.interrupt()
+
+
+def test_the_policy_allows_a_recording_exactly_what_it_takes(start_node, ros, wait_until, tmp_path):
+    kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry}
+    publishers = [ros.publisher(kind, topic) for topic, kind in kinds.items()]
+    out = tmp_path / 'log.mcap'
+    command = [sys.executable, '-m', 'gyro_calibration', 'record', '--reference-topic', 'odom', '--out', out]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        try:
+            wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 20.0, 'the recorder')
+            assert really(ros.node, 'gyro_calibration_recorder', '/') == allowed('record')
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(20.0)
+
+
+def called_with_names(path):
+    """Return the names of topics and services that a file writes down where it makes an end point."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    makers = ('create_publisher', 'create_subscription', 'create_service', 'create_client', '_listen')
+    made = [call for call in calls if isinstance(call.func, ast.Attribute) and call.func.attr in makers]
+    given = [argument.value for call in made for argument in call.args if isinstance(argument, ast.Constant)]
+    return {value for value in given if isinstance(value, str)}
+
+
+@pytest.mark.parametrize('module', ['driver_node', 'compensation_node', 'calibration_services', 'diagnostics', 'node'])
+def test_every_topic_that_a_node_can_make_is_in_the_policy(module):
+    """Also one that none of the settings of the test above brings."""
+    ruled = {rule.text for rules in POLICY.iter('profile') for kind in rules for rule in kind}
+    assert called_with_names(PACKAGE / f'{module}.py') <= ruled
+
+
+@pytest.mark.parametrize('enclave', ['operator', 'technician'])
+def test_a_client_may_what_every_node_has_and_what_it_is_for(enclave, ros, wait_until):
+    offered = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'service'}
+    told = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'publisher'}
+    mine = allowed(enclave)
+    assert {name for kind, name in mine if kind == 'client'} <= offered
+    assert {name for kind, name in mine if kind == 'subscriber'} <= told | {'/clock'}
+    wait_until(lambda: len(really(ros.node, 'test_client', '/')) > 8)
+    plain = {(kind, topic.replace('test_client', enclave)) for kind, topic in really(ros.node, 'test_client', '/')}
+    assert {(kind, name) for kind, name in mine if kind in ('publisher', 'service')} == plain
+
+
+def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
+    assert not [name for kind, name in allowed('operator') if kind == 'client' and 'parameter' in name]
+    publishers = {enclave for enclave in ENCLAVES if ('publisher', '/cmd_vel') in allowed(enclave)}
+    assert publishers == {'compensation_node_that_drives'}
+
+
+# Who moves the robot, and who chooses files
+
+
+def test_only_the_calibration_and_the_demonstration_can_command_a_robot():
+    makers = {path.name for path in FILES for line in path.read_text().splitlines() if 'create_publisher' in line and 'cmd_vel' in line}
+    assert makers == {'calibration_services.py', 'demo.py'}
+
+
+@pytest.fixture
+def start(start_node, ros, wait_until, tmp_path):
+    """Return a function that starts the compensation and a gyro for it."""
+    def start(**parameters):
+        given = {'calibration_file': tmp_path / 'calibration.yaml', **parameters}
+        return start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until)
+    return start
+
+
+def set_parameter(ros, node, name, value):
+    """Set a parameter as any ROS client can, and return the answer."""
+    kind = {bool: ('bool_value', ParameterType.PARAMETER_BOOL), str: ('string_value', ParameterType.PARAMETER_STRING)}[type(value)]
+    parameter = Parameter(name=name, value=ParameterValue(type=kind[1], **{kind[0]: value}))
+    return ros.call(SetParameters, f'/{node}/set_parameters', SetParameters.Request(parameters=[parameter])).results[0]
+
+
+def drivers(ros):
+    """Return the nodes that can command the robot."""
+    return {info.node_name for info in ros.node.get_publishers_info_by_topic('/cmd_vel')}
+
+
+def test_without_drive_profile_calibrate_moves_nothing(start, ros):
+    """Not even where the profile has long begun to turn; the node is no publisher of commands."""
+    _, gyro = start()
+    commands = ros.collect(Twist, 'cmd_vel', 10)
+    answer = gyro.call_later('calibrate')
+    gyro.wait_until(gyro.calibrating)
+    gyro.play(profile_rates()[:600])
+    assert gyro.calibrating() and not answer.done()
+    assert not commands and not drivers(ros)
+
+
+def test_taking_drive_profile_back_stops_the_robot_and_gives_the_run_up(start, ros, wait_until):
+    _, gyro = start()
+    commands = ros.collect(Twist, 'cmd_vel', 10)
+    assert set_parameter(ros, 'compensation_node', 'drive_profile', True).successful
+    answer = gyro.call_later('calibrate')
+    gyro.wait_until(gyro.calibrating)
+    gyro.play(profile_rates()[:250], until=lambda: commands and commands[-1].angular.z > 0.5)
+    assert drivers(ros) == {'compensation_node'}
+    assert set_parameter(ros, 'compensation_node', 'drive_profile', False).successful
+    gyro.play(np.zeros(1000), until=answer.done)
+    wait_until(answer.done)
+    assert not answer.result().success and 'drive_profile' in answer.result().message
+    wait_until(lambda: commands[-1].angular.z == 0.0)
+
+
+@pytest.mark.parametrize('node', ['driver_node', 'compensation_node'])
+def test_no_client_changes_which_files_and_ports_a_running_node_uses(node, start_node, ros, tmp_path):
+    start_node(node, {'calibration_file': tmp_path / 'calibration.yaml'} if node == 'compensation_node' else {})
+    names = ros.call(ListParameters, f'/{node}/list_parameters').result.names
+    chosen = sorted(name for name in names if name == 'port' or name.endswith('_file'))
+    assert chosen == (['port'] if node == 'driver_node' else ['bias_file', 'calibration_file', 'model_file', 'profile_file'])
+    for name in chosen:
+        given = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='/tmp/other'))
+        answers = [ros.call(SetParameters, f'/{node}/set_parameters', SetParameters.Request(parameters=[given])).results[0],
+                   ros.call(SetParametersAtomically, f'/{node}/set_parameters_atomically',
+                            SetParametersAtomically.Request(parameters=[given])).result]
+        assert [answer.successful for answer in answers] == [False, False], name
+        assert all('read' in answer.reason for answer in answers)
