@@ -1,0 +1,213 @@
+"""Gyros and random drives of the benchmark of headings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.heading import integrate
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.motion import CALIBRATION, ROBOT, Motion
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.reproduction.hong_park import XV3500
+
+#: Motions are made at this interval, s, with corners on multiples of `GRID` after their begin.
+STEP, GRID = 0.01, 0.1
+
+
+@dataclass(frozen=True)
+class Gyro:
+    """A gyro's true errors and noise, and the interval of its samples, s."""
+
+    name: str
+    model: GyroModel
+    interval: float
+
+    @property
+    def true(self) -> tuple[float, float]:
+        """Return its scale factor error s, and its bias b, rad/s, at the beginning."""
+        (s,), (b,) = (term.values for term in self.model.terms)
+        return s, b
+
+
+def _gyro(name: str, interval: float, scale_factor_error: float, bias: float, walk: float, instability: float) -> Gyro:
+    """Return a gyro from figures in the units of data sheets: deg/s, deg/√h, deg/h."""
+    noise = Noise(walk * DEGREE / 60.0, instability * DEGREE / 3600.0)
+    return Gyro(name, GyroModel((Term(SCALE_FACTOR_ERROR, (scale_factor_error,)), Term(BIAS, (bias * DEGREE,))), noise=noise), interval)
+
+
+GYROS = {
+    'XV3500': Gyro('XV3500', XV3500, 0.01),
+    # Table I and the 10 Hz of section 5 of Ojeda, Chung and Borenstein: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; of 2 % and
+    # 0.2 deg/s, both from end to end of the range of temperatures, one half
+    'RD2100': _gyro('RD2100', 0.1, 0.01, 0.1, 5.0 / 60.0, 7.2),
+    # round figures of the better ones that are sold, such as the ADIS16488
+    'good MEMS': _gyro('good MEMS', 0.01, 0.01, 0.2, 0.3, 6.0),
+}
+
+
+@dataclass(frozen=True)
+class Path:
+    """True rate, rad/s, heading, rad, and whether the wheels turn, every `STEP` s, shape (n,) each; it begins and ends at rate zero."""
+
+    rate: Array
+    heading: Array
+    moving: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """
+    What a gyro says of a calibration of 20 s and of the drive after it.
+
+    Attributes
+    ----------
+    time : s, shape (n,), 0 at the beginning of the drive
+    output, rate : rad/s, shape (n,)
+    bias : true bias, wandering, rad/s, shape (n,)
+    heading : rad, shape (n,), 0 at the beginning of the drive
+    moving : the wheels turn, or did or will within a sample, shape (n,)
+    run : time, s, 0 at the beginning of the calibration, and output, rad/s, of the calibration
+
+    """
+
+    gyro: Gyro
+    time: Array
+    output: Array
+    rate: Array
+    bias: Array
+    heading: Array
+    moving: NDArray[np.bool_]
+    run: tuple[Array, Array]
+
+
+def path(rate: Array, moving: NDArray[np.bool_]) -> Path:
+    """Return the path of rates, rad/s."""
+    return Path(rate, integrate(np.arange(len(rate)) * STEP, rate), moving)
+
+
+def of_motion(motion: Motion) -> Path:
+    """Return a motion as a path; who knows that the wheels turn is told so where the rate is not zero."""
+    time = np.arange(round(motion.duration / STEP) + 1) * STEP
+    rate = motion.rate_at(time)
+    return Path(rate, motion.heading_at(time), rate != 0.0)
+
+
+def _count(duration: float) -> int:
+    """Return the steps of a duration, a multiple of `GRID`."""
+    return round(duration / GRID) * round(GRID / STEP)
+
+
+def _flank(count: int, ramp: float) -> Array:
+    """Return what goes from 0 to 1, stays, and goes back to 0."""
+    steps = np.arange(count)
+    return np.clip(np.minimum(steps, count - steps) * STEP / ramp, 0.0, 1.0)
+
+
+def _wobble(count: int, generator: np.random.Generator) -> Array:
+    """Return what a robot yaws by that holds its direction: a shake of 0.5 to 2 deg/s at 0.5 to 2 Hz, and a wander of the heading."""
+    time = np.arange(count) * STEP
+    shake = generator.uniform(0.5, 2.0) * np.sin(2.0 * np.pi * (generator.uniform(0.5, 2.0) * time + generator.uniform()))
+    knots = np.arange(0.0, time[-1] + 1.0)
+    wander = np.interp(time, knots, generator.normal(0.0, 0.2, len(knots)))
+    return (shake + wander) * DEGREE * _flank(count, 0.3)
+
+
+def _turn(generator: np.random.Generator) -> Array:
+    """Return a turn of 20 to 180 deg at 10 to 90 deg/s."""
+    speed = np.exp(generator.uniform(np.log(10.0), np.log(90.0)))
+    ramp = 0.3
+    count = _count(max(generator.uniform(20.0, 180.0) / speed + ramp, 3.0 * ramp))
+    return generator.choice((-1.0, 1.0)) * speed * DEGREE * _flank(count, ramp)
+
+
+def _slow_turn(generator: np.random.Generator) -> Array:
+    """Return a turn at 0.5 to 3 deg/s for 10 to 40 s, every other time with a wobble."""
+    count = _count(generator.uniform(10.0, 40.0))
+    turn = generator.choice((-1.0, 1.0)) * generator.uniform(0.5, 3.0) * DEGREE * _flank(count, 0.5)
+    return turn + generator.integers(2) * _wobble(count, generator)
+
+
+def _straight(generator: np.random.Generator) -> Array:
+    return _wobble(_count(generator.uniform(3.0, 15.0)), generator)
+
+
+def _rest(shortest: float, longest: float, generator: np.random.Generator) -> Array:
+    return np.zeros(_count(generator.uniform(shortest, longest)))
+
+
+#: How often each kind of stretch comes, so that about half of the time the robot rests or goes straight.
+STRETCHES: tuple[tuple[float, Callable[[np.random.Generator], Array]], ...] = (
+    (0.2, partial(_rest, 3.0, 20.0)), (0.2, partial(_rest, 0.2, 0.5)), (0.2, _straight), (0.3, _turn), (0.1, _slow_turn))
+
+
+def random_path(duration: float, generator: np.random.Generator) -> Path:
+    """Return a path of stretches in random order; where its time is over, the robot stops within 0.3 s and rests for `GRID`."""
+    count, shares = round((duration - GRID) / STEP), [share for share, _ in STRETCHES]
+    rates, moving, length = [], [], 0
+    while length < count:
+        kind = generator.choice(len(STRETCHES), p=shares)
+        rates.append(STRETCHES[kind][1](generator))
+        moving.append(np.full(len(rates[-1]), kind > 1))
+        length += len(rates[-1])
+    rate = np.concatenate(rates)[:count] * np.clip(np.arange(count, 0, -1) * STEP / 0.3, 0.0, 1.0)
+    rest = (0, round(GRID / STEP) + 1)
+    return path(np.pad(rate, rest), np.pad(np.concatenate(moving)[:count], rest))
+
+
+def slow_path(rate: float, generator: np.random.Generator, rest: float = 30.0, duration: float = 600.0) -> Path:
+    """Return a rest and then one turn at a rate, rad/s, either way."""
+    still, turn = np.zeros(_count(rest)), generator.choice((-1.0, 1.0)) * rate * _flank(_count(duration), 0.5)
+    whole = np.concatenate([still, turn, [0.0]])
+    return path(whole, whole != 0.0)
+
+
+def begun_any_time(way: Path, generator: np.random.Generator) -> Path:
+    """
+    Return a path that begins up to `GRID` later.
+
+    Who looks at blocks of samples would otherwise find each corner at the edge of one, where robots do not put them.
+
+    """
+    late = int(generator.integers(round(GRID / STEP)))
+    rate, moving = (np.append(np.append(np.zeros(late), each[:len(each) - 1 - late]), 0.0) for each in (way.rate, way.moving))
+    return path(rate, moving > 0.5)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a robot drives, and how long its gyro has been on before the calibration, s."""
+
+    path: Callable[[np.random.Generator], Path]
+    warm: float = 600.0
+
+
+#: The first is that of `reproduction.hong_park`, whose gyro comes fresh.
+COURSES = {
+    'robot, 160 s': Course(lambda generator: of_motion(ROBOT), 0.0),
+    'random, 160 s': Course(partial(random_path, 160.0)),
+    'random, 30 min': Course(partial(random_path, 1800.0)),
+}
+
+
+def simulate(gyro: Gyro, course: Course, generator: np.random.Generator) -> Drive:
+    """Return what a gyro says of a calibration and of a course after it."""
+    way = begun_any_time(course.path(generator), generator)
+    every, before = round(gyro.interval / STEP), round(course.warm / gyro.interval)
+    begin = of_motion(CALIBRATION)
+    rate = np.concatenate([begin.rate[:-1], way.rate])[::every]
+    count, first = len(rate), round(CALIBRATION.duration / gyro.interval)
+    noise, (s, b) = gyro.model.noise, gyro.true
+    white = simulate_noise(Noise(noise.angle_random_walk), count, gyro.interval, generator)
+    slow = Noise(0.0, noise.bias_instability, noise.rate_random_walk)
+    bias = b + simulate_noise(slow, before + count, gyro.interval, generator)[before:]
+    output, time = (1.0 + s) * rate + bias + white, np.arange(count) * gyro.interval
+    moving = np.convolve(way.moving, np.ones(2 * every + 1), 'same')[::every] > 0.5
+    return Drive(gyro, time[first:] - time[first], output[first:], rate[first:], bias[first:], way.heading[::every], moving,
+                 (time[:first + 1], output[:first + 1]))

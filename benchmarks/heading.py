@@ -1,0 +1,344 @@
+"""
+How far headings are off after 20 s of calibration: this program, its peers, the paper, and who knows more than a program can.
+
+    python benchmarks/heading.py [--drives N] [--gyros NAME ...] [--courses TEXT] [--only TEXT] [--part drives slow] [--processes 2]
+                                 [--seed N]
+
+The gyros and courses are those of `drives`: the built-in motion `robot`, and random drives of 160 s and 30 min with turns, slow turns,
+wobble on straight ways, rests, and rests too short to notice; about half of the time the robot rests or goes straight. Each drive has
+noise of its own. It begins with the built-in motion `calibration`, of which all rows make what they can; a calibration that is refused is
+run again, as a robot would.
+
+The first table has the mean over the drives of the mean error of the heading over a drive, without its sign, and its standard error; the
+second the error that 95 % of the samples keep; the third how often the heading is inside of its own 95 %: at the end of a drive, at a
+random time, and of all samples. The settings of the peers (`peers`) are the published ones, and the best on drives of their own.
+
+Slow turns: the share of a turn of ten minutes, after a rest of 30 s, that is lost or too much at its end.
+
+`--only` takes the rows in whose names a regular expression is found, `--courses` courses alike. A package that is missing makes a row
+that says so. Prints tables in Markdown.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+
+import bounds
+import numpy as np
+from drives import COURSES, GYROS, Course, Drive, Gyro, simulate, slow_path
+from peers import PEERS, tuned
+
+from gyro_calibration.compensation import covariance, rate_sensitivity
+from gyro_calibration.heading import Threshold, filter_rates, integrate
+from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.model import GyroModel, SelfCalibration
+from gyro_calibration.motion import CALIBRATION
+from gyro_calibration.noise import Noise
+from gyro_calibration.self_calibration import fit_heading, record, self_calibrate
+from gyro_calibration.tracking import HeadingTracker, Settings, in_hindsight
+
+#: The variance is looked at so often, s.
+LOOK = 1.0
+#: Of each normal error squared over its variance, 95 % are below this.
+BAND = 3.841
+#: Drives on which the settings of the peers are found.
+TUNING = {160.0: 40, 1800.0: 8}
+PUBLISHED, WINDOWED = Threshold(0.3 * DEGREE, 0.0), Threshold(0.3 * DEGREE, 0.2)
+SLOW = (0.02, 0.05, 0.1, 0.3, 1.0)
+
+
+@dataclass(frozen=True)
+class Known:
+    """A drive with its calibrations: by the likelihood, and by eq. 7 of Hong and Park."""
+
+    drive: Drive
+    likely: SelfCalibration
+    published: SelfCalibration
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Headings of all samples, rad, and variances every `LOOK` s, rad²; None where there are none."""
+
+    heading: Array
+    variance: Array | None = None
+
+
+def known(gyro: Gyro, course: Course, generator: np.random.Generator) -> Known:
+    """Simulate a drive and calibrate; a calibration that is refused is run again."""
+    while True:
+        drive = simulate(gyro, course, generator)
+        try:
+            likely = self_calibrate(*drive.run, CALIBRATION, noise=gyro.model.noise)
+        except DataRefused:
+            continue
+        return Known(drive, record(likely, 'likelihood', '', None), record(fit_heading(*drive.run, CALIBRATION), 'heading', '', None))
+
+
+# Rows
+
+Row = Callable[[Known], Iterator[tuple[str, Estimate]]]
+
+
+def _simple(known: Known) -> Iterator[tuple[str, Estimate]]:
+    """Yield integrals of rates: of the paper, and of its parts put right."""
+    time, output = known.drive.time, known.drive.output
+    rates = {'pure integration': output, 'self-calibration by eq. 7': known.published.correct(output)}
+    filtered = {'threshold as published': (PUBLISHED, output),
+                'both as published': (PUBLISHED, rates['self-calibration by eq. 7']),
+                'eq. 7, threshold on 0.2 s': (WINDOWED, rates['self-calibration by eq. 7']),
+                'likelihood, threshold on 0.2 s': (WINDOWED, known.likely.correct(output))}
+    rates |= {name: filter_rates(settings, time, rate) for name, (settings, rate) in filtered.items()}
+    rates['likelihood'] = known.likely.correct(output)
+    for name, rate in rates.items():
+        yield name, Estimate(integrate(time, rate))
+
+
+def _tracked(known: Known, noise: Noise, wheels: bool = False) -> tuple[Estimate, Estimate]:
+    """Return what this program makes of a drive, live and with hindsight."""
+    drive, model = known.drive, GyroModel(self_calibration=known.likely)
+    rate = np.asarray(known.likely.correct(drive.output))
+    sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0) for value in (rate, 0.0))
+    tracker = HeadingTracker(noise, covariance(model), Settings(), keep=True)
+    looks = _looks(drive)
+    heading, variance, looked = np.empty(len(rate)), [], set(looks.tolist())
+    moving = drive.moving.tolist() if wheels else [None] * len(rate)
+    for index, sample in enumerate(zip(drive.time.tolist(), rate.tolist(), np.ascontiguousarray(sensitivity.T), moving)):
+        tracker.add(*sample, still)
+        heading[index] = tracker.heading
+        if index in looked:
+            variance.append(tracker.variance)
+    later, with_hindsight, _ = in_hindsight(tracker, drive.time, rate)
+    return Estimate(heading, np.array(variance)), Estimate(later, with_hindsight[looks])
+
+
+def _looks(drive: Drive) -> np.ndarray:
+    """Return the samples at which the variance is looked at; the last is the end."""
+    every = round(LOOK / drive.gyro.interval)
+    return np.arange((len(drive.time) - 1) % every, len(drive.time), every)
+
+
+def _program(known: Known) -> Iterator[tuple[str, Estimate]]:
+    live, later = _tracked(known, known.drive.gyro.model.noise)
+    yield 'this program, live', live
+    yield 'this program, with hindsight', later
+
+
+def _program_with_wheels(known: Known) -> Iterator[tuple[str, Estimate]]:
+    live, later = _tracked(known, known.drive.gyro.model.noise, wheels=True)
+    yield 'this program with wheels, live', live
+    yield 'this program with wheels, with hindsight', later
+
+
+def _program_misled(factor: float, known: Known) -> Iterator[tuple[str, Estimate]]:
+    noise = known.drive.gyro.model.noise
+    live, later = _tracked(known, Noise(*(factor * figure for figure in vars(noise).values())))
+    words = 'half' if factor < 1.0 else 'twice'
+    yield f'this program told {words} the noise, live', live
+    yield f'this program told {words} the noise, with hindsight', later
+
+
+def _peer(name: str, settings: Mapping[str, float], known: Known) -> Iterator[tuple[str, Estimate]]:
+    peer = PEERS[name]
+    if peer.installed:
+        yield f'{name}, as published', Estimate(peer.run(known.drive, known.likely, peer.published))
+        yield f'{name}, best settings', Estimate(peer.run(known.drive, known.likely, settings))
+
+
+def _bounds(known: Known) -> Iterator[tuple[str, Estimate]]:
+    looks = _looks(known.drive)
+    yield 'knows s and b(t)', Estimate(bounds.knows_errors(known.drive))
+    yield 'knows s, b(t) and the rests', Estimate(bounds.knows_errors_and_rests(known.drive))
+    for name, (heading, variance) in zip(('live', 'with hindsight'), bounds.knows_rests(known.drive)):
+        yield f'knows the rests, {name}', Estimate(heading, variance[looks])
+
+
+#: What makes rows, and the rows it makes.
+MAKERS: dict[Row, tuple[str, ...]] = {
+    _simple: ('pure integration', 'self-calibration by eq. 7', 'threshold as published', 'both as published', 'eq. 7, threshold on 0.2 s',
+              'likelihood', 'likelihood, threshold on 0.2 s'),
+    _program: ('this program, live', 'this program, with hindsight'),
+    partial(_program_misled, 0.5): tuple(f'this program told half the noise, {way}' for way in ('live', 'with hindsight')),
+    partial(_program_misled, 2.0): tuple(f'this program told twice the noise, {way}' for way in ('live', 'with hindsight')),
+    _program_with_wheels: ('this program with wheels, live', 'this program with wheels, with hindsight'),
+    _bounds: ('knows the rests, live', 'knows the rests, with hindsight', 'knows s and b(t)', 'knows s, b(t) and the rests'),
+}
+
+
+def makers(settings: Mapping[str, Mapping[str, float]]) -> dict[Row, tuple[str, ...]]:
+    """Return what makes rows, with the peers in place, and the rows."""
+    of_peers: dict[Row, tuple[str, ...]] = {
+        partial(_peer, name, found): (f'{name}, as published', f'{name}, best settings') for name, found in settings.items()}
+    program = list(MAKERS.items())
+    return dict([*program[:-1], *of_peers.items(), program[-1]])
+
+
+# Scores
+
+@dataclass(frozen=True)
+class Score:
+    """
+    How good a heading was over a drive.
+
+    Attributes
+    ----------
+    mean : of the error without its sign, rad
+    errors : without their sign, at some times, rad
+    inside : whether the heading is inside its 95 % at the end and at a random time, and of how many looks; nan without a variance
+
+    """
+
+    mean: float
+    errors: Array
+    inside: tuple[float, float, float]
+
+
+def score(drive: Drive, estimate: Estimate, generator: np.random.Generator) -> Score:
+    """Return how good a heading was."""
+    error = estimate.heading - drive.heading
+    spread = np.linspace(0, len(error) - 1, 100).astype(int)
+    inside = (np.nan, np.nan, np.nan)
+    if estimate.variance is not None:
+        inner = error[_looks(drive)] ** 2 <= BAND * estimate.variance
+        inside = float(inner[-1]), float(inner[generator.integers(len(inner))]), float(inner.mean())
+    return Score(float(np.abs(error).mean()), np.abs(error[spread]), inside)
+
+
+def scores(job: tuple[str, str, int, int, str, Mapping[str, Mapping[str, float]]]) -> dict[str, Score]:
+    """Return the scores of all rows of one drive."""
+    gyro, course, number, seed, only, settings = job
+    generator = np.random.default_rng([seed, number, *gyro.encode(), *course.encode()])
+    drive = known(GYROS[gyro], COURSES[course], generator)
+    found: dict[str, Score] = {}
+    for maker, names in makers(settings).items():
+        if any(re.search(only, name) for name in names):
+            found |= {name: score(drive.drive, estimate, generator) for name, estimate in maker(drive)}
+    return found
+
+
+def tune(job: tuple[str, str, str, int]) -> Mapping[str, float]:
+    """Return the best settings of a peer, on drives of its own."""
+    peer, gyro, course, seed = job
+    generator = np.random.default_rng([seed, *b'settings', *gyro.encode(), *course.encode()])
+    if not PEERS[peer].installed:
+        return {}
+    count = TUNING[1800.0 if '30 min' in course else 160.0]
+    several = [known(GYROS[gyro], COURSES[course], generator) for _ in range(count)]
+    return tuned(PEERS[peer], [(each.drive, each.likely) for each in several])
+
+
+# Tables
+
+Columns = Mapping[tuple[str, str], Sequence[Mapping[str, Score]]]
+
+
+def table(columns: Columns, names: Iterable[str], cell: Callable[[Sequence[Score]], str], title: str) -> str:
+    """Return a table of rows by gyros and courses."""
+    heads = [f'{gyro}, {course}' for gyro, course in columns]
+    lines = [f'| {title} | {" | ".join(heads)} |', f'|:---|{"---:|" * len(heads)}']
+    for name in names:
+        several = [[drive[name] for drive in drives if name in drive] for drives in columns.values()]
+        cells = [cell(each) if each else 'not installed' for each in several]
+        if any(cells):
+            lines.append(f'| {name} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def mean_error(several: Sequence[Score]) -> str:
+    means = np.array([each.mean for each in several]) / DEGREE
+    return f'{means.mean():.3f} ± {means.std(ddof=1) / np.sqrt(len(means)):.3f}'
+
+
+def error_of_most(several: Sequence[Score]) -> str:
+    return f'{np.quantile(np.concatenate([each.errors for each in several]), 0.95) / DEGREE:.3f}'
+
+
+def inside(several: Sequence[Score]) -> str:
+    shares = 100.0 * np.mean([each.inside for each in several], axis=0)
+    return '' if np.isnan(shares).any() else ' / '.join(f'{share:.1f}' for share in shares)
+
+
+def drives_tables(given: argparse.Namespace) -> Iterator[str]:
+    """Yield the tables of the drives, and the settings of the peers."""
+    places = [(gyro, course) for gyro in given.gyros for course in COURSES if re.search(given.courses, course)]
+    wanted = [peer for peer in PEERS if re.search(given.only, f'{peer}, best settings') or re.search(given.only, f'{peer}, as published')]
+    with get_context('fork').Pool(given.processes) as pool:
+        tunings = [(peer, *place, given.seed) for place in places for peer in wanted]
+        best: dict[tuple[str, str], dict[str, Mapping[str, float]]] = {place: {} for place in places}
+        for (peer, *place, _), found in zip(tunings, pool.map(tune, tunings, chunksize=1)):
+            best[place[0], place[1]][peer] = found
+        jobs = [(*place, number, given.seed, given.only, best[place]) for place in places for number in range(given.drives)]
+        found_scores = pool.map(scores, jobs, chunksize=1)
+    columns = {place: found_scores[given.drives * index:given.drives * (index + 1)] for index, place in enumerate(places)}
+    names = [name for each in makers({peer: {} for peer in wanted}).values() for name in each if re.search(given.only, name)]
+    yield table(columns, names, mean_error, f'mean error, deg, {given.drives} drives')
+    yield table(columns, names, error_of_most, '95 % of the errors are below, deg')
+    yield table(columns, names, inside, 'inside of its 95 %: at the end / at a random time / of all samples, %')
+    yield '\n'.join(f'* {gyro}, {course}: {peer}: {settings}' for (gyro, course), each in best.items() for peer, settings in each.items())
+
+
+# Slow turns
+
+def slow_errors(job: tuple[str, float, int, int, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
+    """Return the error at the end of a slow turn as a share of the turn."""
+    gyro, rate, number, seed, settings = job
+    generator = np.random.default_rng([seed, number, round(1e6 * rate), *gyro.encode()])
+    one = known(GYROS[gyro], Course(partial(slow_path, rate * DEGREE)), generator)
+    found: dict[str, float] = {}
+    for maker, names in makers(settings).items():
+        if any(name in SLOW_ROWS for name in names):
+            found |= {name: abs((estimate.heading[-1] / one.drive.heading[-1]) - 1.0) for name, estimate in maker(one)}
+    return found
+
+
+SLOW_ROWS = ('likelihood', 'likelihood, threshold on 0.2 s', 'this program, live', 'this program with wheels, live',
+             *(f'{peer}, {which}' for peer in ('VQF', 'x-io Fusion') for which in ('as published', 'best settings')))
+
+
+def slow_table(given: argparse.Namespace) -> str:
+    """Return the table of the slow turns; the peers have the settings that are best for random drives of 30 min."""
+    peers = ('VQF', 'x-io Fusion')
+    lines = [f'| mean error of a turn of 10 min, % of the turn, {given.slow_drives} drives | '
+             + ' | '.join(f'{gyro}, {rate:g} deg/s' for gyro in given.gyros for rate in SLOW) + ' |',
+             '|:---|' + '---:|' * (len(SLOW) * len(given.gyros))]
+    with get_context('fork').Pool(given.processes) as pool:
+        tunings = [(peer, gyro, 'random, 30 min', given.seed) for gyro in given.gyros for peer in peers]
+        best: dict[str, dict[str, Mapping[str, float]]] = {gyro: {} for gyro in given.gyros}
+        for (peer, gyro, *_), settings in zip(tunings, pool.map(tune, tunings, chunksize=1)):
+            best[gyro][peer] = settings
+        jobs = [(gyro, rate, number, given.seed, best[gyro])
+                for gyro in given.gyros for rate in SLOW for number in range(given.slow_drives)]
+        errors = pool.map(slow_errors, jobs, chunksize=1)
+    for row in SLOW_ROWS:
+        cells = [[each[row] for each in errors[begin:begin + given.slow_drives] if row in each]
+                 for begin in range(0, len(jobs), given.slow_drives)]
+        lines.append(f'| {row} | ' + ' | '.join(f'{100.0 * np.mean(cell):.1f}' if cell else 'not installed' for cell in cells) + ' |')
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--drives', type=int, default=200, help='of each gyro and course')
+    parser.add_argument('--slow-drives', type=int, default=50, help='of each gyro and slow rate')
+    parser.add_argument('--gyros', nargs='+', choices=list(GYROS), default=list(GYROS))
+    parser.add_argument('--courses', default='', help='in whose names this regular expression is found')
+    parser.add_argument('--only', default='', help='rows in whose names this regular expression is found')
+    parser.add_argument('--part', nargs='+', choices=['drives', 'slow'], default=['drives', 'slow'])
+    parser.add_argument('--processes', type=int, default=2)
+    parser.add_argument('--seed', type=int, default=0)
+    given = parser.parse_args()
+    if 'drives' in given.part:
+        for text in drives_tables(given):
+            print(text, flush=True, end='\n\n')
+    if 'slow' in given.part:
+        print(slow_table(given))
+
+
+if __name__ == '__main__':
+    main()
