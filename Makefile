@@ -16,13 +16,22 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 test demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
 
-.PHONY: test demo build clean
+.PHONY: test style timed computing demo build clean
 
-# what ruff and mypy find does not keep pytest from running, so that one run says everything
+# What one finds does not keep the others from running, so that one run says everything.
 test: $(INSTALLED)
+	@$(MAKE) --no-print-directory --keep-going --jobs 2 style timed computing
+
+style:
 	@$(BIN)/python -m ruff check --quiet --output-format concise .; style=$$?; \
-	$(BIN)/python -m mypy --no-error-summary gyro_calibration; types=$$?; \
-	$(BIN)/python -m pytest && exit $$((style + types))
+	$(BIN)/python -m mypy --no-error-summary gyro_calibration && exit $$style
+
+timed:
+	@$(BIN)/python -m pytest -m timed
+
+# beside the tests of processes that have to keep time, and after them where both want the processor
+computing:
+	@nice -n 19 $(BIN)/python -m pytest -m 'not timed' > $(VENV)/computing.txt 2>&1; code=$$?; cat $(VENV)/computing.txt; exit $$code
 
 demo: $(INSTALLED)
 	@$(BIN)/gyro_calibration demo --out demo

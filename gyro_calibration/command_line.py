@@ -12,6 +12,8 @@ from collections.abc import Sequence
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
+import numpy as np
+
 from gyro_calibration import __version__
 from gyro_calibration.log import DataRefused, LogError
 from gyro_calibration.model_file import ModelError
@@ -26,9 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb, print its answer and return 0 (done), 1 (the data allow no answer) or 2 (wrong use)."""
     given = _parser().parse_args(arguments)
     try:
+        _refuse_empty(given)
         answer = given.verb(given)
     except DataRefused as error:
         print(f'gyro_calibration: {error}', file=sys.stderr)
+        return NO_ANSWER
+    except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
+        print(f'gyro_calibration: the numbers are too large or too far apart to be computed with ({error}); see whether columns and units '
+              'are right', file=sys.stderr)
         return NO_ANSWER
     except (LogError, ModelError, MotionError, UsageError, OSError) as error:
         print(f'gyro_calibration: {error}', file=sys.stderr)
@@ -38,10 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return DONE
 
 
+def _refuse_empty(given: argparse.Namespace) -> None:
+    """Refuse an option without a value, as a variable of the shell leaves it that is not set; a file without a name is never written."""
+    for name, value in vars(given).items():
+        if value == '' or isinstance(value, list) and '' in value:
+            raise UsageError(f'{name.replace("_", "-")} is empty; give it a value, or leave it out')
+
+
 def _show(text: str) -> None:
-    """Print; a reader that has gone, as `head` does, is no error."""
+    """Print; a reader that has gone, as `head` does, is no error, nor is the name of a file that is no text."""
+    encoding = sys.stdout.encoding or 'utf-8'
     try:
-        print(text, flush=True)
+        print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -1,7 +1,4 @@
-"""
-Fixtures for tests with real ROS 2 processes: kept on this machine, apart from each other, and ended whatever happens.
-
-"""
+"""Fixtures for tests with real ROS 2 processes: kept on this machine, apart from each other, and ended whatever happens."""
 
 import contextlib
 import fcntl
@@ -21,11 +18,11 @@ import pytest
 _FOLDER = Path(tempfile.mkdtemp(prefix='gyro_calibration_test_'))
 
 # Discovery takes 0.3 s or 3 s at random by default; so it takes less than 0.6 s.
-_FAST_DISCOVERY = """<?xml version="1.0" encoding="UTF-8" ?>
+_PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
     <participant profile_name="test" is_default_profile="true">
-      <rtps><builtin><discovery_config>
+      <rtps>{locators}<builtin><discovery_config>
         <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
         <initialAnnouncements><count>10</count><period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
       </discovery_config></builtin></rtps>
@@ -33,24 +30,38 @@ _FAST_DISCOVERY = """<?xml version="1.0" encoding="UTF-8" ?>
   </profiles>
 </dds>
 """
+_BY_UDP = '<defaultUnicastLocatorList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></defaultUnicastLocatorList>'
+
+
+def _profile(name, locators=''):
+    """Write a profile of Fast DDS and return the environment that has it used."""
+    path = _FOLDER / name
+    path.write_text(_PROFILE.format(locators=locators))
+    return {'FASTRTPS_DEFAULT_PROFILES_FILE': str(path), 'FASTDDS_DEFAULT_PROFILES_FILE': str(path)}
 
 
 def _prepare_environment():
-    profile = _FOLDER / 'discovery.xml'
-    profile.write_text(_FAST_DISCOVERY)
     os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
     os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
     os.environ.update({
         'ROS_LOG_DIR': str(_FOLDER),
         'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',  # leaves nothing in shared memory after a kill
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile),
-        'FASTDDS_DEFAULT_PROFILES_FILE': str(profile),
+        **_profile('discovery.xml'),
     })
 
 
 _prepare_environment()  # before any test module imports rclpy
+
+
+_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_serial_port'
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that have to keep time: those with ROS nodes, and some modules with ports or bounds on time."""
+    for item in items:
+        if 'ros_domain' in item.fixturenames or item.path.stem in _TIMED:
+            item.add_marker('timed')
 
 
 def pytest_unconfigure(config):
@@ -131,11 +142,21 @@ def _free_domain():
     pytest.fail('all ROS domains from 1 to 101 are taken by other runs of these tests')
 
 
-class NodeProcess:
+@pytest.fixture
+def by_udp(monkeypatch):
     """
-    A node in a process of its own, as a robot starts it.
+    Have the nodes of a test, which kills them, hear by UDP.
+
+    Fast DDS 2.14 may go on sending to the shared memory of a process that was killed, and the one that comes in its place hears nothing
+    (issues 5053 and 5469 of Fast DDS).
 
     """
+    for name, value in _profile('udp.xml', _BY_UDP).items():
+        monkeypatch.setenv(name, value)
+
+
+class NodeProcess:
+    """A node in a process of its own, as a robot starts it."""
 
     def __init__(self, module, parameters, remappings, parameter_files):
         arguments = [f'{name}:={value}' for name, value in parameters.items()]
@@ -220,10 +241,7 @@ def _close_all(nodes):
 
 
 class Ros:
-    """
-    A node in the process of the test, with an executor that spins in a thread.
-
-    """
+    """A node in the process of the test, with an executor that spins in a thread."""
 
     def __init__(self):
         import rclpy
@@ -265,8 +283,18 @@ class Ros:
         self._stop.set()
         self._thread.join()
         self._executor.shutdown()
+        self._settle()
         self.node.destroy_node()
         self._context.try_shutdown()
+
+    def _settle(self, quiet=0.15, timeout=5.0):
+        """Wait until nobody comes or goes: Fast DDS 2.14 may hang or crash where it hears of others while it ends."""
+        seen, since, deadline = None, time.monotonic(), time.monotonic() + timeout
+        while time.monotonic() < min(since + quiet, deadline):
+            around = sorted(self.node.get_node_names()), sorted(self.node.get_topic_names_and_types())
+            if around != seen:
+                seen, since = around, time.monotonic()
+            time.sleep(0.01)
 
 
 def _sensor_quality():

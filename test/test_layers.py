@@ -1,7 +1,4 @@
-"""
-The house: imports go in one direction, ROS 2 stays in the nodes, and the core neither prints nor opens sockets nor reads a clock.
-
-"""
+"""The house: imports go in one direction, ROS 2 stays in the nodes, and the core neither prints nor opens sockets nor reads a clock."""
 
 import ast
 import importlib
@@ -17,7 +14,8 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 #: As the package's docstring gives it.
 ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order:')[2])
 CORE = ORDER[:ORDER.index('protocols')]
-MAY_USE_ROS = {'node.py', 'driver_node.py', 'compensation_node.py', 'demo.py'}
+MAY_USE_ROS = {'node.py', 'diagnostics.py', 'driver_report.py', 'driver_node.py', 'recorder_node.py', 'compensation_report.py',
+               'calibration_services.py', 'compensation_node.py', 'demo.py'}
 ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w+_msgs|\w+_srvs')
 OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'datetime', 'threading', 'random', 'argparse'}
 
@@ -26,12 +24,7 @@ def imports(path):
     """Return the modules that a file imports, anywhere in it."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    folders = ['gyro_calibration', *path.relative_to(PACKAGE).parts[:-1]]
-    for node in nodes:
-        if isinstance(node, ast.ImportFrom):
-            where = folders[:len(folders) + 1 - node.level] if node.level else []
-            names += ['.'.join([*where, *filter(None, [node.module]), alias.name]) for alias in node.names]
-    return names
+    return names + [f'{node.module}.{alias.name}' for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
 
 
 def own(names):

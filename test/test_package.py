@@ -1,8 +1,6 @@
-"""
-The package as users get it: from colcon and from pip, with data files and with what `ros2 run` finds.
+"""The package as users get it: from colcon and from pip, with data files and with what `ros2 run` finds."""
 
-"""
-
+import ast
 import importlib.metadata
 import os
 import shutil
@@ -45,7 +43,8 @@ def run(*command, folder):
 
 def expected_data():
     """Return the data files of an installed package below its prefix."""
-    files = {f'share/gyro_calibration/config/{file.name}' for file in (ROOT / 'config').iterdir()}
+    files = {f'share/gyro_calibration/{file.relative_to(ROOT)}' for file in (ROOT / 'config').rglob('*.*')}
+    assert 'share/gyro_calibration/config/sros2/policy.xml' in files
     files |= {f'share/gyro_calibration/launch/{file.name}' for file in (ROOT / 'launch').glob('*.launch.py')}
     files |= {'share/gyro_calibration/package.xml', 'share/ament_index/resource_index/packages/gyro_calibration'}
     return files | {f'lib/gyro_calibration/{name}' for name in EXECUTABLES}
@@ -54,6 +53,22 @@ def expected_data():
 def test_the_version_of_the_manifest_is_the_version_of_the_module():
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert manifest.findtext('version') == gyro_calibration.__version__
+
+
+def imported():
+    """Return the libraries that the package and its launch files import, as rosdep calls them."""
+    nodes = [node for folder in ('gyro_calibration', 'launch') for file in (ROOT / folder).rglob('*.py')
+             for node in ast.walk(ast.parse(file.read_text()))]
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
+    roots = {name.partition('.')[0] for name in names} - sys.stdlib_module_names - {'gyro_calibration'}
+    return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'} else root for root in roots}
+
+
+def test_the_manifest_names_exactly_what_is_imported():
+    """But mcap, which rosdep does not know."""
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert {element.text for element in manifest.iter('exec_depend')} == imported() - {'mcap'}
 
 
 def test_every_launcher_is_the_same_and_can_be_executed():

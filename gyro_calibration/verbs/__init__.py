@@ -6,6 +6,6 @@ converted here, at the rim.
 
 """
 
-from gyro_calibration.verbs import allan, compensate, demo, diagnose, emulate, fit, reproduce, self_calibrate, simulate, turn
+from gyro_calibration.verbs import allan, compensate, demo, diagnose, emulate, fit, plan, record, reproduce, self_calibrate, simulate, turn
 
-VERBS = (fit, compensate, self_calibrate, allan, turn, diagnose, simulate, emulate, reproduce, demo)
+VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, simulate, emulate, record, reproduce, demo)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib.util
-import math
+import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -15,7 +16,11 @@ from typing import Any
 from tqdm import tqdm
 
 from gyro_calibration import __version__
+from gyro_calibration.files import LARGEST
 from gyro_calibration.log import DEGREE, Array, Log, read_log, read_log_blocks
+from gyro_calibration.model import GyroModel
+from gyro_calibration.recording import Topics, blocks_of, read_recording
+from gyro_calibration.storage import files_of, is_recording
 
 
 class UsageError(ValueError):
@@ -39,16 +44,32 @@ def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer 
 
 
 def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
-    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz', **how)
+    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a ROS 2 recording: folder, .mcap or .db3',
+                        **how)
     parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this rate; for logs without a usable time_s')
     parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count, for logs that hold gyro_counts alone')
     parser.add_argument('--invert', action='store_true', help='the gyro counts clockwise turns positive')
+    add_topics(parser)
+
+
+def add_topics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--topic', metavar='TOPIC', help='of the gyro in a recording, sensor_msgs/Imu; default: the only one')
+    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference in a recording, nav_msgs/Odometry, sensor_msgs/Imu, '
+                        'geometry_msgs/PoseStamped or TwistStamped; default: none')
+    parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; default: the one named most like that of the gyro')
 
 
 def positive(text: str) -> float:
     value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    if not 1.0 / LARGEST <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f'{text} is not above 0, or beyond what there is')
+    return value
+
+
+def degrees_celsius(text: str) -> float:
+    value = float(text)
+    if not -273.15 <= value <= 1e4:
+        raise argparse.ArgumentTypeError(f'{text} is no temperature in degC')
     return value
 
 
@@ -75,7 +96,8 @@ def picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    return _turned(given, read_log(given.log, _sensitivity(given), given.rate))
+    log = _recorded(given) if is_recording(given.log) else read_log(given.log, _sensitivity(given), given.rate)
+    return _turned(given, log)
 
 
 def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
@@ -85,16 +107,52 @@ def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
 
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:
     """Return what a model file says of where it comes from: logs, date, program."""
-    files = [{'name': Path(path).name, 'sha256': hashlib.sha256(Path(path).read_bytes()).hexdigest()} for path in paths]
+    files = [{'name': file.name, **({'sha256': digest(file)} if file.is_file() else {})} for path in paths for file in files_of(path)]
     return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'), 'program': f'gyro_calibration {__version__}'}
+
+
+def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
+    """Return the model that --model gave as it is, or else the new one with the log that it comes from."""
+    return model if given.model else replace(model, origin=origin_of([given.log]))
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file, which is no pipe: that was read already, and would be waited for."""
+    found = hashlib.sha256()
+    with open(path, 'rb') as file:
+        while piece := file.read(1 << 20):
+            found.update(piece)
+    return found.hexdigest()
 
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log that a verb was given block by block, with a bar that shows how far it is."""
-    size = Path(given.log).stat().st_size if Path(given.log).is_file() else None
-    with tqdm(total=size, desc=given.log, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
-        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=lambda place: shown.update(place - shown.n)):
+    if is_recording(given.log):
+        yield from blocks_of(read(given))
+        return
+    with _bytes_of(given.log) as heard:
+        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=heard):
             yield _turned(given, log)
+
+
+@contextmanager
+def _bytes_of(path: str) -> Iterator[Callable[[int], None]]:
+    """Show on a terminal how many bytes of a log are read, and give the function that is to be told."""
+    files = [file for file in files_of(path) if file.is_file()]
+    size = sum(file.stat().st_size for file in files) or None
+    with tqdm(total=size, desc=path, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
+        yield lambda place: _show_place(shown, place)
+
+
+def _show_place(shown: Any, place: int) -> None:
+    shown.update(place - shown.n)
+
+
+def _recorded(given: argparse.Namespace) -> Log:
+    """Read a recording, and say on standard error what was taken and mended: no answer of a verb shows the notes of a log."""
+    topics = Topics(given.topic, given.reference_topic, given.temperature_topic)
+    with _bytes_of(given.log) as heard:
+        return read_recording(given.log, topics, given.rate, heard, lambda note: print(f'gyro_calibration: {note}', file=sys.stderr))
 
 
 def _sensitivity(given: argparse.Namespace) -> float | None:
