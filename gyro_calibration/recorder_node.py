@@ -27,7 +27,8 @@ from gyro_calibration.log import LogError
 from gyro_calibration.node import call_every
 from gyro_calibration.storage import Message
 
-_DEPTH = 1000  # a second at 1 kHz
+_DEPTH = 5000  # as SENSOR_QUALITY: a recorder that is busy for five seconds loses nothing at 1 kHz
+_LAST = 2.0  # s; within it is taken what had come before a recorder was told to stop
 _LOOK_INTERVAL = 0.3  # s; between two looks at the graph
 _LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process by itself
 _LINE = '=' * 80
@@ -52,6 +53,8 @@ class RecorderNode(Node):
         Those that were asked for, as the graph names them.
     unknown : dict of str to str
         Topics whose kind is not installed here, and why they cannot be recorded.
+    taken : int
+        How many messages were handed over.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class RecorderNode(Node):
         super().__init__('gyro_calibration_recorder', context=context, start_parameter_services=False, enable_rosout=False)
         self.topics = tuple(_resolved(self, topic) for topic in topics)
         self.unknown: dict[str, str] = {}
+        self.taken = 0
         self._everything, self._take = everything, take
         self._subscriptions_of: dict[str, tuple] = {}
         self._begin = time.time_ns() - time.monotonic_ns()
@@ -103,7 +107,10 @@ class RecorderNode(Node):
 
     def _taker(self, topic: str, kind: str, definition: str) -> Callable[[bytes], None]:
         # By the monotonic clock: the time of receiving must not jump where somebody sets the clock.
-        return lambda data: self._take(Message(topic, kind, self._begin + time.monotonic_ns(), bytes(data)), definition)
+        def take(data: bytes) -> None:
+            self.taken += 1
+            self._take(Message(topic, kind, self._begin + time.monotonic_ns(), bytes(data)), definition)
+        return take
 
 
 def _resolved(node: Node, topic: str) -> str:
@@ -191,12 +198,22 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
             while not stop.is_set():
                 executor.spin_once(timeout_sec=0.05)
                 tick(node)
+            _take_what_came(executor, node)
         finally:
             executor.remove_node(node)
             node.destroy_node()
     finally:
         executor.shutdown()
         rclpy.shutdown(context=context)
+
+
+def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
+    """Hand over what waits in the queues: messages that came before the recorder was told to stop belong to the recording."""
+    deadline, idle = time.monotonic() + _LAST, 0
+    while idle < 3 and time.monotonic() < deadline:  # now and then it is a timer that is served
+        before = node.taken
+        executor.spin_once(timeout_sec=0.0)
+        idle = 0 if node.taken > before else idle + 1
 
 
 def _start(context: rclpy.Context) -> None:
