@@ -19,7 +19,7 @@ try:
 except ImportError:
     pass  # the fixture `ros` skips, and says why
 
-DURATION, CALIBRATED, SPEED = 300.0, 20.0, 8.0
+DURATION, CALIBRATED, SPEED = 300.0, 20.0, 4.0
 
 
 @pytest.fixture
@@ -81,11 +81,10 @@ def test_calibrated_on_20_s_the_published_heading_follows_the_encoder_for_five_m
     settings = Settings(columns=('time_s', 'gyro_dps'))
     with Emulator(find('csv'), samples, settings, SPEED, tmp_path / 'gyro', wait_for_reader=True) as emulator:
         emulator.join()
-        wait_until(lambda: len(corrected) > 0.999 * len(time), 20.0, 'the last samples')
+        wait_until(lambda: min(len(raw), len(corrected)) > 0.999 * len(time), 20.0, 'the last samples')
     assert answer.done() and answer.result().success, answer.result()
     clock, yaw = _stamped_yaw(corrected)
     error = yaw - yaw[0] - np.interp(clock, time, heading)
     pure = integrate(time, -output) - heading
     print(f'rms error over {DURATION:g} s: {_rms(error):.2f} deg, pure integration {_rms(pure):.2f} deg; {answer.result().message}')
-    assert len(raw) > 0.999 * len(time)
     assert _rms(error) < _rms(pure) / 3
