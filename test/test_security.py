@@ -200,7 +200,8 @@ def test_the_policy_allows_a_recording_exactly_what_it_takes(start_node, ros, wa
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 20.0, 'the recorder')
-            assert really(ros.node, 'gyro_calibration_recorder', '/') == allowed('record')
+            name = 'gyro_calibration_recorder'
+            wait_until(lambda: name in ros.node.get_node_names() and really(ros.node, name, '/') == allowed('record'), 20.0, 'all of it')
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(20.0)
