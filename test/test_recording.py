@@ -46,19 +46,21 @@ def _start_nodes(start_node, folder):
     return driver
 
 
-def _warm_up(driver, port, wait_until, *heard):
-    """Be a gyro at rest until the whole chain has heard it, then unplug it, so that not a sample of the recording is lost."""
+def _warm_up(ros, driver, port, wait_until, *heard):
+    """Be a gyro at rest until all have heard it, then unplug it, so that not a sample of the recording is lost; return the time, s."""
     rest = (Sample(0.0, time=0.01 * number) for number in range(100000))
     with Emulator(find('csv'), rest, Settings(columns=('time_s', 'gyro_dps')), link=port):
         wait_until(lambda: all(heard), 20.0, 'the nodes')
     wait_until(lambda: 'the device is gone' in driver.output, 5.0, 'the driver to notice')
-    wait_until(lambda: heard[0][-1].header.stamp == heard[1][-1].header.stamp, 5.0, 'the last sample at rest')
-    for messages in heard:
-        messages.clear()
+    return 1e-9 * ros.node.get_clock().now().nanoseconds
+
+
+def _stamp(message):
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
 def _stamped_yaw(messages):
-    stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages])
+    stamps = np.array([_stamp(message) for message in messages])
     return stamps - stamps[0], np.unwrap([2 * math.atan2(m.orientation.z, m.orientation.w) for m in messages])
 
 
@@ -71,7 +73,7 @@ def test_calibrated_on_20_s_the_published_heading_follows_the_encoder_for_five_m
     _write_profile(tmp_path / 'profile.csv', time, heading)
     driver = _start_nodes(start_node, tmp_path)
     raw, corrected = ros.collect(Imu, 'imu/data_raw'), ros.collect(Imu, 'imu/data')
-    _warm_up(driver, tmp_path / 'gyro', wait_until, raw, corrected)
+    begun = _warm_up(ros, driver, tmp_path / 'gyro', wait_until, raw, corrected)
     calibrate = ros.node.create_client(Trigger, 'calibrate')
     assert calibrate.wait_for_service(15.0)
     answer = calibrate.call_async(Trigger.Request())
@@ -81,10 +83,12 @@ def test_calibrated_on_20_s_the_published_heading_follows_the_encoder_for_five_m
     settings = Settings(columns=('time_s', 'gyro_dps'))
     with Emulator(find('csv'), samples, settings, SPEED, tmp_path / 'gyro', wait_for_reader=True) as emulator:
         emulator.join()
-        wait_until(lambda: min(len(raw), len(corrected)) > 0.999 * len(time), 20.0, 'the last samples')
+        wait_until(lambda: min(_stamp(messages[-1]) for messages in (raw, corrected)) > begun + DURATION, 20.0, 'the last samples')
     assert answer.done() and answer.result().success, answer.result()
-    clock, yaw = _stamped_yaw(corrected)
+    played = [[message for message in messages if _stamp(message) > begun] for messages in (raw, corrected)]
+    clock, yaw = _stamped_yaw(played[1])
     error = yaw - yaw[0] - np.interp(clock, time, heading)
     pure = integrate(time, -output) - heading
     print(f'rms error over {DURATION:g} s: {_rms(error):.2f} deg, pure integration {_rms(pure):.2f} deg; {answer.result().message}')
+    assert min(map(len, played)) > 0.99 * len(time)
     assert _rms(error) < _rms(pure) / 3
