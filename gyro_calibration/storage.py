@@ -259,7 +259,7 @@ class _McapReader:
     def _message(self, body: bytes) -> Iterator[Message]:
         number, _, received, _ = struct.unpack_from('<HIQQ', body)
         if number in self._channels:
-            yield Message(*self._channels[number], received, body[22:])
+            yield Message(*self._channels[number], received, _message_data(body[22:]))
 
 
 class _Damaged(ValueError):
@@ -315,6 +315,11 @@ def _expanded(compression: str, data: bytes, size: int) -> bytes:
             raise _Damaged from error
         return expanded
     raise _Damaged
+
+
+def _message_data(data: bytes) -> bytes:
+    """Return the bytes of a message that may be compressed by itself."""
+    return _expanded('zstd', data, 1 << 16) if data.startswith(_ZSTANDARD_MAGIC) else data
 
 
 # SQLite
@@ -408,8 +413,3 @@ def _last_row(database: sqlite3.Connection) -> int:
 def _rows(database: sqlite3.Connection) -> Iterator[Any]:
     """Give row, topic, time and data of the messages; none of those that are wanted here is large."""
     return database.execute('SELECT rowid, topic_id, timestamp, CASE WHEN length(data) < 65536 THEN data END FROM messages')
-
-
-def _message_data(data: bytes) -> bytes:
-    """Return the bytes of a message that may be compressed by itself."""
-    return _expanded('zstd', data, 1 << 16) if data.startswith(_ZSTANDARD_MAGIC) else data

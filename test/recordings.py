@@ -9,7 +9,8 @@ BEGIN = 1_700_000_000_000_000_000  # ns
 DELAY = 2_000_000
 #: Kind of storage -> arguments of `write`.
 KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'mode': 'MESSAGE'}, 'mcap': {'storage': 'MCAP'},
-         'mcap-chunks': {'storage': 'MCAP', 'mode': 'STORAGE'}, 'mcap-file': {'storage': 'MCAP', 'mode': 'FILE'}}
+         'mcap-chunks': {'storage': 'MCAP', 'mode': 'STORAGE'}, 'mcap-file': {'storage': 'MCAP', 'mode': 'FILE'},
+         'mcap-message': {'storage': 'MCAP', 'mode': 'MESSAGE'}}
 
 
 def rosbags():
