@@ -153,6 +153,14 @@ def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
     assert recognize(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol is find('csv')
 
 
+def test_columns_that_do_not_fit_are_told_although_noise_at_another_baud_may_look_like_frames():
+    """At a wrong baud text makes some frames of the E-Core; what is said of all bauds is what explains most."""
+    data = b''.join(b'%d,%f,3.5,4.25\n' % (10 * k, math.sin(k)) for k in range(100))
+    wrong = [recognize(received(data, baud / find('csv').baud)) for baud in set(BAUDS) - {find('csv').baud}]
+    assert max(each.explained for each in wrong) > 0.0
+    assert recognize(data).explained > max(each.explained for each in wrong)
+
+
 def test_lines_of_a_dsp3000_are_no_columns():
     """Two numbers in a line, and with one column a line is one number."""
     data = b'       0.015733   1\r\n' * 8

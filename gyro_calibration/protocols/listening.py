@@ -35,7 +35,8 @@ class Recognition:
     protocol : Protocol or None
         The format of the bytes, or None if there are too few of them, or none explains them, or two do.
     explained : float
-        The share of the bytes that are frames of the best format, 0 to 1; the rest of a frame at the beginning does not count.
+        The share of the bytes that are frames of the best format, 0 to 1; the rest of a frame at the beginning does not count. Where
+        the columns do not fit, the share of the lines that have as many numbers as most.
     frames : int
         How many frames that are.
     runner_up : Protocol or None
@@ -81,8 +82,8 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     rivals = runner_up is not None and second.explained >= _NEARLY * best.explained
     enough = _ENOUGH if best.distinct >= _FRAMES else _ALL
     found = best.frames >= _FRAMES and best.explained >= enough and not rivals
-    words = _found(best, runner_up, data) if found else _not_found(best, second if rivals else None, data, settings)
-    return Recognition(best.protocol if found else None, best.explained, best.frames, runner_up.protocol if runner_up else None, words)
+    explained, words = _found(best, runner_up, data) if found else _not_found(best, second if rivals else None, data, settings)
+    return Recognition(best.protocol if found else None, explained, best.frames, runner_up.protocol if runner_up else None, words)
 
 
 def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
@@ -97,26 +98,33 @@ def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
     return _Score(protocol, known / (known + unknown - begun), len(good), len({frame.data for frame in good}))
 
 
-def _found(best: _Score, runner_up: _Score | None, data: bytes) -> str:
+def _found(best: _Score, runner_up: _Score | None, data: bytes) -> tuple[float, str]:
     second = f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}' if runner_up else ''
-    return f'{best.protocol.name} explains {best.explained:.0%} of {len(data)} bytes, in {best.frames} frames{second}'
+    return best.explained, f'{best.protocol.name} explains {best.explained:.0%} of {len(data)} bytes, in {best.frames} frames{second}'
 
 
-def _not_found(best: _Score, rival: _Score | None, data: bytes, settings: Settings) -> str:
+def _not_found(best: _Score, rival: _Score | None, data: bytes, settings: Settings) -> tuple[float, str]:
+    count, share = _numbers_of_a_line(data)
+    if not rival and count not in (0, len(settings.columns)):
+        return share, f'lines of {count} numbers came, but columns names {len(settings.columns)}: name all columns in their order'
+    return best.explained, _why_not(best, rival, data)
+
+
+def _why_not(best: _Score, rival: _Score | None, data: bytes) -> str:
     if not data:
         return 'nothing came: check the power and the wires of the gyro'
     if rival:
         return f'the bytes may be {best.protocol.name} or {rival.protocol.name}: set protocol to the one it is'
-    count = _numbers_of_a_line(data)
-    if count not in (0, len(settings.columns)):
-        return f'lines of {count} numbers came, but columns names {len(settings.columns)}: name all columns in their order'
     if best.frames:
         return f'{len(data)} bytes came, too few of which are frames of {best.protocol.name} to be sure: listen longer, or set protocol'
     return f'{len(data)} bytes came, but no format explains them: try another baud, or set protocol'
 
 
-def _numbers_of_a_line(data: bytes) -> int:
-    """Return how many numbers most lines have, or 0 where most lines are something else."""
+def _numbers_of_a_line(data: bytes) -> tuple[int, float]:
+    """Return how many numbers most lines have, or 0 where most lines are something else, and which share of the lines these are."""
     lines = [frame.data for frame in LineSplitter(1024).feed(data)]
     counts = Counter(line.count(b',') + 1 if _NUMBERS.fullmatch(line.strip()) else 0 for line in lines)
-    return counts.most_common(1)[0][0] if len(lines) >= _FRAMES else 0
+    if len(lines) < _FRAMES:
+        return 0, 0.0
+    count, times = counts.most_common(1)[0]
+    return count, times / len(lines)
