@@ -102,6 +102,13 @@ def resolve(port: str) -> str:
     return matches[0]
 
 
+def _known(protocol: str) -> Protocol:
+    try:
+        return find(protocol)
+    except ValueError as error:
+        raise ValueError(f'{error}, or {AUTO} to find it by listening') from None
+
+
 class _Silence:
     """
     The time without a sample, since the port was opened or since the last one came.
@@ -226,7 +233,7 @@ class Connection:
         self.openings, self.waited = 0, 0.0
         self._is_auto = protocol == AUTO
         if not self._is_auto:
-            known = find(protocol)
+            known = _known(protocol)
             self._use(known, baud or known.baud)
 
     def counts(self) -> Counts:
