@@ -21,6 +21,7 @@ from types import SimpleNamespace
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -202,7 +203,8 @@ def _start(node_class: Callable[[], Node]) -> Node | None:
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         return node_class()
-    except (ValueError, OSError, RuntimeError) as error:  # rclpy says with a RuntimeError that an argument cannot be parsed
+    # rclpy says with a RuntimeError that an argument cannot be parsed, and with a ParameterException that one of its own is none
+    except (ValueError, OSError, RuntimeError, ParameterException) as error:
         print(f'{node_class.__name__}: {error}', file=sys.stderr)
         return None
 

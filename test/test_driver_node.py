@@ -264,6 +264,7 @@ def test_a_signal_ends_it_with_code_0_while_the_port_is_missing(robot):
 @pytest.mark.parametrize(('parameters', 'sentence'), [
     ({'protocol': 'fizoptika'}, 'sensitivity is not set'),
     ({'protocol': 'bogus'}, 'csv, or auto to find it by listening'),
+    ({'use_sim_time': 'maybe'}, "'use_sim_time' to 'maybe'"),
     ({'invert': 'maybe'}, "invert is 'maybe', but must be one of default, always, never"),
     ({'time_source': 'device'}, 'kvh_dsp3000 sends no time'),
     ({'columns': '[time_s]', 'protocol': 'csv'}, 'exactly one'),
