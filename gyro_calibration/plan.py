@@ -52,19 +52,27 @@ class Ability:
     highest: float = math.inf
     rest: float = 1.0
 
-    @property
-    def rounding(self) -> float:
-        """Return how long the acceleration takes to its maximum, s."""
-        return self.acceleration / self.jerk
+    def rising(self, rate: Number) -> tuple[Number, Number]:
+        """Return how long a ramp from rest to a rate takes but for its rounding, and the rounding, s; no ramp to a low rate gets steep."""
+        jerked = np.sqrt(rate / self.jerk)
+        return np.maximum(rate / self.acceleration, jerked), np.minimum(self.acceleration / self.jerk, jerked)
 
     def ramp(self, rate: Number) -> Number:
         """Return how long the robot takes from rest to a rate, s."""
-        return rate / self.acceleration + self.rounding
+        rising, rounding = self.rising(rate)
+        return rising + rounding
 
     def fastest(self, angle: float) -> float:
-        """Return the fastest rate, rad/s, of a turn through an angle, rad: there is none left at it where rate times ramp is the angle."""
-        jerked = 0.5 * self.acceleration * self.rounding
-        return min(self.rate, math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked)
+        """Return the fastest rate, rad/s, of a turn through an angle above 0, rad: there is none left at it where rate times ramp is it."""
+        jerked = 0.5 * self.acceleration ** 2 / self.jerk
+        steep, low = math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked, (0.25 * angle ** 2 * self.jerk) ** (1.0 / 3.0)
+        return min(self.rate, low if low < 2.0 * jerked else steep)
+
+    def reach(self, duration: float) -> float:
+        """Return how far the robot turns in that time, s, from rest to rest, rad."""
+        half, rounding = 0.5 * duration, self.acceleration / self.jerk
+        rate = min(self.rate, self.acceleration * (half - rounding) if half > 2.0 * rounding else 0.25 * self.jerk * half ** 2)
+        return rate * (duration - float(self.ramp(rate)))
 
 
 @dataclass(frozen=True)
@@ -232,7 +240,7 @@ def profile(ability: Ability, turns: list[Turn], first_rest: float) -> Motion:
 
 def _ramp(ability: Ability, rate: float) -> tuple[Array, Array]:
     """Return times, s, and parts of the rate from rest to it; rounded where the jerk is limited."""
-    rising, rounding = rate / ability.acceleration, ability.rounding
+    rising, rounding = ability.rising(rate)
     if not rounding:
         return np.array([0.0, rising]), np.array([0.0, 1.0])
     time = np.linspace(0.0, rising + rounding, 17)
@@ -257,7 +265,7 @@ class _Family:
 
     def __init__(self, ability: Ability, duration: float):
         self._ability, self._moving = ability, duration - 2.0 * ability.rest
-        reach = 0.5 * ability.rate * self._moving
+        reach = ability.reach(0.5 * self._moving)
         self._up, self._down = min(ability.highest, reach), min(-ability.lowest, reach)
         place = self._up + self._down
         rate = ability.fastest(place)
@@ -366,7 +374,7 @@ def plain(ability: Ability, duration: float) -> Motion:
     """
     _refuse(ability, duration)
     place, half = max(ability.highest, -ability.lowest), 0.5 * duration - ability.rest
-    rate = max(0.5 * ability.fastest(min(place, 0.5 * ability.rate * half)), ability.slowest)
+    rate = max(0.5 * ability.fastest(min(place, ability.reach(half))), ability.slowest)
     angle = min(place, rate * (half - ability.ramp(rate)))
     between = 2.0 * (half - angle / rate - ability.ramp(rate))
     side = 1.0 if ability.highest == place else -1.0

@@ -52,6 +52,21 @@ def test_the_jerk_keeps_its_limit():
     assert np.abs(np.diff(acceleration) / (0.5 * (step[1:] + step[:-1]))).max() <= 600 * DEGREE * 1.01
 
 
+SLUGGISH = {'hardly any acceleration': Ability(60 * DEGREE, 1 * DEGREE), 'hardly any jerk': Ability(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
+
+
+@pytest.mark.parametrize('name', SLUGGISH)
+def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
+    """By hand: from rest to a rate in a quarter of 18 s, at 1 deg/s² to 4.5 deg/s, at 5 deg/s³ to 5 (4.5 / 2)² = 25.3 deg/s."""
+    ability, forecast = SLUGGISH[name], Forecast(XV3500, 20.0, ROBOT, 160.0)
+    fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
+    simple, motion = plain(ability, 20.0), best(ability, forecast, 20.0, np.random.default_rng(1), 5).motion
+    for each in (simple, motion):
+        assert able(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9) and abs(each.heading[-1]) < 1e-9
+    assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
+    assert ability.reach(9.0) == pytest.approx(4.5 * fastest) and ability.fastest(4.5 * fastest) == pytest.approx(fastest)
+
+
 @pytest.mark.parametrize('name', ABILITIES)
 def test_it_tells_the_scale_better_than_a_plain_motion(name):
     forecast = Forecast(XV3500, 20.0, ROBOT, 160.0)
@@ -154,7 +169,7 @@ IMPOSSIBLE = {
     'no place': (Ability(1.0, 2.0, lowest=0.0, highest=0.0), 20.0, 'the place leaves a turn of 0 deg'),
     'no place at the slowest rate': (Ability(1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5), 20.0, 'more place or more acceleration'),
     'nothing worth it': (Ability(0.01, 0.02), 20.0, 'tells the scale to'),
-    'next to no time': (Ability(1.0, 2.0, 0.5, rest=1.0), 10.02, ''),
+    'next to no time': (Ability(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
 }
 
 
