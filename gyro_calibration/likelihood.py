@@ -150,13 +150,18 @@ DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
 _ALIKE = 1.5
 
 
+#: s; rate and acceleration are looked at over so long, or an interval, to either side: closer by they are of the noise alone.
+_SMOOTH = 0.01
+
+
 class _Pairing:
     """A run and a motion, brought together at any time offset and lag."""
 
     def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
         self._time, self._rate = time, rate
         self._prior = np.array([math.inf, math.inf, DELAY_DEVIATION, lag])
-        self._integral, self._interval = integrate(time, rate), float(np.median(np.diff(time)))
+        self._integral = integrate(time, rate)
+        self._base = max(float(np.median(np.diff(time))), _SMOOTH)
         self.sampled = motion.rate is None
         self._block = block_length(motion)
         self._points = _points(motion, self._block)
@@ -189,12 +194,17 @@ class _Pairing:
 
     def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """Return rate, acceleration and integral of the rate that is linear between the samples, the first and last without the lag."""
-        rate, half = np.interp(at, self._time, self._rate), 0.5 * self._interval
-        later, earlier = (np.interp(at + shift, self._time, self._rate) for shift in (half, -half))
-        index = np.clip(np.searchsorted(self._time, at, side='right') - 1, 0, len(self._time) - 1)
-        integral = self._integral[index] + 0.5 * (at - self._time[index]) * (rate + self._rate[index])
-        acceleration = (later - earlier) / self._interval
+        base = self._base
+        integral, later, earlier = (self._turned(at + shift) for shift in (0.0, base, -base))
+        rate, acceleration = 0.5 * (later - earlier) / base, (later - 2.0 * integral + earlier) / base ** 2
         return rate + constant * acceleration, acceleration, integral + constant * rate
+
+    def _turned(self, at: Array) -> Array:
+        inside = np.clip(at, self._time[0], self._time[-1])
+        index = np.searchsorted(self._time, inside, side='right') - 1
+        rate = np.interp(inside, self._time, self._rate)
+        within = self._integral[index] + 0.5 * (inside - self._time[index]) * (rate + self._rate[index])
+        return within + (at - inside) * rate
 
     def coarse_offset(self, largest: float) -> float:
         """

@@ -147,14 +147,14 @@ def test_honest_runs_are_not_refused(reference):
     assert honest(reference)[2] <= 1
 
 
-def lagging(constant):
-    """Return the rate of a robot that follows the calibration with a first-order lag, s."""
+def lagging(constant, every=10):
+    """Return the rate of a robot that follows the calibration with a first-order lag, s, every so many ms."""
     fine = np.arange(20001) / 1000.0
     decay, state, rates = math.exp(-0.001 / constant), 0.0, []
     for wanted in CALIBRATION.rate_at(fine):
         state = decay * state + (1 - decay) * wanted
         rates.append(state)
-    return np.array(rates[::10])
+    return np.array(rates[::every])
 
 
 SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)], ramp=0.7).rate_at(TIME)
@@ -169,6 +169,16 @@ def test_a_robot_that_follows_late_or_softly_is_calibrated_all_the_same(rate, pe
         fit = self_calibrate(TIME, (1 + XV3500_S) * rate + XV3500_B + noise, CALIBRATION)
         assert 100 * abs(fit.scale_factor_error - XV3500_S) < percent
         assert abs(fit.scale_factor_error - XV3500_S) < 4.0 * math.sqrt(fit.covariance[0, 0])
+
+
+def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
+    """Its noise in the rate and the acceleration, sample by sample, must not be taken for what a delay and a lag do."""
+    fine, true, sizes = np.arange(20001) / 1000.0, lagging(0.15, 1), []
+    for seed in range(20):
+        noise = simulate_noise(XV3500, len(fine), 0.001, np.random.default_rng([8, seed]))
+        fit = self_calibrate(fine, (1 + XV3500_S) * true + XV3500_B + noise, CALIBRATION)
+        sizes.append((fit.scale_factor_error - XV3500_S) / math.sqrt(fit.covariance[0, 0]))
+    assert abs(np.mean(sizes)) < 4.0 / math.sqrt(20) and np.sum(np.abs(sizes) < 1.96) >= 15, np.round(sizes, 1)
 
 
 def run(seed=0, true=RATE, s=XV3500_S):
