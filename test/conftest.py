@@ -20,9 +20,9 @@ _FOLDER = Path(tempfile.mkdtemp(prefix='gyro_calibration_test_'))
 # Discovery takes 0.3 s or 3 s at random by default; so it takes less than 0.6 s.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <profiles>
+  <profiles>{transport}
     <participant profile_name="test" is_default_profile="true">
-      <rtps>{locators}<builtin><discovery_config>
+      <rtps>{choice}<builtin><discovery_config>
         <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
         <initialAnnouncements><count>10</count><period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
       </discovery_config></builtin></rtps>
@@ -31,12 +31,19 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
 </dds>
 """
 _BY_UDP = '<defaultUnicastLocatorList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></defaultUnicastLocatorList>'
+# By default a process that the machine does not let run for a second, or to which 512 messages come meanwhile, loses them all.
+_PATIENT = """
+    <transport_descriptors><transport_descriptor>
+      <transport_id>patient</transport_id><type>SHM</type><segment_size>2097152</segment_size>
+      <port_queue_capacity>8192</port_queue_capacity><healthy_check_timeout_ms>20000</healthy_check_timeout_ms>
+    </transport_descriptor></transport_descriptors>"""
+_BY_PATIENT = '<userTransports><transport_id>patient</transport_id></userTransports>'
 
 
-def _profile(name, locators=''):
+def _profile(name, choice='', transport=''):
     """Write a profile of Fast DDS and return the environment that has it used."""
     path = _FOLDER / name
-    path.write_text(_PROFILE.format(locators=locators))
+    path.write_text(_PROFILE.format(choice=choice, transport=transport))
     return {'FASTRTPS_DEFAULT_PROFILES_FILE': str(path), 'FASTDDS_DEFAULT_PROFILES_FILE': str(path)}
 
 
@@ -47,7 +54,7 @@ def _prepare_environment():
         'ROS_LOG_DIR': str(_FOLDER),
         'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        **_profile('discovery.xml'),
+        **_profile('patient.xml', _BY_PATIENT, _PATIENT),
     })
 
 
@@ -69,7 +76,7 @@ def pytest_unconfigure(config):
     shutil.rmtree(_FOLDER, ignore_errors=True)
 
 
-def wait_until(predicate, timeout=10.0, what=None):
+def wait_until(predicate, timeout=30.0, what=None):
     """
     Poll a condition until it is true and return its value.
 
@@ -87,7 +94,7 @@ def wait_until(predicate, timeout=10.0, what=None):
 
 @pytest.fixture(name='wait_until')
 def _wait_until():
-    """Return the function `wait_until(predicate, timeout=10.0, what=None)`."""
+    """Return the function `wait_until(predicate, timeout=30.0, what=None)`."""
     return wait_until
 
 
@@ -155,6 +162,12 @@ def by_udp(monkeypatch):
         monkeypatch.setenv(name, value)
 
 
+@pytest.fixture
+def impatient():
+    """Return the environment of a process that loses messages as soon as on a robot."""
+    return {**os.environ, **_profile('impatient.xml')}
+
+
 class NodeProcess:
     """A node in a process of its own, as a robot starts it."""
 
@@ -174,12 +187,12 @@ class NodeProcess:
         """What it has printed so far, standard error included."""
         return Path(self._output).read_text(errors='replace')
 
-    def wait(self, timeout=15.0):
+    def wait(self, timeout=30.0):
         """Wait until it ends by itself and return its exit code."""
         self.waited = True
         return self.process.wait(timeout)
 
-    def stop(self, number=signal.SIGINT, timeout=15.0):
+    def stop(self, number=signal.SIGINT, timeout=30.0):
         """Send a signal to its process group, wait, and return its exit code."""
         self.interrupt(number)
         return self.wait(timeout)
@@ -270,7 +283,7 @@ class Ros:
         """Return a publisher with the quality of a sensor, if nothing else is said."""
         return self.node.create_publisher(message_type, topic, quality or _sensor_quality())
 
-    def call(self, service_type, name, request=None, timeout=15.0):
+    def call(self, service_type, name, request=None, timeout=30.0):
         """Call a service and return its response."""
         client = self.node.create_client(service_type, name)
         assert client.wait_for_service(timeout), f'no service {name} within {timeout} s'

@@ -24,7 +24,7 @@ class FakeGyro:
     """Publishes raw rates with stamps of its own clock, and hears what the node makes of them."""
 
     def __init__(self, ros, wait_until):
-        self.ros, self.wait_until, self.nanoseconds, self.interval = ros, wait_until, BEGIN, INTERVAL
+        self.ros, self.wait_until, self.nanoseconds, self.interval, self.frame = ros, wait_until, BEGIN, INTERVAL, 'gyro'
         self._imu = ros.publisher(Imu, 'imu/data_raw')
         self._temperature = ros.publisher(Temperature, 'imu/temperature')
         self.imu, self.rate, self.heading = ros.collect(Imu, 'imu/data'), ros.collect(Float64, 'yaw_rate'), ros.collect(Float64, 'heading')
@@ -33,13 +33,16 @@ class FakeGyro:
         self._meet()
 
     def _meet(self):
-        """Send zeros until everything is heard, for discovery takes its time each way; then begin at heading zero."""
+        """Send zeros until everything is heard, for discovery takes its time each way; then, with the last, begin at heading zero."""
         def all_heard():
             self.send(0.0)
             return self.imu and self.rate and self.heading and self.status and self._temperature.get_subscription_count()
-        self.wait_until(all_heard, 15.0, 'the node')
+        self.wait_until(all_heard, 60.0, 'the node')
+        self.frame = 'last'
+        self.send(0.0)
+        self.wait_until(lambda: self.imu[-1].header.frame_id == 'last', what='the last')
+        self.frame = 'gyro'
         assert self.ros.call(Trigger, 'reset_heading').success
-        self.play([0.0])
         for heard in (self.imu, self.rate, self.heading, self.diagnostics):
             heard.clear()
 
@@ -50,7 +53,7 @@ class FakeGyro:
     def send(self, rate, temperature=None):
         """Publish one sample and let the gyro's time go on."""
         message = Imu()
-        message.header.stamp, message.header.frame_id = self.stamp(), 'gyro'
+        message.header.stamp, message.header.frame_id = self.stamp(), self.frame
         message.angular_velocity.z = float(rate)
         if temperature is not None:
             self._temperature.publish(Temperature(header=message.header, temperature=float(temperature)))
@@ -68,38 +71,34 @@ class FakeGyro:
         `before` is called before each sample with its number, and may publish what else the robot says.
 
         """
-        self._wait_for_quiet()
-        heard, sent = len(self.heading), 0
+        heard, sent = self._heard(), 0
         for rate, degc in zip(rates, temperature if isinstance(temperature, np.ndarray) else repeat(temperature)):
             before(sent)
             self.send(rate, degc)
             sent += 1
             time.sleep(PACE)
             if sent % 100 == 0:  # a machine that is busy elsewhere must not overrun the queues
-                self.wait_until(lambda: len(self.heading) >= heard + sent - 300, 10.0, 'the node to keep up')  # noqa: B023, at once
+                self.wait_until(lambda: self._heard() >= heard + sent - 300, what='the node to keep up')  # noqa: B023, at once
             if until():
                 break
-        self.wait_until(lambda: len(self.heading) >= heard + sent, 5.0, f'{sent} headings; {len(self.heading) - heard} came')
+        self.wait_until(lambda: self._heard() >= heard + sent, what=f'{sent} headings')
 
     def values(self):
         """Return the values of the newest diagnostics."""
         return {pair.key: pair.value for pair in self.diagnostics[-1].status[0].values}
 
     def says(self, words):
-        """Tell whether the newest diagnostics hold the words."""
-        return any(words in status.message for array in self.diagnostics[-1:] for status in array.status)
+        """Tell whether the diagnostics since they were cleared hold the words; the newest may be about another second."""
+        return any(words in status.message for array in self.diagnostics for status in array.status)
 
-    def _wait_for_quiet(self):
-        """Wait until the node has answered what was sent before, if anything is still on its way."""
-        last = -1
-        while last != len(self.heading):
-            last = len(self.heading)
-            time.sleep(0.02)
+    def _heard(self):
+        """Return to how many samples all has come that the node makes of one."""
+        return min(map(len, (self.imu, self.rate, self.heading)))
 
     def call_later(self, name):
         """Call a service without waiting for its answer."""
         client = self.ros.node.create_client(Trigger, name)
-        assert client.wait_for_service(15.0)
+        assert client.wait_for_service(30.0)
         return client.call_async(Trigger.Request())
 
     def calibrating(self):

@@ -1,12 +1,14 @@
 """The compensation node as a robot has it: its own process, fake publishers, service clients."""
 
 import math
+import os
 import signal
+import time
 
 import numpy as np
 import pytest
 import yaml
-from fake_gyro import INTERVAL, FakeGyro
+from fake_gyro import INTERVAL, PACE, FakeGyro
 
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
@@ -44,9 +46,9 @@ def start(start_node, ros, wait_until, tmp_path):
 def calibrate(gyro, rates=None, name='calibrate'):
     """Call a calibration, play the run and return the answer."""
     answer = gyro.call_later(name)
-    gyro.wait_until(gyro.calibrating, 10.0, 'the calibration to begin')
+    gyro.wait_until(gyro.calibrating, what='the calibration to begin')
     gyro.play(profile_rates() if rates is None else rates, until=answer.done)
-    gyro.wait_until(answer.done, 10.0, 'the answer')
+    gyro.wait_until(answer.done, what='the answer')
     return answer.result()
 
 
@@ -65,6 +67,17 @@ def test_the_heading_is_not_wrapped_and_stands_as_yaw_in_the_orientation(start):
     assert gyro.heading[-1].data == pytest.approx(4.0 * (4.99 + INTERVAL / 2), abs=1e-6)
     z, w = gyro.imu[-1].orientation.z, gyro.imu[-1].orientation.w
     assert math.remainder(2 * math.atan2(z, w) - gyro.heading[-1].data, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(start):
+    node, gyro = start(threshold=0.0)
+    os.killpg(node.process.pid, signal.SIGSTOP)
+    for _ in range(1000):
+        gyro.send(0.5)
+        time.sleep(PACE)
+    os.killpg(node.process.pid, signal.SIGCONT)
+    gyro.wait_until(lambda: len(gyro.heading) == 1000)
+    assert gyro.heading[-1].data == pytest.approx(0.5 * (9.99 + INTERVAL / 2), abs=1e-6)
 
 
 def test_covariances_follow_rep_145(start, tmp_path):
@@ -191,20 +204,9 @@ def test_calibrate_bias_refuses_a_gyro_that_is_moved(start):
     assert not result.success and 'was moved' in result.message
 
 
-def test_the_node_drives_the_profile_and_stops_the_robot_at_the_end(start):
-    _, gyro = start(drive_profile=True)
-    commands = gyro.ros.collect(Twist, 'cmd_vel', 10)
-    answers = (calibrate(gyro) for _ in range(3))  # where this machine is busy elsewhere, samples may stop for 0.25 s
-    answer = next(answer for answer in answers if 'no sample came' not in answer.message)
-    assert answer.success, answer.message
-    gyro.wait_until(lambda: commands and commands[-1].angular.z == 0.0)
-    driven = np.array([command.angular.z for command in commands])
-    assert driven.max() == pytest.approx(45 * DEGREE, abs=1e-6) and driven.min() == pytest.approx(-45 * DEGREE, abs=1e-6)
-
-
 @pytest.mark.parametrize('end', ['cancel', 'signal', 'silence'])
 def test_the_robot_is_stopped_on_cancel_signal_and_silence(start, end):
-    node, gyro = start(drive_profile=True, sample_timeout=0.5)
+    node, gyro = start(drive_profile=True)
     commands = gyro.ros.collect(Twist, 'cmd_vel', 10)
     gyro.call_later('calibrate')
     gyro.wait_until(gyro.calibrating)
@@ -213,7 +215,7 @@ def test_the_robot_is_stopped_on_cancel_signal_and_silence(start, end):
         gyro.call_later('cancel_calibration')
     elif end == 'signal':
         assert node.stop(signal.SIGTERM) == 0
-    gyro.wait_until(lambda: commands[-1].angular.z == 0.0, 3.0)
+    gyro.wait_until(lambda: commands and commands[-1].angular.z == 0.0)
 
 
 def test_a_robot_is_not_driven_on_when_samples_stop_whatever_the_timeout(start):
@@ -223,9 +225,9 @@ def test_a_robot_is_not_driven_on_when_samples_stop_whatever_the_timeout(start):
     gyro.wait_until(gyro.calibrating)
     gyro.play(profile_rates()[:250], until=lambda: commands and commands[-1].angular.z > 0.5)
     before = len(commands)
-    gyro.wait_until(answer.done, 4.0, 'the end of the run')
+    gyro.wait_until(answer.done, what='the end of the run')
     assert 'while the robot was driven' in answer.result().message, answer.result().message
-    gyro.wait_until(lambda: commands[-1].angular.z == 0.0)
+    gyro.wait_until(lambda: commands and commands[-1].angular.z == 0.0)
     assert sum(command.angular.z != 0.0 for command in commands[before:]) < 25, 'half a second at 50 Hz'
 
 

@@ -6,8 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gyro_calibration.log import DEGREE
+from gyro_calibration.motion import CALIBRATION
+
 try:
     import rclpy
+    from diagnostic_msgs.msg import DiagnosticStatus
+    from rclpy.parameter import Parameter
     from rclpy.signals import SignalHandlerOptions
     from rclpy.time import Time
     from sensor_msgs.msg import Imu
@@ -25,13 +30,13 @@ class Robot:
         self.node, self.steady, self.stamp = node, 1000.0, 1.7e9
         self._noise = np.random.default_rng(0)
 
-    def sample(self, after=0.01, waited=None):
+    def sample(self, after=0.01, waited=None, rate=0.0):
         """Let the node take a sample, stamped so long after the one before, s; its clock goes on by that, or by what it waited."""
         self.stamp += after
         self.steady += after if waited is None else waited
         message = Imu()
         message.header.stamp = Time(nanoseconds=round(self.stamp * 1e9)).to_msg()
-        message.angular_velocity.z = 1e-3 * self._noise.standard_normal()
+        message.angular_velocity.z = rate + 1e-3 * self._noise.standard_normal()
         self.node._on_imu(message)
 
     @property
@@ -121,12 +126,50 @@ def test_a_cancel_that_comes_with_the_last_sample_does_not_say_that_the_old_cali
     assert answered(calibration).success is not cancelled
 
 
-@pytest.mark.parametrize('interval, burst', [(0.01, 2), (0.1, 1), (0.01, 20), (0.2, 1)], ids=['100 Hz', '10 Hz', 'bursts', '5 Hz'])
-def test_a_robot_is_driven_on_between_samples_that_are_seldom_or_come_in_bursts_and_not_after_them(start, interval, burst):
+def driven(start):
+    """Return a robot that the node drives from now on, the list of its commands, rad/s, and the coroutine of the calibration."""
     robot, commands = start(drive_profile=True), []
     services = robot.node._calibrations
     services._velocity = SimpleNamespace(publish=lambda message: commands.append(message.angular.z), wait_for_all_acked=lambda _: True)
-    calibration = asked(services._on_calibrate)
+    return robot, commands, asked(services._on_calibrate)
+
+
+def test_the_node_drives_the_profile_and_stops_the_robot_at_the_end(start):
+    robot, commands, calibration = driven(start)
+    for rate in CALIBRATION.rate_at(np.arange(0.0, CALIBRATION.duration + 4.1, 0.01)):
+        robot.sample(rate=rate)
+        robot.node._calibrations._drive()
+    answer = answered(calibration)
+    assert answer.success and commands[-1] == 0.0, answer.message
+    assert (max(commands), min(commands)) == pytest.approx((45.0 * DEGREE, -45.0 * DEGREE), abs=1e-6)
+
+
+def test_taking_drive_profile_back_gives_the_run_up_and_stops_the_robot(start):
+    robot, commands, calibration = driven(start)
+    for rate in CALIBRATION.rate_at(np.arange(0.0, 3.0, 0.01)):
+        robot.sample(rate=rate)
+        robot.node._calibrations._drive()
+    assert commands[-1] > 0.5
+    robot.node.set_parameters([Parameter('drive_profile', value=False)])
+    robot.node._watch()
+    assert 'drive_profile was set to false' in answered(calibration).message and commands[-1] == 0.0
+
+
+def test_bad_news_are_told_at_once(start):
+    """Not with the next report, a second later."""
+    robot = start()
+    played(robot)
+    robot.node._diagnostics.now()
+    assert robot.node._diagnostics.level == DiagnosticStatus.OK
+    robot.sample(-10.0, waited=0.01)
+    robot.node._watch()
+    assert robot.node._diagnostics.level == DiagnosticStatus.WARN
+
+
+@pytest.mark.parametrize('interval, burst', [(0.01, 2), (0.1, 1), (0.01, 20), (0.2, 1)], ids=['100 Hz', '10 Hz', 'bursts', '5 Hz'])
+def test_a_robot_is_driven_on_between_samples_that_are_seldom_or_come_in_bursts_and_not_after_them(start, interval, burst):
+    robot, commands, calibration = driven(start)
+    services = robot.node._calibrations
 
     def wait(seconds):
         for _ in range(round(seconds / 0.02)):

@@ -146,13 +146,13 @@ def _kill(node):
 
 
 @pytest.fixture
-def listeners():
+def listeners(impatient):
     """Return a function that starts a process with so many subscribers and waits for them; all are ended after the test."""
     processes = []
 
     def start(count):
         command = [sys.executable, Path(__file__).parent / 'listeners.py', str(count)]
-        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True))
+        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True, env=impatient))
         assert b'listening\n' in iter(processes[-1].stdout.readline, b'')  # rclpy prints there, too, that it is started again
         return processes[-1]
     yield start
