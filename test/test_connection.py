@@ -84,7 +84,7 @@ def test_samples_come_with_stamps_that_increase(wait_until):
 def test_auto_finds_the_protocol_and_says_what_it_heard(name, wait_until):
     settings = Settings(sensitivity=1e-6) if name == 'fizoptika' else Settings()
     with Emulator(find(name), turning(), settings) as gyro, Taker(gyro.path, settings=settings) as taker:
-        wait_until(lambda: taker.samples, 15.0, taker.states)
+        wait_until(lambda: taker.samples, what=taker.states)
         assert taker.connection.protocol is find(name)
         assert name in taker.connection.heard
         assert [state.name for state in taker.states] == ['listening', 'reading']
@@ -108,8 +108,8 @@ def test_another_gyro_in_the_same_place_is_listened_to(tmp_path, wait_until):
     with Taker(tmp_path / 'gyro', silence_timeout=0.3) as taker:
         for name in ('kvh_dsp3000', 'minimu9'):
             with Emulator(find(name), turning(), link=tmp_path / 'gyro'):
-                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading', 15.0)
-        assert taker.connection.counts().samples == len(taker.samples)
+                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading')
+    assert taker.connection.counts().samples == len(taker.samples)
 
 
 def test_stamps_go_on_when_another_gyro_is_listened_to(tmp_path, wait_until):
@@ -118,7 +118,7 @@ def test_stamps_go_on_when_another_gyro_is_listened_to(tmp_path, wait_until):
     with Taker(tmp_path / 'gyro', settings=settings, silence_timeout=0.3) as taker:
         for name in ('kvh_dsp3000', 'csv'):
             with Emulator(find(name), turning(), settings, link=tmp_path / 'gyro', speed=20.0):
-                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading', 15.0)
+                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading')
     stamps = [stamp for chunk in taker.chunks for stamp in chunk.stamps]
     assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
 
@@ -158,13 +158,12 @@ def test_waiting_doubles_up_to_its_limit(wait_until):
 
 def test_a_missing_port_costs_next_to_nothing(wait_until):
     """Also where an interval of nothing is asked for, as far as the limit goes."""
-    begin = resource.getrusage(resource.RUSAGE_SELF)
+    begin, since = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
     with Taker('/nonexistent/gyro', 'csv', reopen_interval=0.1, reopen_limit=0.4) as taker:
-        time.sleep(2.0)
-    end = resource.getrusage(resource.RUSAGE_SELF)
-    assert 3 <= len(taker.problems) <= 8  # after 0, 0.1, 0.3, 0.7, 1.1, 1.5, 1.9 s
+        wait_until(lambda: len(taker.problems) == 7)  # after 0, 0.1, 0.3, 0.7, 1.1, 1.5, 1.9 s
+        waited, lasted, end = taker.connection.waited, time.monotonic() - since, resource.getrusage(resource.RUSAGE_SELF)
     assert end.ru_utime + end.ru_stime - begin.ru_utime - begin.ru_stime < 0.1
-    assert taker.connection.waited == pytest.approx(2.0, abs=0.3)
+    assert 1.9 <= waited <= lasted
 
 
 def test_waiting_ends_at_once(wait_until):
@@ -172,16 +171,16 @@ def test_waiting_ends_at_once(wait_until):
     with taker:
         wait_until(lambda: taker.problems)
         begin = time.monotonic()
-    assert time.monotonic() - begin < 0.5
+    assert time.monotonic() - begin < 5.0  # of 60 s; a busy machine is late
 
 
 def test_listening_ends_at_once(terminal):
     _, path = terminal
-    connection, stop = Connection(path, silence_timeout=5.0), threading.Event()
+    connection, stop = Connection(path, silence_timeout=60.0), threading.Event()
     threading.Timer(0.3, stop.set).start()
     begin = time.monotonic()
     assert list(connection.chunks(stop)) == [] and connection.state.name == 'listening'
-    assert time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin < 5.0  # of 60 s; a busy machine is late
 
 
 def test_samples_end_the_waiting(tmp_path, wait_until):
@@ -245,8 +244,8 @@ class Board(Worker):
 @pytest.mark.parametrize('protocol', ['razor', 'auto'])
 def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_hears(protocol, wait_until):
     angles, rates = b'#YPR=-142.28,-5.38,33.52\r\n', b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
-    with Board(1.2, angles, b'#ox', rates) as board, Taker(board.path, protocol, silence_timeout=0.5) as taker:
-        wait_until(lambda: taker.samples, 15.0, taker.states)
+    with Board(1.2, angles, b'#ox', rates) as board, Taker(board.path, protocol, silence_timeout=5.0) as taker:
+        wait_until(lambda: taker.samples, what=taker.states)
         asked, count = board.asked, len(taker.samples)
         wait_until(lambda: len(taker.samples) > count + 150)  # 1.5 s
         assert taker.connection.openings == 1
@@ -257,7 +256,7 @@ def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_hears(protoco
 def test_a_board_that_takes_long_to_restart_is_waited_for(protocol, wait_until):
     """Its silence is told meanwhile."""
     with Board(2.0, b'1.0\r\n') as board, Taker(board.path, protocol, settings=ONE_COLUMN, silence_timeout=0.3) as taker:
-        wait_until(lambda: taker.samples, 15.0, taker.states)
+        wait_until(lambda: taker.samples, what=taker.states)
         assert taker.connection.openings == 1
     assert taker.problems[0] == f'nothing comes on {board.path} for 0.3 s: check the power and the wires of the gyro'
 

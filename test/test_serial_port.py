@@ -21,11 +21,17 @@ def terminal():
             os.close(descriptor)
 
 
-def test_what_is_there_is_read_at_once(terminal):
+def holds(port, count):
+    """Tell whether so many bytes can be read: the system takes its time from one end of a terminal to the other."""
+    return port._port.in_waiting == count
+
+
+def test_what_is_there_is_read_at_once(terminal, wait_until):
     master, path = terminal
     port = SerialPort(path, 115200)
     port.open()
     os.write(master, b'x' * 1000)
+    wait_until(lambda: holds(port, 1000))
     assert port.read() == b'x' * 1000
     port.close()
 
@@ -74,14 +80,16 @@ def test_a_closed_port_cannot_be_read():
         SerialPort('/dev/null', 115200).read()
 
 
-def test_the_speed_changes_without_opening_the_port_anew(terminal):
+def test_the_speed_changes_without_opening_the_port_anew(terminal, wait_until):
     """What came at the other speed is dropped."""
     master, path = terminal
     port = SerialPort(path, 9600, timeout=0.01)
     port.open()
     os.write(master, b'garbage')
+    wait_until(lambda: holds(port, 7))
     port.set_baud(115200)
     speed = termios.tcgetattr(master)[4]
     os.write(master, b'sense')
+    wait_until(lambda: holds(port, 5))
     assert (speed, port.baud, port.read()) == (termios.B115200, 115200, b'sense')
     port.close()
