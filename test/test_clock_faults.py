@@ -97,13 +97,13 @@ def test_driver_and_compensation_go_on_together_where_the_clock_is_set(set_clock
     with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro:
         start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml', 'model_file': tmp_path / 'model.yaml'})
         start_node('driver_node', {'port': gyro.path})
-        wait_until(lambda: len(heading) > 200, 15.0, 'headings')
+        wait_until(lambda: len(heading) > 200, what='headings')
         for hours in (3.0, 1.0):
             set_clock(hours * HOUR)
             later, begin = heading[-1].header.stamp.sec + (HOUR if hours == 3.0 else -2.0 * HOUR), len(heading)
             wait_until(lambda: abs(heading[-1].header.stamp.sec - later) < 100.0 and len(heading) > begin + 200,  # noqa: B023, at once
-                       20.0, 'headings with stamps of the clock that was set')
-        wait_until(lambda: any('2 times' in value.value for value in values_of(diagnostics, 'clock_set')), 5.0, 'two steps of the clock')
+                       what='headings with stamps of the clock that was set')
+        wait_until(lambda: any('2 times' in value.value for value in values_of(diagnostics, 'clock_set')), what='two steps of the clock')
     messages = list(heading)
     steps = np.diff([stamp.sec + 1e-9 * stamp.nanosec for stamp in (message.header.stamp for message in messages)])
     jumps = np.where(np.abs(steps) > 100.0, np.round(steps / HOUR) * HOUR, 0.0)
@@ -124,10 +124,10 @@ def test_timers_and_time_limits_go_on_where_the_clock_is_set_back(set_clock, sta
     future = gyro.call_later('calibrate_bias')
     gyro.wait_until(lambda: gyro.play(outputs(0.4)) or gyro.calibrating())
     set_clock(HOUR)
-    wait_until(future.done, 5.0, 'a refusal')
+    wait_until(future.done, what='a refusal')
     assert 'no sample came for 1 s' in future.result().message
     gyro.diagnostics.clear()
-    wait_until(lambda: gyro.diagnostics and gyro.says('no samples on imu/data_raw'), 5.0, 'diagnostics')
+    wait_until(lambda: gyro.diagnostics and gyro.says('no samples on imu/data_raw'), what='diagnostics')
 
 
 def test_a_calibration_of_before_the_clock_was_set_gets_the_date_that_it_had(set_clock, start, tmp_path):

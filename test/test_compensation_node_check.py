@@ -70,7 +70,7 @@ def test_a_calibration_at_rest_says_that_the_bias_had_moved_and_the_alarm_ends(s
     _, gyro = start(bias_duration=15.0)
     rates = outputs(60.0, bias=0.01 + 0.2 * DEGREE, seed=1)
     answer = gyro.call_later('calibrate_bias')
-    gyro.wait_until(gyro.calibrating, 10.0, 'the calibration to begin')
+    gyro.wait_until(gyro.calibrating, what='the calibration to begin')
     gyro.play(rates[:400], until=answer.done)
     gyro.wait_until(answer.done)
     result = answer.result()

@@ -47,7 +47,7 @@ def told(gyro, condition, what, bias=0.012, temperature=None):
     gyro.diagnostics.clear()
     seeds = count(1)
     gyro.wait_until(lambda: gyro.play(outputs(0.4, bias=bias, seed=next(seeds)), temperature) or gyro.diagnostics and condition(
-        gyro.values()), 15.0, what)
+        gyro.values()), what=what)
     return gyro.values()
 
 
@@ -131,7 +131,6 @@ def test_wheels_and_commands_decide_on_slow_turns(start, ros):
     command = TwistStamped()
     command.twist.linear.x = 0.3
     gyro.wait_until(lambda: commands.publish(command) or told(gyro, lambda values: True, 'diagnostics')['wheels'] == 'moving')
-    assert gyro.values()['wheels'] == 'moving'
 
 
 def test_a_temperature_step_a_restart_and_a_lost_temperature(start, tmp_path):

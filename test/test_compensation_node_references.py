@@ -37,12 +37,12 @@ def start(start_node, ros, wait_until, tmp_path):
 def begun(gyro):
     """Call a calibration, and return its answer to come."""
     answer = gyro.call_later('calibrate')
-    gyro.wait_until(gyro.calibrating, 10.0, 'the calibration to begin')
+    gyro.wait_until(gyro.calibrating, what='the calibration to begin')
     return answer
 
 
 def ended(gyro, answer):
-    gyro.wait_until(answer.done, 10.0, 'the answer')
+    gyro.wait_until(answer.done, what='the answer')
     return answer.result()
 
 

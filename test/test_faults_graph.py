@@ -63,7 +63,7 @@ class Heard:
         self.variances.append(message.orientation_covariance[8])
         self.arrivals.append(time.monotonic())
 
-    def more(self, count, timeout=20.0):
+    def more(self, count, timeout=60.0):
         """Wait for so many more rates."""
         before = len(self.numbers)
         self._wait_until(lambda: len(self.numbers) >= before + count, timeout, f'{count} more rates')
@@ -89,7 +89,7 @@ class Heard:
         def said():
             return any(words in text for report in self.reports for status in report.status
                        for text in (status.message, *(f'{pair.key}: {pair.value}' for pair in status.values)))
-        self._wait_until(said, 10.0, words)
+        self._wait_until(said, what=words)
 
 
 def _quality():
@@ -189,7 +189,7 @@ def test_the_heading_goes_on_over_a_line_that_damages_frames_and_comes_in_bursts
     start_node('driver_node', {'port': tmp_path / 'gyro', 'protocol': 'kvh_1750', 'sample_rate': RATE})
     line = Line(lost_bytes=0.0015, doubled_bytes=0.0015, flipped_bytes=0.002, burst=0.016)
     with Turning(tmp_path / 'gyro', 'kvh_1750', line=line, generator=np.random.default_rng(1)).emulator:
-        heard.more(600, 40.0)
+        heard.more(600)
     assert heard.missing() > 50
     assert heard.error(0, -1) < 4.0 * math.sqrt(heard.variances[-1]) + NEARLY
     heard.says('lost_samples: 1')

@@ -60,7 +60,7 @@ class Wired:
 
     def __init__(self, name, start_node, ros, folder):
         self.name, self.link, self.exact, self.discarded = name, folder / name, exact(name), 0
-        parameters = {'protocol': name, 'port': self.link, 'reopen_interval': 0.05, 'reopen_limit': 0.2, 'silence_timeout': 1.0,
+        parameters = {'protocol': name, 'port': self.link, 'reopen_interval': 0.05, 'reopen_limit': 0.2, 'silence_timeout': 10.0,
                       'sensitivity': SETTINGS[name].sensitivity or 0.0, 'sample_rate': RATE}
         start_node('driver_node', parameters, {'__ns': f'/{name}', '/diagnostics': f'/{name}/diagnostics'})
         self.rates = ros.collect(Imu, f'/{name}/imu/data_raw')
@@ -90,9 +90,9 @@ def test_drivers_of_every_format_go_on_over_bad_lines_and_count(start_node, ros,
         with ExitStack() as stack:
             for driver in drivers:
                 stack.enter_context(driver.gyro(share))
-            wait_until(lambda wanted=wanted: all(len(driver.rates) >= wanted for driver in drivers), 20.0, f'samples at {share}')
+            wait_until(lambda wanted=wanted: all(len(driver.rates) >= wanted for driver in drivers), 60.0, f'samples at {share}')
             if not wanted:
-                wait_until(lambda: all(driver.count('discarded bytes') > driver.discarded + 100 for driver in drivers), 20.0, 'the counts')
+                wait_until(lambda: all(driver.count('discarded bytes') > driver.discarded + 100 for driver in drivers), what='the counts')
         assert not [driver.name for driver in drivers if driver.name in CHECKED and driver.wrong()]
         assert share or not [(driver.name, driver.wrong(30)) for driver in drivers if driver.wrong(30)]  # the first are still under way
     wait_until(lambda: all(driver.count('lost samples') > 0 for driver in drivers), what='lost samples')

@@ -20,7 +20,7 @@ except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
 TIMES = 100
-PROMPT = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'reopen_interval': 0.05, 'reopen_limit': 0.2, 'silence_timeout': 5.0}
+PROMPT = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'reopen_interval': 0.05, 'reopen_limit': 0.2, 'silence_timeout': 10.0}
 SETTINGS = Settings(columns=('gyro_rad_s',))
 
 
@@ -88,6 +88,6 @@ def test_single_bytes_make_whole_samples(start_node, ros, wait_until, tmp_path):
     rates = ros.collect(Imu, 'imu/data_raw')
     samples = (Sample(0.001 * number, time=number / 80.0) for number in itertools.count())
     with Emulator(replace(find('csv'), baud=9600), samples, SETTINGS, link=tmp_path / 'gyro', line=Line(piece=1)):
-        wait_until(lambda: len(rates) > 150, 20.0, 'samples')
+        wait_until(lambda: len(rates) > 150, what='samples')
     numbers = [round(1000.0 * message.angular_velocity.z) for message in rates]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))

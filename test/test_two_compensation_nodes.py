@@ -26,7 +26,7 @@ def both(start_node, ros, wait_until, tmp_path):
         gyro.interval, heard = INTERVAL, ros.collect(Float64, '/second/heading')
         start_node('compensation_node', {**common, 'calibration_file': tmp_path / second},
                    {'__ns': '/second', 'imu/data_raw': '/imu/data_raw', 'imu/temperature': '/imu/temperature'})
-        gyro.wait_until(lambda: gyro.play(outputs(0.4)) or heard, 15.0, 'the second node')
+        gyro.wait_until(lambda: gyro.play(outputs(0.4)) or heard, 60.0, 'the second node')
         return gyro, heard
     return start
 
@@ -34,7 +34,7 @@ def both(start_node, ros, wait_until, tmp_path):
 def calibrate(gyro, *names):
     """Calibrate at rest by services at the same time, and return the messages."""
     futures = [gyro.call_later(name) for name in names]
-    gyro.wait_until(lambda: gyro.play(outputs(0.4)) or all(future.done() for future in futures), 20.0, 'calibrations')
+    gyro.wait_until(lambda: gyro.play(outputs(0.4)) or all(future.done() for future in futures), 60.0, 'calibrations')
     assert all(future.result().success for future in futures), [future.result().message for future in futures]
 
 
@@ -61,5 +61,5 @@ def test_two_nodes_with_one_file_say_so_and_leave_it_whole(both, ros, tmp_path):
         assert read_model(tmp_path / 'calibration.yaml').self_calibration.method == 'rest'
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics', 10)
     gyro.wait_until(lambda: gyro.play(outputs(0.4)) or any(SHARED in status.message for array in diagnostics for status in array.status),
-                    15.0, 'a warning')
+                    what='a warning')
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != 'calibration_biases.yaml') == ['calibration.yaml', 'model.yaml']
