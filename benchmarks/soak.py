@@ -150,7 +150,8 @@ def gyro(given: argparse.Namespace) -> None:
     """Be the gyro until the samples end or a signal comes."""
     numbers = shared(given.folder)
     settings = settings_of(given.protocol, given.rate)
-    emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, link=given.folder / 'port', wait_for_reader=True)
+    speed = 1.0 + 1e-9 if given.patient else 1.0  # what is faster than time is a replay, which waits for its reader
+    emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, speed, given.folder / 'port', wait_for_reader=True)
     signal.signal(signal.SIGINT, lambda *_: emulator.stop())
     emulate(emulator)
     numbers[LOST_BYTES] = emulator.lost_bytes
@@ -246,7 +247,7 @@ class Run:
         """Start all, and let the gyro begin to count once its rates arrive."""
         own = [sys.executable, __file__]
         words = ['--folder', self._folder, '--protocol', self.given.protocol, '--rate', self.given.rate, '--leading', self.given.leading,
-                 '--samples', self.given.samples]
+                 '--samples', self.given.samples, *['--patient'] * self.given.patient]
         self._begin('compensation_node', self._node('compensation_node', model_file=self._folder / 'model.yaml',
                                                     calibration_file=self._folder / 'calibration.yaml'))
         self._begin('driver_node', self._node('driver_node', port=self._folder / 'port', protocol=self.given.protocol, **self._wiring()))
@@ -345,9 +346,9 @@ def growth(values: list[int]) -> float:
     return 100.0 * (median(values[-tenth:]) / median(values[tenth:2 * tenth] or values) - 1.0)
 
 
-def soak(protocol: str, rate: float, seconds: float, leading: float) -> dict[str, object]:
+def soak(protocol: str, rate: float, seconds: float, leading: float, patient: bool) -> dict[str, object]:
     """Run the graph for some time, or until Ctrl-C, and return the figures."""
-    given = argparse.Namespace(protocol=protocol, rate=rate, samples=round(seconds * rate), leading=leading)
+    given = argparse.Namespace(protocol=protocol, rate=rate, samples=round(seconds * rate), leading=leading, patient=patient)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         run = Run(given, Path(folder), stack)
         run.start()
@@ -362,10 +363,10 @@ def soak(protocol: str, rate: float, seconds: float, leading: float) -> dict[str
 def outcomes(given: argparse.Namespace) -> Iterator[dict[str, object]]:
     """Yield the figures of what was asked for."""
     if not given.protocols:
-        yield soak(SOAKED, SOAKED_RATE, 60.0 * given.minutes, LEADING)
+        yield soak(SOAKED, SOAKED_RATE, 60.0 * given.minutes, LEADING, given.patient)
         return
     for name in given.only or sorted(PROTOCOLS):
-        yield soak(name, full_rate(name), 60.0 * min(given.minutes, 1.0), 0.0)
+        yield soak(name, full_rate(name), 60.0 * min(given.minutes, 1.0), 0.0, given.patient)
 
 
 def text(found: dict[str, object]) -> Iterator[str]:
@@ -398,6 +399,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument('--minutes', type=float, default=60.0)
     parser.add_argument('--protocols', action='store_true', help='every wire format at its full line rate, at most a minute each')
     parser.add_argument('--only', nargs='*', metavar='NAME', help='of these formats')
+    parser.add_argument('--patient', action='store_true', help='let the gyro wait for a driver that a busy machine does not let read')
     parser.add_argument('--json', action='store_true')
     return parser.parse_args()
 
@@ -411,6 +413,7 @@ def process_arguments() -> argparse.Namespace:
     for name in ('--rate', '--leading'):
         parser.add_argument(name, type=float)
     parser.add_argument('--samples', type=int)
+    parser.add_argument('--patient', action='store_true')
     return parser.parse_args()
 
 

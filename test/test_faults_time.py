@@ -97,7 +97,7 @@ class Phases:
         """
         Return what the stamps went on by, s, and what the heading did, rad, while samples came for 1.5 s.
 
-        At the speed of time the samples of a busy machine are waited for at both ends: what is asked of stamps is not that they come soon.
+        The samples of a busy machine are waited for at both ends: what is asked of stamps is not that they come soon.
 
         """
         self._simulation.speed = speed
@@ -112,8 +112,8 @@ class Phases:
         return last - first, turned - heading
 
     def _catch_up(self):
-        if self._simulation.speed == 1.0:
-            self._wait_until(lambda: abs(seconds(self._rates[-1]) - self._simulation.now) < 0.2, 20.0, 'stamps of the simulation')
+        near = 0.2 * max(1.0, self._simulation.speed)
+        self._wait_until(lambda: abs(seconds(self._rates[-1]) - self._simulation.now) < near, what='stamps of the simulation')
 
     def _newest(self):
         """Return stamp and heading of the newest sample of which both came."""
