@@ -60,7 +60,7 @@ class CalibrationServices:
         # A robot that is driven must not drive on for an hour because somebody set the clock back.
         self._drive_timer = node.create_timer(0.02, self._drive, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._drive_timer.cancel()  # it runs only while the robot is driven, for a wake-up costs as much as a sample
-        self._blind = False
+        self._blind = self._is_silent = False
 
     # What the node brings
 
@@ -79,7 +79,9 @@ class CalibrationServices:
         """Give up a run that hears nothing, or that may no longer drive the robot."""
         if self.run and self._driving and not current(self._node, PARAMETERS).drive_profile:
             self.run.answer('drive_profile was set to false while the robot was driven: set it to true and run again')
-        if self.run and self._now() - self.run.heard > self._settings.sample_timeout:
+        # At the second look, for after a pause of this node the samples that wait come after the timers.
+        before, self._is_silent = self._is_silent, self.run is not None and self._now() - self.run.heard > self._settings.sample_timeout
+        if self.run and self._is_silent and before:
             self.run.answer(f'no sample came for {self._settings.sample_timeout:g} s: look at the gyro and its driver')
 
     # Runs
@@ -227,7 +229,7 @@ class CalibrationServices:
             return
         silent = self._now() - self.run.heard
         before, self._blind = self._blind, silent > self._blind_limit
-        if self._blind and before:  # at the second look, for after a pause of this node the samples that wait come after the timers
+        if self._blind and before:  # at the second look, as in `watch`
             self.run.answer(f'no sample came for {silent:.2f} s while the robot was driven: look at the gyro and its driver')
         self._command(0.0 if self._blind else float(self.run.motion.rate_at(np.array(self.run.elapsed + silent))))
 

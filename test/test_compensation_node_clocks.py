@@ -126,6 +126,26 @@ def test_a_cancel_that_comes_with_the_last_sample_does_not_say_that_the_old_cali
     assert answered(calibration).success is not cancelled
 
 
+def test_a_pause_of_the_node_ends_no_calibration_whose_samples_wait_behind_the_timers(start):
+    robot = start(bias_duration=1.0)
+    calibration = asked(robot.node._calibrations._on_calibrate_bias)
+    played(robot, 50)
+    robot.steady += 60.0
+    robot.node._watch()
+    played(robot, 60, waited=0.0)
+    assert answered(calibration).success
+
+
+def test_silence_ends_a_calibration(start):
+    robot = start(bias_duration=1.0)
+    calibration = asked(robot.node._calibrations._on_calibrate_bias)
+    played(robot)
+    for _ in range(2):
+        robot.steady += 6.0
+        robot.node._watch()
+    assert 'no sample came for 5 s' in answered(calibration).message
+
+
 def driven(start):
     """Return a robot that the node drives from now on, the list of its commands, rad/s, and the coroutine of the calibration."""
     robot, commands = start(drive_profile=True), []
