@@ -6,9 +6,11 @@ import math
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tqdm import tqdm
 
 from gyro_calibration import verbs
 from gyro_calibration.command_line import main
@@ -213,7 +215,7 @@ def demo(ros_domain, tmp_path):
     """Run the demonstration as a person would, and return its folder, time and process."""
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
     return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo', '--out', tmp_path / 'demo', '--seed', '2', '--json'],
-                          capture_output=True, text=True, timeout=120), tmp_path / 'demo'
+                          capture_output=True, text=True, timeout=240), tmp_path / 'demo'
 
 
 def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_picture_table_and_log(demo):
@@ -224,6 +226,25 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
     assert (folder / 'heading.png').read_bytes().startswith(b'\x89PNG')
     assert 'Hong and Park' in (folder / 'table.md').read_text()
     assert len(read_log(folder / 'log.csv')) > 4000
+
+
+@pytest.mark.parametrize('refusals', [0, 2, 3])
+def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(ros_domain, capsys, refusals):
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    from gyro_calibration.demo import ATTEMPTS, Refused, calibrate
+    answers = iter([Refused('calibrate: the gyro slipped')] * refusals + ['done'])
+
+    def call(*_):
+        answer = next(answers)
+        if isinstance(answer, Refused):
+            raise answer
+    with tqdm(total=60, disable=True) as bar:
+        if refusals < ATTEMPTS:
+            calibrate(SimpleNamespace(call=call), bar)
+        else:
+            with pytest.raises(Refused, match='slipped'):
+                calibrate(SimpleNamespace(call=call), bar)
+    assert capsys.readouterr().err.count('slipped; once more') == min(refusals, ATTEMPTS - 1)
 
 
 def test_rows_without_output_are_said_and_do_not_spoil_the_heading(run, model, tmp_path):
