@@ -43,8 +43,8 @@ MCAP_END = struct.pack('<BQ4x', _DATA_END, 4) + struct.pack('<BQ20x', _FOOTER, 2
 #: Name of what a recorder of this program says of a recording; and how many characters of a text are told.
 ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
 
-#: SQLite tells of a damaged file in its words, which need not be text.
-_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
+#: SQLite tells of a damaged file in its words, which need not be text, or that a length in it asks for more memory than there may be.
+_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 #: Is told how many bytes of all files are read.
 Heard = Callable[[int], object]
@@ -341,7 +341,7 @@ def _from_database(plain: Path, path: Path, contents: Contents, heard: Heard) ->
                     continue
                 yield Message(*channels[topic], received, _message_data(data))
         except _DATABASE_ERRORS as error:
-            contents.notes.append(f'{path.name} is damaged after {count} messages ({said(error)}), and was read up to there')
+            contents.notes.append(f'{path.name} is damaged after {count} messages ({_why(error)}), and was read up to there')
 
 
 @contextmanager
@@ -361,7 +361,11 @@ def _database(plain: Path, path: Path, contents: Contents) -> Iterator[sqlite3.C
                     raise LogError(f'{path}: is a database, but not a ROS 2 recording; name a recording')
                 yield database
                 return
-    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({said(reason)}); name a recording, or record again')
+    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); name a recording, or record again')
+
+
+def _why(error: Exception | None) -> str:
+    return said(str(error) or 'it asks for more memory than there may be')
 
 
 def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
@@ -398,7 +402,7 @@ def _topics(database: sqlite3.Connection, path: Path, contents: Contents) -> dic
             if kind in LAYOUTS and encoding == 'cdr':
                 channels[number] = topic, kind
     except _DATABASE_ERRORS as error:
-        raise LogError(f'{path}: its list of topics cannot be read ({said(error)}); record again') from error
+        raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); record again') from error
     return channels
 
 

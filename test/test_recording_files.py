@@ -291,6 +291,17 @@ def test_only_recordings_are_taken_for_recordings(tmp_path):
         read_recording(tmp_path)
 
 
+def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_path):
+    """Its only page begins with an entry whose length is as large as can be written."""
+    page = bytearray(512)
+    for place, data in {0: b'SQLite format 3', 16: b'\2', 21: b'\x40\x20\x20', 100: b'\r', 104: b'\2', 108: b'\1\x89', 393: 17 * b'\xff',
+                        411: b'C'}.items():
+        page[place:place + len(data)] = data
+    (tmp_path / 'a.db3').write_bytes(page[:412])
+    with pytest.raises(LogError, match='it asks for more memory than there may be'):
+        read_recording(tmp_path / 'a.db3')
+
+
 @pytest.mark.parametrize('name', ['missing.mcap', 'missing.db3', 'missing.db3.zstd'])
 def test_a_recording_that_is_not_there_is_one_sentence_and_is_not_made(tmp_path, name):
     with pytest.raises(LogError, match=f'{name}: cannot be read .No such file or directory.'):
