@@ -23,23 +23,28 @@ PACE = 0.0015  # s between messages: stamps run 7 times faster than the clock, a
 class FakeGyro:
     """Publishes raw rates with stamps of its own clock, and hears what the node makes of them."""
 
-    def __init__(self, ros, wait_until):
+    def __init__(self, ros, wait_until, resting=0.0):
         self.ros, self.wait_until, self.nanoseconds, self.interval, self.frame = ros, wait_until, BEGIN, INTERVAL, 'gyro'
         self._imu = ros.publisher(Imu, 'imu/data_raw')
         self._temperature = ros.publisher(Temperature, 'imu/temperature')
         self.imu, self.rate, self.heading = ros.collect(Imu, 'imu/data'), ros.collect(Float64, 'yaw_rate'), ros.collect(Float64, 'heading')
         self.diagnostics = ros.collect(DiagnosticArray, '/diagnostics', 10)
         self.status = ros.collect(DiagnosticStatus, 'calibration_status', _latched())
-        self._meet()
+        self._meet(resting)
 
-    def _meet(self):
-        """Send zeros until everything is heard, for discovery takes its time each way; then, with the last, begin at heading zero."""
+    def _meet(self, resting):
+        """
+        Rest until everything is heard, for discovery takes its time each way; then, with the last sample, begin at heading zero.
+
+        `resting` is what the gyro says at rest: if it said something else afterwards, that were a turn.
+
+        """
         def all_heard():
-            self.send(0.0)
+            self.send(resting)
             return self.imu and self.rate and self.heading and self.status and self._temperature.get_subscription_count()
         self.wait_until(all_heard, 60.0, 'the node')
         self.frame = 'last'
-        self.send(0.0)
+        self.send(resting)
         self.wait_until(lambda: self.imu[-1].header.frame_id == 'last', what='the last')
         self.frame = 'gyro'
         assert self.ros.call(Trigger, 'reset_heading').success
@@ -106,11 +111,11 @@ class FakeGyro:
         return bool(self.status) and self.status[-1].message.startswith('calibrating')
 
 
-def start_with_gyro(start_node, ros, wait_until, folder, model, interval, **parameters):
-    """Start a compensation node with a model, its files in a folder, and return it with a gyro of an interval, s, that it hears."""
+def start_with_gyro(start_node, ros, wait_until, folder, model, interval, resting, **parameters):
+    """Start a compensation node with a model, its files in a folder, and return it with a gyro: its interval, s, and output at rest."""
     (folder / 'model.yaml').write_text(yaml.safe_dump(model))
     given = {'calibration_file': folder / 'calibration.yaml', 'model_file': folder / 'model.yaml', **parameters}
-    node, gyro = start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until)
+    node, gyro = start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until, resting)
     gyro.interval = interval
     return node, gyro
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from fake_gyro import BEGIN, start_with_gyro
-from test_compensation_node_live import INTERVAL, MODEL, outputs, told
+from test_compensation_node_live import BIAS, INTERVAL, MODEL, outputs, told
 
 from gyro_calibration.emulator import Emulator
 from gyro_calibration.protocols import Sample, find
@@ -58,7 +58,7 @@ def set_clock(tmp_path, monkeypatch):
 
 @pytest.fixture
 def start(start_node, ros, wait_until, tmp_path):
-    return partial(start_with_gyro, start_node, ros, wait_until, tmp_path, MODEL, INTERVAL)
+    return partial(start_with_gyro, start_node, ros, wait_until, tmp_path, MODEL, INTERVAL, BIAS)
 
 
 def seconds(date):

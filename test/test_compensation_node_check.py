@@ -19,7 +19,7 @@ MODEL = {'effects': {'bias': {'bias': 0.01}}, 'covariance': [[1e-8]],
 
 @pytest.fixture
 def start(start_node, ros, wait_until, tmp_path):
-    return partial(start_with_gyro, start_node, ros, wait_until, tmp_path, MODEL, INTERVAL)
+    return partial(start_with_gyro, start_node, ros, wait_until, tmp_path, MODEL, INTERVAL, 0.01)
 
 
 def outputs(seconds, scale=1.0, bias=0.01, seed=0):
