@@ -143,6 +143,10 @@ class Client:
             raise Refused(f'{name}: {answer.result().message}')
         return answer.result().message
 
+    def is_ready(self) -> bool:
+        """Return whether all is heard: the gyro, its heading, and who commands the robot beside this node."""
+        return bool(self.raw and self.headings) and self._node.count_publishers('cmd_vel') > 1
+
     def turn(self, rate: float) -> None:
         """Command a rate, rad/s."""
         command = Twist()
@@ -222,7 +226,7 @@ def _perform(client: Client) -> float:
     total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s', disable=None) as bar:
         bar.set_description('starting driver and compensation')
-        _until(lambda: client.raw and client.headings, 20.0)
+        _until(client.is_ready, 20.0)
         bar.set_description('calibrating on the motion profile')
         calibrate(client, bar)
         client.call('reset_heading', 10.0, lambda: time.sleep(0.01))
@@ -256,7 +260,7 @@ def _until(condition: Callable[[], object], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
-            raise OSError(f'no heading came within {timeout:g} s; is another program using the port?')
+            raise OSError(f'the nodes were not ready within {timeout:g} s; is another program using the port?')
         time.sleep(0.02)
 
 
