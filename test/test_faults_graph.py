@@ -24,7 +24,7 @@ except ImportError:
 
 RATE = 100.0  # Hz
 STEP = 2e-5  # rad/s from a sample to the next
-NEARLY = 0.02  # rad; what it turns in 0.07 s, by which a busy machine may be late at first
+NEARLY = 0.3  # rad; what it turns in 1 s, by which a busy machine may be late at first; the gaps of these tests are longer
 FIRST = 0.3  # rad/s
 SETTINGS = Settings(columns=('gyro_rad_s',))
 DRIVER = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'reopen_interval': 0.05, 'sample_rate': RATE}
@@ -110,7 +110,7 @@ def compensation(start_node, ros, wait_until, tmp_path):
     return start
 
 
-def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver_that_is_killed(compensation, start_node, tmp_path):
+def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver_that_is_killed(compensation, start_node, by_udp, tmp_path):
     """One bridges gaps up to 20 s, the other, as by default, none of more than 1 s; both tell, and know how well they know."""
     node, first = compensation()
     _, second = compensation('second', maximum_gap=20.0)
