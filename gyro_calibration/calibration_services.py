@@ -31,6 +31,8 @@ from gyro_calibration.wheels import COMMAND
 
 #: A robot is driven for so long, s, or so many intervals of the samples after the last one, but not over a gap that refuses the run.
 _BLIND, _BLIND_INTERVALS = 0.25, 4.0
+#: Somebody must hear the commands within this time, s; until nodes know of each other may take three.
+_HEARING = 5.0
 
 
 class CalibrationServices:
@@ -61,12 +63,17 @@ class CalibrationServices:
         self._drive_timer = node.create_timer(0.02, self._drive, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._drive_timer.cancel()  # it runs only while the robot is driven, for a wake-up costs as much as a sample
         self._blind = self._is_silent = False
+        self._asked = 0.0
 
     # What the node brings
 
     def add(self, time: float, output: float, heard: float) -> None:
         """Take a sample into the run that goes on."""
-        if self.run:
+        if not self.run:
+            return
+        if self._is_unheard:
+            self.run.heard = heard
+        else:
             live = self._rooms.live
             self.run.add(time, output, float(live.last.modelled), None if live.temperature_is_lost else live.temperature, heard)
 
@@ -79,6 +86,10 @@ class CalibrationServices:
         """Give up a run that hears nothing, or that may no longer drive the robot."""
         if self.run and self._driving and not current(self._node, PARAMETERS).drive_profile:
             self.run.answer('drive_profile was set to false while the robot was driven: set it to true and run again')
+        if self.run and self._is_unheard and self._now() - self._asked > _HEARING:
+            kind = 'TwistStamped' if self._settings.cmd_vel_stamped else 'Twist'
+            self.run.answer(f'nobody hears cmd_vel as a {kind}: start what moves the robot, remap cmd_vel to its topic, '
+                            'or change cmd_vel_stamped')
         # At the second look, for after a pause of this node the samples that wait come after the timers.
         before, self._is_silent = self._is_silent, self.run is not None and self._now() - self.run.heard > self._settings.sample_timeout
         if self.run and self._is_silent and before:
@@ -116,6 +127,7 @@ class CalibrationServices:
         self.run = run = Run(kind, duration, wanted_after(kind, rules), self._now(), _once(future), motion)
         self._rooms.check.restart()
         if drives:
+            self._asked = run.heard
             self._drive_timer.reset()
         self._show()
         message, success = await self._outcome(run, rules, future)
@@ -222,6 +234,14 @@ class CalibrationServices:
     @property
     def _driving(self) -> bool:
         return not self._drive_timer.is_canceled()
+
+    @property
+    def _is_unheard(self) -> bool:
+        """Tell whether a run that drives the robot has yet to wait for somebody who hears its commands, other than this node."""
+        if not self._driving or not self.run or self.run.times:
+            return False
+        assert self._velocity is not None  # nobody drives before `_learn_to_drive`
+        return self._velocity.get_subscription_count() <= (self._settings.wheels in ('cmd_vel', 'both'))
 
     def _drive(self) -> None:
         """Command what the profile wants now; the robot moves only while samples come."""

@@ -218,6 +218,22 @@ def test_the_robot_is_stopped_on_cancel_signal_and_silence(start, end):
     gyro.wait_until(lambda: commands and commands[-1].angular.z == 0.0)
 
 
+def test_a_drive_waits_for_somebody_who_hears_it_and_is_refused_where_nobody_does(start):
+    _, gyro = start(drive_profile=True, wheels='cmd_vel')  # the node hears itself, which does not count
+    alone = gyro.call_later('calibrate')
+    gyro.play(np.zeros(10 ** 5), until=alone.done)
+    assert not alone.result().success and 'nobody hears cmd_vel as a Twist' in alone.result().message
+    answer = gyro.call_later('calibrate')
+    gyro.wait_until(gyro.calibrating)
+    gyro.play(np.zeros(100))
+    assert gyro.calibrating() and not answer.done()
+    commands = gyro.ros.collect(Twist, 'cmd_vel', 10)
+    gyro.play(np.zeros(10 ** 5), until=lambda: commands)
+    gyro.call_later('cancel_calibration')
+    gyro.wait_until(answer.done)
+    assert answer.result().message == 'refused: cancelled'
+
+
 def test_a_robot_is_not_driven_on_when_samples_stop_whatever_the_timeout(start):
     _, gyro = start(drive_profile=True)
     commands = gyro.ros.collect(Twist, 'cmd_vel', 10)

@@ -150,7 +150,8 @@ def driven(start):
     """Return a robot that the node drives from now on, the list of its commands, rad/s, and the coroutine of the calibration."""
     robot, commands = start(drive_profile=True), []
     services = robot.node._calibrations
-    services._velocity = SimpleNamespace(publish=lambda message: commands.append(message.angular.z), wait_for_all_acked=lambda _: True)
+    services._velocity = SimpleNamespace(publish=lambda message: commands.append(message.angular.z), wait_for_all_acked=lambda _: True,
+                                         get_subscription_count=lambda: 1)
     return robot, commands, asked(services._on_calibrate)
 
 
