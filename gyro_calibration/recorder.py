@@ -184,7 +184,6 @@ class McapRecorder:
         finally:
             self._stream.file.close()
 
-
     def _close_without_index(self) -> None:
         with suppress(DiskFull):  # not even room for these bytes: whoever reads it finds it torn
             if self.size:

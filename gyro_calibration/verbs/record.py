@@ -230,6 +230,8 @@ class _PortSession(_Session):
             tick()
 
     def _tell(self, state: State) -> None:
+        if state.name == 'failed':
+            self._recorder.flush()  # there is no piece in a silence
         said = state.problem or state.name
         if state.name == 'opening' or said == self._told or state.name == 'listening' and self._told:
             return  # it listens again at each attempt
