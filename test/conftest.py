@@ -148,9 +148,8 @@ def _is_empty(domain):
 
     """
     ports = {int(re.findall(r'[0-9]+', path.name)[0]) for path in _SHARED_MEMORY.glob('fastrtps_port*')}
-    first = 7400 + 250 * domain
-    there = [port for port in ports if port < 7400 or first <= port < first + 250]
-    listened = {port for port in there if not _is_left(port)}
+    first = 7400 + 250 * domain  # below 7400 are ports that all domains share
+    listened = [port for port in ports if (port < 7400 or first <= port < first + 250) and not _is_left(port)]
     return all(port < 7400 for port in listened)
 
 
