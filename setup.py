@@ -44,9 +44,9 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'gyro_calibration = gyro_calibration.command_line:main',
-            'driver_node = gyro_calibration.driver_node:main',
-            'compensation_node = gyro_calibration.compensation_node:main',
+            'gyro_calibration = gyro_calibration.cli.main:main',
+            'driver_node = gyro_calibration.ros.driver_node:main',
+            'compensation_node = gyro_calibration.ros.compensation_node:main',
         ],
     },
     data_files=[

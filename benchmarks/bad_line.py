@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyro_calibration.line import Line, damaged
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line, damaged
 from gyro_calibration.log import DEGREE
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000

@@ -25,13 +25,13 @@ import numpy as np
 from drives import GYROS, STEP, Gyro, begun_any_time, of_motion, random_path
 
 from gyro_calibration.compensation import covariance, rate_sensitivity
+from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, Array, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import simulate_noise
-from gyro_calibration.protocols import Sample
-from gyro_calibration.sample_clock import SampleClock
 from gyro_calibration.self_calibration import record, self_calibrate
 from gyro_calibration.tracking import Settings, track
 

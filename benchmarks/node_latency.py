@@ -34,22 +34,22 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as implemen
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64
 
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, find
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, rate_temperature_polynomial
-from gyro_calibration.emulator import Emulator
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model_file import write_model
-from gyro_calibration.node import SENSOR_QUALITY
 from gyro_calibration.noise import Noise
-from gyro_calibration.protocols import Sample, find
+from gyro_calibration.ros.runner import SENSOR_QUALITY
 
 RATES = (100, 1000)  # Hz
 ROUNDS = 4
 BLOCK = 4.0  # s
 COMMANDS = {
     'relay': [sys.executable, __file__, 'relay'],
-    'node': [sys.executable, '-m', 'gyro_calibration.compensation_node'],
-    'driver': [sys.executable, '-m', 'gyro_calibration.driver_node'],
+    'node': [sys.executable, '-m', 'gyro_calibration.ros.compensation_node'],
+    'driver': [sys.executable, '-m', 'gyro_calibration.ros.driver_node'],
 }
 COMPARED = ('relay', 'node')
 

@@ -41,14 +41,14 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as implemen
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
+from gyro_calibration.driver.emulator import Emulator, emulate
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.emulator import Emulator, emulate
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import write_model
-from gyro_calibration.node import SENSOR_QUALITY
 from gyro_calibration.noise import Noise
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.ros.runner import SENSOR_QUALITY
 
 SOAKED, SOAKED_RATE = 'kvh_1750', 1000.0  # Hz
 SMALLEST = 0.5  # rad/s; of a numbered sample

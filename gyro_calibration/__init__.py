@@ -10,12 +10,10 @@ Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Ot
 command line), where the name says so: ``gyro_dps``.
 
 Reading order: `log`, `messages`, `storage`, `recording`, `stamps`, `effects`, `history`, `noise`, `model`, `settings_file`, `model_file`,
-`motion`, `simulation`, `compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`, `assumptions`, `log_compensation`,
-`likelihood`, `doubt`, `mishap`, `self_calibration`, `whole_turns`, `plan`, `check`; then, for the laboratory, `allan`, `dwells`,
-`scatter`, `calibration`, `selection`, `encoder`, `turn`, `diagnosis`, `reproduction`; then `protocols`, `serial_port`, `sample_clock`,
-`connection`, `recorder`, `line`, `emulator`; then, on the robot, `diagnostics`, `driver_report`, `driver_node`, `recorder_node`,
-`host_clock`, `live_heading`, `memory`, `wheels`, `compensation_settings`, `calibration_run`, `compensation_report`,
-`calibration_services`, `compensation_node`; then `verbs`, `command_line`.
+`motion`, `simulation`, `compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`, `assumptions`, `heading_estimator`,
+`log_compensation`, `likelihood`, `doubt`, `mishap`, `self_calibration`, `whole_turns`, `plan`; then, for the laboratory, `allan`,
+`dwells`, `scatter`, `calibration`, `selection`, `encoder`, `turn`, `diagnosis`, `reproduction`; then the folders `driver`, on the robot
+`ros`, and `cli`.
 
 """
 

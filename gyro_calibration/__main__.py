@@ -2,6 +2,6 @@
 
 import sys
 
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
 
 sys.exit(main())

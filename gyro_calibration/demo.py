@@ -29,17 +29,17 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from gyro_calibration.emulator import Emulator
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, find
 from gyro_calibration.heading import Threshold, filter_rates, integrate
 from gyro_calibration.log import DEGREE, Array, Log, write_log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import CALIBRATION, Motion, turns
-from gyro_calibration.node import SENSOR_QUALITY
 from gyro_calibration.noise import simulate_noise
 from gyro_calibration.picture import draw_headings
-from gyro_calibration.protocols import Sample, find
 from gyro_calibration.reproduction.hong_park import TABLE_1
+from gyro_calibration.ros.runner import SENSOR_QUALITY
 
 PROTOCOL = 'kvh_dsp3000'
 NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands

@@ -112,7 +112,7 @@ def data():
 @pytest.fixture
 def run(capsys):
     """Return a function that runs the program and gives its exit code, standard output and standard error."""
-    from gyro_calibration.command_line import main  # not before the environment is prepared
+    from gyro_calibration.cli.main import main  # not before the environment is prepared
 
     def run(*words):
         try:
@@ -198,7 +198,7 @@ class NodeProcess:
 
     def __init__(self, module, parameters, remappings, parameter_files):
         arguments = [f'{name}:={value}' for name, value in parameters.items()]
-        self._command = [sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args']
+        self._command = [sys.executable, '-m', f'gyro_calibration.ros.{module}', '--ros-args']
         self._command += [word for argument in arguments for word in ('-p', argument)]
         self._command += [word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
         self._command += [word for file in parameter_files for word in ('--params-file', str(file))]
@@ -336,7 +336,7 @@ class Ros:
 
 
 def _sensor_quality():
-    from gyro_calibration.node import SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QUALITY
     return SENSOR_QUALITY
 
 

@@ -26,8 +26,15 @@ from pathlib import Path
 import numpy as np
 
 from gyro_calibration.bias_table import BiasTable, carry, read_bias_table, write_bias_table
-from gyro_calibration.command_line import _parser
+from gyro_calibration.cli.main import _parser
+from gyro_calibration.cli.plan import read_limits, write_motion
+from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.compensation import compensate
+from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols.lines import LineSplitter
+from gyro_calibration.driver.protocols.listening import recognize
+from gyro_calibration.driver.protocols.protocol import Splitter
+from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.files import LARGEST
 from gyro_calibration.log import QUANTITIES, Log, LogError, read_log, read_log_blocks, write_log
@@ -36,14 +43,7 @@ from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model_file import ModelError, model_text, read_model, write_model
 from gyro_calibration.motion import CALIBRATION, MotionError, read_motion
 from gyro_calibration.noise import Noise
-from gyro_calibration.protocols import PROTOCOLS, Protocol, Sample, Settings
-from gyro_calibration.protocols.lines import LineSplitter
-from gyro_calibration.protocols.listening import recognize
-from gyro_calibration.protocols.protocol import Splitter
 from gyro_calibration.recording import Topics, read_recording
-from gyro_calibration.sample_clock import SampleClock
-from gyro_calibration.verbs.plan import read_limits, write_motion
-from gyro_calibration.verbs.verb import UsageError
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes that a decoder may hold back.
 MESSAGE, SECONDS, HELD = 1000, 5.0, 1024
@@ -438,8 +438,8 @@ def wild_value(data: bytes) -> object:
 
 
 def check_parameters(data: bytes) -> bool:
-    from gyro_calibration.compensation_settings import PARAMETERS
-    from gyro_calibration.driver_node import PARAMETERS as OF_DRIVER
+    from gyro_calibration.ros.compensation_settings import PARAMETERS
+    from gyro_calibration.ros.driver_node import PARAMETERS as OF_DRIVER
     table = [*PARAMETERS, *OF_DRIVER]
     parameter, value = table[(data[0] if data else 0) % len(table)], wild_value(data[1:])
     try:

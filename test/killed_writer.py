@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 from gyro_calibration.bias_table import Prior
-from gyro_calibration.memory import Memory
 from gyro_calibration.model import SelfCalibration
+from gyro_calibration.ros.state_store import Memory
 
 FILES = ('calibration.yaml', 'biases.yaml')
 BEGIN, STEP = 1.7e9, 86400.0  # s since 1970, and from one run of the robot to the next

@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
-from gyro_calibration.node import SENSOR_QUALITY
+from gyro_calibration.ros.runner import SENSOR_QUALITY
 
 
 def listener(number):

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from gyro_calibration.allan import PARTS, allan_deviation, even_record, fit_noise
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise

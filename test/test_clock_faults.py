@@ -15,8 +15,8 @@ import yaml
 from fake_gyro import BEGIN, start_with_gyro
 from test_compensation_node_live import BIAS, INTERVAL, MODEL, outputs, told
 
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.protocols import Sample, find
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, find
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray

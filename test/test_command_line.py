@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from gyro_calibration import verbs
-from gyro_calibration.command_line import main
+from gyro_calibration import cli as verbs
+from gyro_calibration.cli.main import main
+from gyro_calibration.driver.protocols import find
 from gyro_calibration.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION
-from gyro_calibration.protocols import find
 
 TURN = 2.0 * math.pi
 VERBS = [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS]

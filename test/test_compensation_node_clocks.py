@@ -18,7 +18,7 @@ try:
     from sensor_msgs.msg import Imu
     from std_srvs.srv import Trigger
 
-    from gyro_calibration.compensation_node import CompensationNode
+    from gyro_calibration.ros.compensation_node import CompensationNode
 except ImportError:
     pass  # the fixture `ros_domain` skips every test that needs them, and says why
 
@@ -56,7 +56,7 @@ def start(ros_domain, monkeypatch, tmp_path):
             robot = Robot(None)
             for place in ('host_clock', 'compensation_node'):
                 monkeypatch.setattr(f'gyro_calibration.{place}.steady', lambda: robot.steady)
-            monkeypatch.setattr('gyro_calibration.host_clock.time', SimpleNamespace(time=lambda: robot.steady + 1.7e9))
+            monkeypatch.setattr('gyro_calibration.driver.host_clock.time', SimpleNamespace(time=lambda: robot.steady + 1.7e9))
             robot.node = CompensationNode()
             closing.callback(robot.node.destroy_node)
             return robot

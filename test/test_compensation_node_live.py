@@ -106,7 +106,7 @@ def _parameters_act_and_are_checked(gyro, ros):
 
 
 def _latched():
-    from gyro_calibration.node import LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QUALITY
     return LATCHED_QUALITY
 
 

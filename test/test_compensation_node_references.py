@@ -74,7 +74,7 @@ def test_odometry_is_a_reference(start, ros, tmp_path):
 
 
 def _latched():
-    from gyro_calibration.node import LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QUALITY
     return LATCHED_QUALITY
 
 

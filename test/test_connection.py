@@ -11,10 +11,10 @@ import tty
 
 import pytest
 
-from gyro_calibration.connection import Connection, resolve
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.serial_port import PortError
+from gyro_calibration.driver.connection import Connection, resolve
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.serial_port import PortError
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
 

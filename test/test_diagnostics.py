@@ -22,8 +22,8 @@ import diagnostic_updater_stand_in
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import ListParameters
 
-from gyro_calibration import diagnostics
-from gyro_calibration.diagnostics import Diagnostics
+from gyro_calibration.ros import diagnostics
+from gyro_calibration.ros.diagnostics import Diagnostics
 
 STAND_IN = Path(diagnostic_updater_stand_in.__file__)
 PERIOD = 0.2  # s, for tests within one process; nodes report once a second

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
+from gyro_calibration.driver.protocols import PROTOCOLS
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.model_file import POLYNOMIAL, read_model
-from gyro_calibration.protocols import PROTOCOLS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst', *sorted((ROOT / 'docs').glob('*.md'))]
@@ -62,7 +62,7 @@ def test_every_document_has_no_line_beyond_140_columns_outside_tables():
 def parameters(request):
     """Return the table of parameters of a node; skip where ROS 2 is missing."""
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
-    from gyro_calibration import compensation_node, driver_node
+    from gyro_calibration.ros import compensation_node, driver_node
     return {'driver_node': driver_node, 'compensation_node': compensation_node}[request.param].PARAMETERS
 
 

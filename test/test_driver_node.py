@@ -25,10 +25,10 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Temperature
 
-from gyro_calibration.driver_node import PARAMETERS
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.line import Line
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.ros.driver_node import PARAMETERS
 
 CONFIGURATION = Path(__file__).parents[1] / 'config' / 'driver.yaml'
 FAST = {'reopen_interval': 0.1, 'silence_timeout': 10.0}  # a busy machine may keep the emulated gyro silent
@@ -279,7 +279,7 @@ def test_an_impossible_parameter_ends_it_with_one_sentence(start_node, parameter
 
 BROKEN = """
 import sys
-from gyro_calibration import driver_node
+from gyro_calibration.ros import driver_node
 def publish(self, samples, stamps, period):
     raise ZeroDivisionError('as if there were a fault in the program')
 driver_node._Output.publish = publish
@@ -441,7 +441,7 @@ def test_a_group_that_has_begun_is_published_when_the_gyro_falls_silent(robot, t
 
 TALKATIVE = """
 import sys
-from gyro_calibration import driver_node
+from gyro_calibration.ros import driver_node
 driver_node._Output._send = lambda self, stamp, output, *_: print(f'published {output:.3f}', file=sys.stderr)
 sys.exit(driver_node.main())
 """

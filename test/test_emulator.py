@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gyro_calibration.emulator import Emulator, emulate
-from gyro_calibration.line import Line
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.serial_port import PortError, SerialPort
+from gyro_calibration.driver.emulator import Emulator, emulate
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.driver.serial_port import PortError, SerialPort
 
 
 def samples(count=None, rate=100.0):

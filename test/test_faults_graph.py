@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.line import Line
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -93,7 +93,7 @@ class Heard:
 
 
 def _quality():
-    from gyro_calibration.node import SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QUALITY
     return SENSOR_QUALITY
 
 
@@ -198,7 +198,7 @@ def test_the_heading_goes_on_over_a_line_that_damages_frames_and_comes_in_bursts
 _STUCK = """
 import threading, time
 from rclpy.node import Node
-from gyro_calibration import node
+from gyro_calibration.ros import runner as node
 
 class Stuck(Node):
     def __init__(self):

@@ -7,10 +7,10 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.line import Line, damaged
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line, damaged
 from gyro_calibration.log import DEGREE
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray

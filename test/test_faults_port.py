@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.line import Line
-from gyro_calibration.protocols import Sample, Settings, find
-from gyro_calibration.serial_port import SerialPort
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.driver.serial_port import SerialPort
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray

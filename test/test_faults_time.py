@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from gyro_calibration.emulator import Emulator
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray

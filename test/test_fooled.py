@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
 from gyro_calibration.likelihood import UNLIKELY, Fit, fit_likelihood
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.mishap import pieces, unit_error

@@ -20,8 +20,8 @@ from pathlib import Path
 import pytest
 from fuzzed import SECONDS, TARGETS, WIRES
 
-from gyro_calibration import verbs
-from gyro_calibration.command_line import _parser
+from gyro_calibration import cli as verbs
+from gyro_calibration.cli.main import _parser
 
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.

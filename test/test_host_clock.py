@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gyro_calibration.host_clock import Stamps, both
+from gyro_calibration.driver.host_clock import Stamps, both
 
 INTERVAL = 0.01
 
@@ -79,6 +79,6 @@ def test_a_step_between_the_first_samples_leaves_times_that_go_on(step):
 @pytest.mark.parametrize('pause, read', [(0.001, (10.0, 1e9)), (0.3, None)])
 def test_clocks_are_not_compared_over_a_pause_between_them(monkeypatch, pause, read):
     now = iter((10.0, 10.0 + pause))
-    monkeypatch.setattr('gyro_calibration.host_clock.steady', lambda: next(now))
+    monkeypatch.setattr('gyro_calibration.driver.host_clock.steady', lambda: next(now))
     monkeypatch.setattr('time.time', lambda: 1e9)
     assert both() == read

@@ -13,11 +13,10 @@ PACKAGE = Path(gyro_calibration.__file__).parent
 FILES = sorted(PACKAGE.rglob('*.py'))
 #: As the package's docstring gives it.
 ORDER = re.findall(r'`(\w+)`', gyro_calibration.__doc__.partition('Reading order:')[2])
-CORE = ORDER[:ORDER.index('protocols')]
-MAY_USE_ROS = {'node.py', 'diagnostics.py', 'driver_report.py', 'driver_node.py', 'recorder_node.py', 'compensation_report.py',
-               'calibration_services.py', 'compensation_node.py', 'demo.py'}
+CORE = ORDER[:ORDER.index('driver')]
+MAY_USE_ROS = {'demo.py', *(path.name for path in (PACKAGE / 'ros').glob('*.py'))}
 ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w+_msgs|\w+_srvs')
-OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'datetime', 'threading', 'random', 'argparse'}
+OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'threading', 'random', 'argparse'}
 
 
 def imports(path):
@@ -36,7 +35,7 @@ def own(names):
 def files(module):
     """Return the files of a module: one, or those of its folder."""
     path = PACKAGE / f'{module}.py'
-    return [path] if path.exists() else sorted((PACKAGE / module).glob('*.py'))
+    return [path] if path.exists() else sorted((PACKAGE / module).rglob('*.py'))
 
 
 def calls(path):
@@ -47,20 +46,22 @@ def calls(path):
 
 @pytest.mark.parametrize('module', ORDER)
 def test_a_module_imports_only_what_is_read_before_it(module):
-    known = set(ORDER[:ORDER.index(module)]) | {'files', 'node', module}
-    known |= {'demo', 'picture'} if module == 'verbs' else set()
+    known = set(ORDER[:ORDER.index(module)]) | {'files', module}
+    known |= {'demo', 'picture'} if module == 'cli' else set()
     paths = files(module)
     assert paths and all(own(imports(path)) <= known for path in paths), [(path.name, own(imports(path)) - known) for path in paths]
 
 
-@pytest.mark.parametrize('folder', ['effects', 'allan', 'dwells', 'diagnosis'])
+@pytest.mark.parametrize('folder', ['effects', 'allan', 'dwells', 'diagnosis', 'driver', 'ros'])
 def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
     order = re.findall(r'`(\w+)`', importlib.import_module(f'gyro_calibration.{folder}').__doc__.partition('Reading order')[2])
     inside = f'gyro_calibration.{folder}.'
-    assert sorted(order) == sorted(path.stem for path in files(folder) if path.stem != '__init__')
+    assert sorted(order) == sorted(path.stem for path in (PACKAGE / folder).iterdir() if path.suffix == '.py' and path.stem != '__init__' or
+                                  path.is_dir() and path.stem != '__pycache__')
     for place, name in enumerate(order):
-        used = {each.removeprefix(inside).split('.')[0] for each in imports(PACKAGE / folder / f'{name}.py') if each.startswith(inside)}
-        assert used <= set(order[:place]), (name, used)
+        paths = [path for path in (PACKAGE / folder).rglob('*.py') if path.relative_to(PACKAGE / folder).parts[0] in (name, f'{name}.py')]
+        used = {each.removeprefix(inside).split('.')[0] for path in paths for each in imports(path) if each.startswith(inside)}
+        assert used <= {name, *order[:place]}, (name, used)
 
 
 def test_files_stands_on_nothing():
@@ -77,6 +78,7 @@ def test_only_the_nodes_know_ros(path):
 def test_the_core_only_computes(module):
     for path in files(module):
         roots = {name.split('.')[0] for name in imports(path)}
+        assert not re.search(r'\b(now|utcnow|today)\(\)', path.read_text()), path
         assert not roots & OUTSIDE_WORLD and not calls(path) & {'print', 'input', 'exec', 'eval'}, path
 
 

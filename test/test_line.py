@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from gyro_calibration.line import Line, damaged, delivered
+from gyro_calibration.driver.serial_faults import Line, damaged, delivered
 
 DATA = bytes(range(256)) * 400  # 102400 bytes, each unlike its neighbours
 

@@ -5,8 +5,8 @@ import random
 
 import pytest
 
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.protocols.listening import BAUDS, recognize
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.protocols.listening import BAUDS, recognize
 
 ALL = sorted(PROTOCOLS)
 SETTINGS = {name: Settings() for name in ALL} | {'fizoptika': Settings(sensitivity=1e-6)}

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
 from gyro_calibration.log import Log, read_log, read_log_blocks, write_log
 from gyro_calibration.motion import ROBOT
 
@@ -24,7 +24,7 @@ self_calibration: {scale_factor_error: 0.01, bias: 0.001, covariance: [[1.0e-6, 
 #: Runs the program and then says how much memory the process had at most, KiB.
 _MEASURED = """
 import resource, sys
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
 code = main(sys.argv[1:])
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 sys.exit(code)
@@ -62,7 +62,7 @@ def test_the_memory_does_not_grow_with_the_log(model, tmp_path):
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Let logs be read in blocks of 300 rows."""
-    monkeypatch.setattr('gyro_calibration.verbs.verb.read_log_blocks',
+    monkeypatch.setattr('gyro_calibration.cli.verb.read_log_blocks',
                         lambda *given, **more: read_log_blocks(*given, rows=300, **more))
 
 

@@ -5,8 +5,8 @@ import threading
 import pytest
 
 from gyro_calibration.bias_table import INTERVAL, Prior
-from gyro_calibration.memory import Memory
 from gyro_calibration.model import SelfCalibration
+from gyro_calibration.ros.state_store import Memory
 
 NOW = 1.7e9
 

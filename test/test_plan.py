@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import yaml
 
+from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.likelihood import fit_likelihood
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.motion import CALIBRATION, ROBOT, from_rates, read_motion, turns
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.plan import Ability, Forecast, _Family, able, best, plain, profile
 from gyro_calibration.self_calibration import self_calibrate
-from gyro_calibration.verbs.plan import write_motion
 
 XV3500 = Noise(2.5 * DEGREE / 60, 18 * DEGREE / 3600)
 WHITE = Noise(XV3500.angle_random_walk)
@@ -200,7 +200,7 @@ def test_the_verb_writes_a_profile_and_says_what_it_is_worth(run, limits, tmp_pa
 
 
 def test_the_verb_speaks_to_people(run, limits, tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.verbs.plan.LENGTHS', (12.0,))
+    monkeypatch.setattr('gyro_calibration.cli.plan.LENGTHS', (12.0,))
     write_motion(tmp_path / 'drive.csv', from_rates(np.array([0.0, 10.0]), np.array([0.5, 0.5])))
     code, text, _ = run('plan', '--limits', limits(), '--seconds', 10, '--motion', tmp_path / 'drive.csv', '--drive', 30)
     assert code == 0 and 'planned, 12 s:' in text and 'heading over 30 s' in text and text.count('mean heading error') == 4

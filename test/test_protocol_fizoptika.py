@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import Sample, Settings, find
 
 PROTOCOL = find('fizoptika')
 ONE_COUNT = Settings(sensitivity=1.0)

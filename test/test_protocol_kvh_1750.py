@@ -5,8 +5,8 @@ import struct
 
 import pytest
 
-from gyro_calibration.protocols import Sample, Settings, find
-from gyro_calibration.protocols.frames import FrameSplitter
+from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols.frames import FrameSplitter
 
 #: Interface control document 56-0298, section 5.2.1.
 GOLDEN = bytes.fromhex('FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC773D00284BFA34D8')

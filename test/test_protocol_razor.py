@@ -2,7 +2,7 @@
 
 import pytest
 
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import Sample, Settings, find
 
 PROTOCOL = find('razor')
 #: At rest and level the axis that points down has 256.

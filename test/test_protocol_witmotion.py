@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from gyro_calibration.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import Sample, Settings, find
 
 PROTOCOL = find('witmotion')
 GRAVITY = 9.80665

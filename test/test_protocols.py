@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gyro_calibration.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
 
 ALL = sorted(PROTOCOLS)
 DPS = math.radians(1.0)

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from recordings import rosbags
 
-from gyro_calibration import command_line
-from gyro_calibration.emulator import Emulator
+from gyro_calibration.cli import main as command_line
+from gyro_calibration.cli import record as record_verb
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
 from gyro_calibration.log import read_log
-from gyro_calibration.protocols import Sample, Settings, find
 from gyro_calibration.recording import Topics, read_recording
-from gyro_calibration.verbs import record as record_verb
 
 RATE = 200.0
 KINDS = ['a.csv', 'a.csv.gz', 'a.mcap']
@@ -62,7 +62,7 @@ class Recording:
 
     def __init__(self, folder, words, limit=None):
         forks = multiprocessing.get_context('forkserver')
-        forks.set_forkserver_preload(['gyro_calibration.command_line', 'gyro_calibration.recorder_node', __name__])
+        forks.set_forkserver_preload(['gyro_calibration.cli.main', 'gyro_calibration.ros.recorder_node', __name__])
         self._files = [Path(tempfile.mkstemp(dir=folder)[1]) for _ in range(2)]
         self.process = forks.Process(target=_record, args=(list(map(str, words)), *self._files, dict(os.environ), limit))
         self.process.start()
@@ -421,7 +421,7 @@ def test_publishers_that_come_late_or_with_another_quality_are_heard(ros, record
 
 
 def ros_quality():
-    from gyro_calibration.node import SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QUALITY
     return SENSOR_QUALITY
 
 
@@ -479,7 +479,7 @@ def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_
     import rclpy
     from rclpy.clock import ClockType
 
-    from gyro_calibration.recorder_node import RecorderNode
+    from gyro_calibration.ros.recorder_node import RecorderNode
     context = rclpy.Context()
     rclpy.init(args=[], context=context)
     node = RecorderNode([], False, print, context)
@@ -508,6 +508,6 @@ def test_a_driver_is_recorded_from_its_topics(start_node, ros, record, wait_unti
 
 
 def test_without_ros_the_way_out_is_said(run, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'gyro_calibration.recorder_node', None)
+    monkeypatch.setitem(sys.modules, 'gyro_calibration.ros.recorder_node', None)
     code, _, error = run('record', '--out', tmp_path / 'a.csv')
     assert code == 2 and 'topics need ROS 2' in error and 'record from --port' in error

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from recordings import BEGIN, Messages, rosbags
 
+from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.driver.recorder import CsvRecorder, DiskFull, McapRecorder, MessageLog, WholePieces, about
 from gyro_calibration.log import LogError, read_log
 from gyro_calibration.messages import IMU, TEMPERATURE
-from gyro_calibration.protocols import Sample
-from gyro_calibration.recorder import CsvRecorder, DiskFull, McapRecorder, MessageLog, WholePieces, about
 from gyro_calibration.recording import Topics, read_recording
 from gyro_calibration.storage import Message
 

@@ -5,17 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from gyro_calibration.emulator import Emulator
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import Sample, Settings, find
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.protocols import Sample, Settings, find
 
 try:
     from diagnostic_msgs.msg import DiagnosticStatus
     from sensor_msgs.msg import Imu
     from std_srvs.srv import Trigger
 
-    from gyro_calibration.node import LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QUALITY
 except ImportError:
     pass  # the fixture `ros` skips, and says why
 

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyro_calibration.command_line import main
+from gyro_calibration.cli.main import main
+from gyro_calibration.cli.reproduce import page
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.reproduction import SOURCES, bot_thoughts, hong_park
 from gyro_calibration.reproduction import ojeda_chung_borenstein as ojeda
 from gyro_calibration.reproduction.finding import Comparison
-from gyro_calibration.verbs.reproduce import page
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'gyro_calibration/reproduction').glob('*.py'))
@@ -94,7 +94,7 @@ def test_the_page_holds_what_the_program_prints(source):
 @each_source
 def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys, monkeypatch):
     few = {source: lambda generator, progress: SOURCES[source](generator, 2, progress)}
-    monkeypatch.setattr('gyro_calibration.verbs.reproduce.SOURCES', few)
+    monkeypatch.setattr('gyro_calibration.cli.reproduce.SOURCES', few)
     answers = []
     for seed in (1, 1, 2):
         assert main(['reproduce', source, '--seed', str(seed), '--json']) == 0

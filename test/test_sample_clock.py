@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gyro_calibration.protocols import Sample
-from gyro_calibration.sample_clock import ClockDifference, LowerLine, SampleClock
+from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.driver.timestamps import ClockDifference, LowerLine, SampleClock
 
 BURST = 0.016  # s; latency_timer of an FTDI adapter
 BUFFER = 113  # samples of 36 bytes that a port holds at most

@@ -75,7 +75,7 @@ def test_what_is_imported_late_is_named_in_the_code():
 @pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'os/path', 'a.b/msg/Imu', '../msg/Imu', 'sensor_msgs/srv/SetCameraInfo', ''])
 def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
-    from gyro_calibration.recorder_node import load
+    from gyro_calibration.ros.recorder_node import load
     with pytest.raises(ImportError, match='no kind of messages'):
         load(kind)
 

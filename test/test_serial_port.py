@@ -7,7 +7,7 @@ import tty
 
 import pytest
 
-from gyro_calibration.serial_port import PortError, SerialPort
+from gyro_calibration.driver.serial_port import PortError, SerialPort
 
 
 @pytest.fixture

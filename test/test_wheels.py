@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from gyro_calibration.wheels import COASTING, COMMAND, FRESH, ODOMETRY, Standing, Wheels
+from gyro_calibration.ros.wheels import COASTING, COMMAND, FRESH, ODOMETRY, Standing, Wheels
 
 
 def twist(ahead=0.0, turning=0.0):

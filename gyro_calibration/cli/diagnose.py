@@ -1,0 +1,89 @@
+"""The verb diagnose: what a simulation gets wrong, why, the extended model, and what it wins."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from gyro_calibration.cli.verb import Answer, UsageError, add_log, origin_of, output_of, read, verb, whole
+from gyro_calibration.diagnosis.extension import calibrated
+from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.diagnosis.words import lines, offered
+from gyro_calibration.files import write_atomically
+from gyro_calibration.log import Log
+from gyro_calibration.model import GyroModel
+from gyro_calibration.model_file import model_text, read_model
+
+#: Steps of a diagnosis, for the bar that shows how far it is.
+_STEPS = 6
+
+
+def add(verbs: Any) -> argparse.ArgumentParser:
+    parser = verb(verbs, 'diagnose', _diagnose, 'say what a simulation gets wrong, name the cause, extend the model, measure the gain',
+                  'drive.csv --model gyro.yaml --out diagnosis')
+    add_log(parser, nargs='+')
+    parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an ideal gyro with the bias and scale factor '
+                        'error that fit the logs best')
+    parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and model.yaml, the extended model')
+    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='of what is drawn to learn what chance shows; default: 0')
+    return parser
+
+
+def _diagnose(given: argparse.Namespace) -> Answer:
+    logs = [_read(given, path) for path in given.log]
+    model = None if given.model is None else read_model(given.model)
+    found = _found(given, logs, model)
+    written = _written(given.out, found) if given.out else []
+    return Answer('\n'.join([*lines(found), *written]), found.figures())
+
+
+def _read(given: argparse.Namespace, path: str) -> Log:
+    one = argparse.Namespace(**{**vars(given), 'log': path})
+    log = read(one)
+    output_of(one, log)
+    return log
+
+
+def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | None) -> Diagnosis:
+    """Diagnose logs in time, or a rate table, and say what the extended model comes from."""
+    generator = np.random.default_rng(given.seed)
+    if any(log.time is None for log in logs):
+        if len(logs) > 1:
+            raise UsageError(f'{len(logs)} logs, and one without time_s; give rate tables one by one, or say with --rate how samples came')
+        found = diagnose_table(logs[0], None if model is None else calibrated(model))
+    else:
+        with tqdm(total=_STEPS, desc='diagnose', delay=2.0, leave=False, disable=None) as bar:
+            def say(step: str) -> None:
+                bar.set_description(step)
+                bar.update()
+            found = diagnose(logs, generator, model, names=given.log, say=say)
+    return _with_origin(replace(found, logs=tuple(given.log)), model)
+
+
+def _with_origin(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis whose model says what it comes from; one that was given and is not extended stays as it is."""
+    if model is not None and not offered(found):
+        return replace(found, before=model, model=model)
+    return replace(found, model=replace(found.model, origin={**found.model.origin, **origin_of(found.logs)}))
+
+
+def _written(folder: str, found: Diagnosis) -> list[str]:
+    """Write all files; what they hold is made before the first of them is touched."""
+    content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n', 'report.html': report(found),
+               'model.yaml': model_text(found.model)}
+    for name in content:
+        if (Path(folder) / name).is_dir():
+            raise IsADirectoryError(f'{Path(folder) / name} is a folder, where a file is to be written; move it away')
+    for name, text in content.items():
+        write_atomically(Path(folder) / name, text.encode())
+    return [f'Written to {folder}: {", ".join(content)}.']

@@ -1,0 +1,70 @@
+"""The program ``gyro_calibration``: it runs one verb, prints its answer and says by its exit code how it went."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+
+# The matrices of a fit are small; threads that wait for each other make it ten times slower on a busy machine. NumPy reads it once.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+# ruff: noqa: E402
+import numpy as np
+
+from gyro_calibration import __version__
+from gyro_calibration.cli import VERBS
+from gyro_calibration.cli.verb import UsageError
+from gyro_calibration.log import DataRefused, LogError
+from gyro_calibration.model_file import ModelError
+from gyro_calibration.motion import MotionError
+
+DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb, print its answer and return 0 (done), 1 (the data allow no answer) or 2 (wrong use)."""
+    given = _parser().parse_args(arguments)
+    try:
+        _refuse_empty(given)
+        answer = given.verb(given)
+    except DataRefused as error:
+        print(f'gyro_calibration: {error}', file=sys.stderr)
+        return NO_ANSWER
+    except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
+        print(f'gyro_calibration: the numbers are too large or too far apart to be computed with ({error}); see whether columns and units '
+              'are right', file=sys.stderr)
+        return NO_ANSWER
+    except (LogError, ModelError, MotionError, UsageError, OSError) as error:
+        print(f'gyro_calibration: {error}', file=sys.stderr)
+        return WRONG_USE
+    if answer is not None:
+        _show(json.dumps(answer.data, allow_nan=False) if given.json else answer.text)
+    return DONE
+
+
+def _refuse_empty(given: argparse.Namespace) -> None:
+    """Refuse an option without a value, as a variable of the shell leaves it that is not set; a file without a name is never written."""
+    for name, value in vars(given).items():
+        if value == '' or isinstance(value, list) and '' in value:
+            raise UsageError(f'{name.replace("_", "-")} is empty; give it a value, or leave it out')
+
+
+def _show(text: str) -> None:
+    """Print; a reader that has gone, as `head` does, is no error, nor is the name of a file that is no text."""
+    encoding = sys.stdout.encoding or 'utf-8'
+    try:
+        print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='gyro_calibration', description='Calibrate a gyro, so that a robot knows its heading.')
+    parser.add_argument('--version', action='version', version=__version__)
+    verbs = parser.add_subparsers(required=True, metavar='VERB')
+    for verb in VERBS:
+        verb.add(verbs).add_argument('--json', action='store_true', help='print one JSON object and nothing else')
+    return parser

@@ -1,0 +1,339 @@
+"""The verb record: what comes of a gyro, from its port or from topics, into a log file or an MCAP recording."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from tqdm import tqdm
+
+from gyro_calibration.cli.verb import Answer, UsageError, positive, verb
+from gyro_calibration.driver.connection import AUTO, Connection, State
+from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
+from gyro_calibration.driver.protocols.csv_lines import CSV
+from gyro_calibration.driver.recorder import KINDS, PIECE, CsvRecorder, DiskFull, McapRecorder, MessageLog, Notes, about
+from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.messages import BILLION
+from gyro_calibration.storage import Message
+
+Recorder = CsvRecorder | McapRecorder
+
+_TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
+_INCREMENTS = {'always': True, 'never': False, 'default': None}
+_LARGEST_BAUD = 4_000_000  # bit/s; no line of Linux is faster
+_PATIENCE = 5.0  # s; without a message, until it is said what is waited for
+
+
+def add(verbs: Any) -> argparse.ArgumentParser:
+    parser = verb(verbs, 'record', _record, 'record a gyro, from its port or from topics, until Ctrl-C',
+                   '--port /dev/ttyUSB0 --out drive.csv')
+    parser.add_argument('--out', required=True, metavar='FILE', help=f'a new file, {", ".join(KINDS)}')
+    parser.add_argument('--seconds', type=positive, metavar='N', help='end after so many seconds; default: when interrupted')
+    topics = parser.add_argument_group('from topics, with ROS 2')
+    topics.add_argument('--topic', metavar='TOPIC', help=f'of the gyro; default: {_TOPICS["gyro"]}')
+    topics.add_argument('--temperature-topic', metavar='TOPIC', help=f'default: {_TOPICS["temperature"]}')
+    topics.add_argument('--reference-topic', metavar='TOPIC', action='append', default=[],
+                        help='of a reference; in .mcap several may be given')
+    topics.add_argument('--all', action='store_true', help='every topic that there is, into .mcap')
+    port = parser.add_argument_group('from the port, without ROS 2')
+    port.add_argument('--port', metavar='PORT', help='of the gyro, or a pattern such as "/dev/serial/by-id/*A9003XYZ*"')
+    port.add_argument('--protocol', metavar='NAME', help=f'{", ".join(PROTOCOLS)}; default: {AUTO}, found by listening')
+    port.add_argument('--baud', type=int, default=0, metavar='N', help='bit/s; default: that of the protocol')
+    port.add_argument('--columns', metavar='NAME,...', help=f'of the protocol csv; default: {",".join(Settings().columns)}')
+    port.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count; default: that of the protocol')
+    port.add_argument('--axis', default='z', choices=['x', 'y', 'z'], help='of a gyro with three; default: z')
+    port.add_argument('--invert', action='store_true', default=None, help='the gyro counts clockwise turns positive')
+    port.add_argument('--increments', choices=list(_INCREMENTS), default='default',
+                      help='whether the gyro sends angles, not rates; default: as the protocol says')
+    port.add_argument('--sample-rate', type=positive, metavar='HZ', help='that the gyro is set to; default: that of the protocol')
+    return parser
+
+
+def _record(given: argparse.Namespace) -> Answer:
+    if not given.out.endswith(KINDS):
+        raise UsageError(f'{given.out}: a recording ends in {", ".join(KINDS[:-1])} or {KINDS[-1]}; name it so')
+    with _stopping(given.seconds) as stop:
+        session = (_PortSession if given.port else _TopicSession)(given, stop)
+        session.run()
+    return session.answer()
+
+
+@contextmanager
+def _stopping(seconds: float | None) -> Iterator[threading.Event]:
+    """
+    Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets.
+
+    A second signal changes nothing, for the file is being closed. Whoever has it run on without a terminal (nohup) ignores SIGHUP.
+
+    """
+    stop = threading.Event()
+    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    timer = threading.Timer(seconds, stop.set) if seconds else None
+    if timer is not None:
+        timer.daemon = True
+        timer.start()
+    try:
+        yield stop
+    finally:
+        if timer is not None:
+            timer.cancel()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _prints_on_standard_error() -> Iterator[None]:
+    """Let go to standard error what the middleware of ROS 2 prints, for standard output is for the answer alone."""
+    sys.stdout.flush()
+    before = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+
+
+class _Session:
+    """What both ways to record share: the file, its pieces, the progress, and what is said at the end."""
+
+    #: What is waited for, for the sentence that nothing came.
+    waited_for = ''
+
+    def __init__(self, given: argparse.Namespace, stop: threading.Event):
+        self._given, self._stop = given, stop
+        self._begin = self._flushed = time.monotonic()
+        self._full: DiskFull | None = None
+        self._recorder: Recorder = self._open()
+
+    @property
+    def samples(self) -> int:
+        """How many samples of the gyro came."""
+        raise NotImplementedError
+
+    @property
+    def lost(self) -> int:
+        """How many are known to be lost."""
+        raise NotImplementedError
+
+    def _open(self) -> Recorder:
+        raise NotImplementedError
+
+    def _take(self, tick: Callable[[], None]) -> None:
+        raise NotImplementedError
+
+    def _create(self, notes: Notes, expected: tuple[str, ...] = ()) -> Recorder:
+        try:
+            return McapRecorder(self._given.out, notes) if self._is_mcap() else CsvRecorder(self._given.out, notes, expected)
+        except FileExistsError:
+            raise UsageError(f'{self._given.out}: is there already, and no recording is ever written over; name a new file') from None
+
+    def _is_mcap(self) -> bool:
+        return bool(self._given.out.endswith('.mcap'))
+
+    def run(self) -> None:
+        """Record until it is to end, and close the file whatever happens."""
+        try:
+            with tqdm(desc=self._given.out, unit=' samples', leave=False, disable=None) as shown:
+                try:
+                    self._take(lambda: self._tick(shown))
+                finally:
+                    self._recorder.close()
+        except DiskFull as error:
+            self._full = error
+
+    def _tick(self, shown: Any) -> None:
+        if time.monotonic() - self._flushed < PIECE:
+            return
+        self._recorder.flush()
+        self._flushed = time.monotonic()
+        shown.set_postfix_str(f'{self.lost} lost', refresh=False)
+        shown.update(self.samples - shown.n)
+
+    def answer(self) -> Answer:
+        """Say what was recorded."""
+        seconds = time.monotonic() - self._begin
+        if self._full is not None:
+            written = f'{self._recorder.size} bytes stay in {self._given.out}, which can be read up to the last {PIECE:g} s'
+            written = written if self._recorder.size else 'nothing was written'
+            raise DataRefused(f'{self._full.strerror}; {written}: make room, then record again')
+        if not self.samples:
+            raise DataRefused(f'nothing came within {seconds:.1f} s{self._why()}; no file was written: {self.waited_for}')
+        data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost, 'seconds': seconds, **self._details()}
+        lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, written to {self._given.out}.', *self._remarks()]
+        return Answer('\n'.join(lines), {**data, 'remarks': self._remarks()})
+
+    def _why(self) -> str:
+        return ''
+
+    def _details(self) -> dict[str, Any]:
+        return {'bytes': self._recorder.size}
+
+    def _remarks(self) -> list[str]:
+        missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
+        way_out = '.mcap keeps temperature, acceleration and reference whenever they come'
+        return [f'{", ".join(missed)} came too late for a column of a log; {way_out}.'] if missed else []
+
+
+class _PortSession(_Session):
+    """Records what comes on a port."""
+
+    waited_for = 'check the port, the power and the wires of the gyro'
+
+    def __init__(self, given: argparse.Namespace, stop: threading.Event):
+        if given.topic or given.temperature_topic or given.reference_topic or given.all:
+            raise UsageError('--port and topics were both given; record one of them, or the topics of a driver on that port')
+        if not 0 <= given.baud <= _LARGEST_BAUD:
+            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_LARGEST_BAUD}; leave it out for that of the protocol')
+        columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
+        sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
+        try:
+            self._settings = Settings(sensitivity=sensitivity, invert=given.invert, axis=given.axis, columns=columns,
+                                      increments=_INCREMENTS[given.increments], sample_rate=given.sample_rate)
+            self._connection = Connection(given.port, given.protocol or AUTO, given.baud, self._settings, on_change=self._tell)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        self._told = ''
+        # Fixed at the beginning: the stamps must not jump where somebody sets the clock.
+        self._since = time.time_ns() - time.monotonic_ns()
+        super().__init__(given, stop)
+
+    @property
+    def samples(self) -> int:
+        return self._connection.counts().samples
+
+    @property
+    def lost(self) -> int:
+        return self._connection.counts().lost_samples
+
+    def _open(self) -> Recorder:
+        # Nobody knows before it comes whether a gyro says its temperature, and how often.
+        return self._create(self._about, ('temperature_degc',))
+
+    def _about(self) -> dict[str, str]:
+        found, protocol = self._connection, self._connection.protocol
+        return about(port=self._given.port, device=found.path, protocol=protocol.name if protocol else '', baud=found.baud,
+                     axis=self._settings.axis, **(_scale(protocol, self._settings) if protocol else {}))
+
+    def _take(self, tick: Callable[[], None]) -> None:
+        for chunk in self._connection.chunks(self._stop):
+            for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
+                self._recorder.add_sample(round(stamp * BILLION) + self._since, sample)
+            tick()
+
+    def _tell(self, state: State) -> None:
+        if state.name == 'failed':
+            self._recorder.flush()  # there is no piece in a silence
+        said = state.problem or state.name
+        if state.name == 'opening' or said == self._told or state.name == 'listening' and self._told:
+            return  # it listens again at each attempt
+        found, self._told = self._connection, said
+        name = f'samples of {found.protocol.name} come at {found.baud} bit/s' if found.protocol else ''
+        print(f'gyro_calibration: {name if state.name == "reading" else said}', file=sys.stderr)
+
+    def _why(self) -> str:
+        return f' ({self._connection.last_error})' if self._connection.last_error else ''
+
+    def _details(self) -> dict[str, Any]:
+        found = self._connection
+        protocol = found.protocol.name if found.protocol else None
+        return {**super()._details(), 'protocol': protocol, 'baud': found.baud, 'openings': found.openings}
+
+    def _remarks(self) -> list[str]:
+        counts, protocol, clock = vars(self._connection.counts()), self._connection.protocol, self._connection.clock
+        warning = protocol.wrong_rate(self._settings, clock.period) if protocol and clock and clock.is_settled else ''
+        told = {name.replace('_', ' '): count for name, count in counts.items() if name not in ('samples', 'lost_samples') and count}
+        return [*(f'{count} {name}.' for name, count in told.items()), *([f'{warning}.'] if warning else []), *super()._remarks()]
+
+
+def _scale(protocol: Protocol, settings: Settings) -> dict[str, str]:
+    """Return what one unit of the device was taken for; columns in rad/s or deg/s have their unit in their names."""
+    factor = protocol.factor(settings)
+    angles = f', an angle at {protocol.nominal_rate(settings):g} Hz' if protocol.sends_angles(settings) else ''
+    sensitivity = '' if protocol is CSV and settings.sensitivity is None else f'{abs(factor)!r} rad/s a unit of the device{angles}'
+    return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
+
+
+class _TopicSession(_Session):
+    """Records what comes on topics."""
+
+    waited_for = 'see whether a driver publishes, and whether ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE agree'
+
+    def __init__(self, given: argparse.Namespace, stop: threading.Event):
+        wire = given.protocol, given.columns, given.sensitivity, given.invert, given.baud, given.sample_rate
+        if any(wire) or given.increments != 'default':
+            raise UsageError('options of a port were given without --port; give it, or leave them out')
+        if not given.out.endswith('.mcap') and (given.all or len(given.reference_topic) > 1):
+            raise UsageError(f'{given.out}: a log has one gyro and one reference; record several topics into .mcap')
+        try:
+            from gyro_calibration.ros.recorder_node import take_messages
+        except ImportError as error:
+            raise UsageError(f'topics need ROS 2, which is not there ({error}); source it, or record from --port') from None
+        self._take_messages = take_messages
+        roles = {'gyro': given.topic or _TOPICS['gyro'], 'temperature': given.temperature_topic or _TOPICS['temperature']}
+        if given.reference_topic:
+            roles['reference'] = given.reference_topic[0]
+        self._roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
+        if len(set(self._roles.values())) < len(roles):
+            raise UsageError(f'one topic was named twice, of {", ".join(self._roles.values())}; name one each for {", ".join(roles)}')
+        self._topics = [*self._roles.values(), *given.reference_topic[1:]]
+        self._heard, self._waiting, self._missing, self._known = 0, True, list(self._topics), list[str]()
+        self._unknown: dict[str, str] = {}
+        super().__init__(given, stop)
+        self._log = MessageLog(self._recorder if isinstance(self._recorder, CsvRecorder) else None, self._roles)
+
+    @property
+    def samples(self) -> int:
+        return self._log.samples or (self._heard if self._is_mcap() else 0)
+
+    @property
+    def lost(self) -> int:
+        return self._log.lost
+
+    def _open(self) -> Recorder:
+        # Who names a temperature or a reference wants it in the file; the usual temperature may be missing.
+        return self._create(lambda: about(topics='everything' if self._given.all else ', '.join(self._topics)),
+                            ('temperature_degc', *(['reference'] if 'reference' in self._roles else [])))
+
+    def _take(self, tick: Callable[[], None]) -> None:
+        with _prints_on_standard_error():
+            self._take_messages(self._topics, self._given.all, self._add, lambda node: self._watch(node, tick), self._stop)
+
+    def _add(self, message: Message, definition: str) -> None:
+        self._heard += 1
+        self._log.add(message)
+        if isinstance(self._recorder, McapRecorder):
+            self._recorder.add_message(message, definition)
+
+    def _watch(self, node: Any, tick: Callable[[], None]) -> None:
+        tick()
+        self._unknown = node.unknown
+        if self._waiting and time.monotonic() - self._begin > _PATIENCE:
+            self._waiting = False
+            self._missing, self._known = node.missing, node.known()
+            if self._missing:
+                print(f'gyro_calibration: nobody publishes {", ".join(self._missing)} so far; there are {", ".join(self._known) or "none"}',
+                      file=sys.stderr)
+
+    def _details(self) -> dict[str, Any]:
+        return {**super()._details(), 'messages': self._heard}
+
+    def _remarks(self) -> list[str]:
+        log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.' for topic, reason in self._unknown.items()]
+        left_out = '' if self._is_mcap() else ', and were left out'
+        remarks += [f'{wrong}; it was recorded as it is.' for wrong in log.of_another_kind.values()]
+        if log.damaged:
+            remarks.append(f'{log.damaged} messages could not be read.')
+        if log.left_out:
+            remarks.append(f'{log.left_out} samples had the stamp of another or an earlier one{left_out}.')
+        if log.clock_steps:
+            remarks.append(f'The clock of the stamps was set {log.clock_steps} times; the log goes on by the time of receiving.')
+        return [*remarks, *super()._remarks()]

@@ -1,0 +1,38 @@
+"""
+Wire formats of serial gyros: bytes to samples and back, and which format it is (`listening`). No port, no ROS, no clock.
+
+>>> decoder = find('kvh_dsp3000').decoder()
+>>> decoder.feed(b'       0.015733   1\\r\\n')
+[Sample(output=-0.00027459265121626786, ...)]
+
+"""
+
+from __future__ import annotations
+
+from gyro_calibration.driver.protocols.csv_lines import CSV
+from gyro_calibration.driver.protocols.fizoptika import FIZOPTIKA
+from gyro_calibration.driver.protocols.kvh_1750 import KVH_1750
+from gyro_calibration.driver.protocols.kvh_dsp3000 import KVH_DSP3000
+from gyro_calibration.driver.protocols.kvh_ecore import KVH_ECORE
+from gyro_calibration.driver.protocols.minimu9 import MINIMU9
+from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols.razor import RAZOR
+from gyro_calibration.driver.protocols.witmotion import WITMOTION
+
+PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
+
+__all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
+
+
+def find(name: str) -> Protocol:
+    """
+    Return a protocol by its name.
+
+    Raises
+    ------
+    ValueError : there is none of that name
+
+    """
+    if name in PROTOCOLS:
+        return PROTOCOLS[name]
+    raise ValueError(f'protocol {name!r} is not known: choose one of {", ".join(PROTOCOLS)}')

@@ -1,0 +1,99 @@
+"""
+Fizoptika fibre-optic gyros with one axis: binary frames of 8 bytes, ``DD low high middle id data sum sum``.
+
+The rate is a signed number of 24 bits in counts, whose meaning differs from unit to unit (27880 counts per deg/s in one). The sum is that
+of the second to the sixth byte, most significant byte first. Each frame holds half of a value about the unit itself: the even numbers
+``id`` have the high byte, the odd ones after them the low byte of a signed number of 16 bits. They are joined only if the two frames
+follow each other with nothing between.
+
+Source: the public decoder `riptide_gyro` of Ohio State University, which names the numbers from 8 to 15 as reserved; its sign extension
+is off by one count and was not taken over. No manual was seen: the sample rate, which is not named anywhere, and the sense of rotation are
+not verified.
+
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from gyro_calibration.driver.protocols.frames import FrameSplitter
+from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, check_counts
+
+_HEADER = 0xDD
+_VALUES = {  # of the number of the high byte: name, unit of one count, offset, and what an emulated unit says where nothing is given
+    0: ('temperature', 250.0 / 0x8000, -50.0, 25.0),
+    2: ('supply_v', 10.0 / 0x8000, 0.0, 5.0),
+    4: ('source_current_a', 0.25 / 0x8000, 0.0, 0.1),
+    6: ('diagnostic_v', 2.5 / 0x8000, 0.0, 1.0),
+}
+
+
+def _checksum(frame: bytes) -> bytes:
+    return sum(frame[1:6]).to_bytes(2, 'big')
+
+
+def _is_intact(frame: bytes) -> bool:
+    return _checksum(frame) == frame[6:]
+
+
+class _Parser:
+    """Joins the halves of the values that are spread over two frames."""
+
+    def __init__(self, settings: Settings):
+        self._number: int | None = None
+        self._high = 0
+
+    def __call__(self, frame: bytes) -> Reading:
+        _, low, high, middle, number, byte, *_ = frame
+        joined = self._joined(number, byte)
+        self._number, self._high = number, byte
+        count = int.from_bytes((high, middle, low), 'big', signed=True)
+        if joined is None:
+            return Reading(count)
+        name, value = joined
+        return Reading(count, temperature=value) if name == 'temperature' else Reading(count, health={name: value})
+
+    def _joined(self, number: int, byte: int) -> tuple[str, float] | None:
+        if self._number not in _VALUES or number != self._number + 1:
+            return None
+        name, unit, offset, _ = _VALUES[self._number]
+        return name, int.from_bytes((self._high, byte), 'big', signed=True) * unit + offset
+
+
+class _Writer:
+    """Sends each value in two frames: both halves are of the same instant."""
+
+    def __init__(self, settings: Settings):
+        self._latched: dict[int, bytes] = {}
+
+    def __call__(self, reading: Written) -> bytes:
+        number = reading.sequence % 8
+        even = number & ~1
+        if number == even or even not in self._latched:
+            self._latched = {even: _half_bytes(even, reading)}
+        count = min(max(round(reading.value), -0x800000), 0x7FFFFF)
+        high, middle, low = count.to_bytes(3, 'big', signed=True)
+        frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])
+        return frame + _checksum(frame)
+
+
+def _half_bytes(number: int, reading: Written) -> bytes:
+    name, unit, offset, usual = _VALUES[number]
+    value = reading.temperature if name == 'temperature' else reading.health.get(name)
+    count = round(((usual if value is None else value) - offset) / unit)
+    return min(max(count, -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
+
+
+FIZOPTIKA = Protocol(
+    name='fizoptika',
+    description='Fizoptika fibre-optic gyros, binary with raw counts',
+    baud=921600,
+    rate=1000.0,
+    sensitivity=1.0,
+    splitter=partial(FrameSplitter, rb'\xdd.{7}', 8, _is_intact),
+    parser=_Parser,
+    writer=_Writer,
+    largest_count=0x800000,
+    good={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15), 'diagnostic_v': (0.95, 1.05)},
+    check=check_counts,
+)

@@ -1,0 +1,46 @@
+"""
+KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1`` with the rate in deg/s and 1 for valid.
+
+The rate is positive clockwise, seen from above. The unit's clock is 2 to 3 % off from unit to unit, so its samples must never be
+integrated with the nominal interval. The letter R, sent three times, asks for rates instead of increments or integrated angles.
+
+Source: KVH DSP-3000 technical manual, 54-0215 revision C, section 2, for the unit with the asynchronous interface of 100 Hz (part
+02-1222-01); that of 1000 Hz (02-1222-07) sends binary and is not read here. The linearity is given up to 375 deg/s, and beyond 500 deg/s
+the output is unreliable, whatever the valid bit says (table 2).
+
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import partial
+
+from gyro_calibration.driver.protocols.lines import LineSplitter
+from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, stateless
+
+_LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
+
+
+def _parse(line: bytes, settings: Settings) -> Reading | None:
+    match = _LINE.fullmatch(line)
+    return match and Reading(float(match[1]), valid=match[2] == b'1')
+
+
+def _write(reading: Written, settings: Settings) -> bytes:
+    return b'%15.6f   %d\r\n' % (reading.value, reading.valid)
+
+
+KVH_DSP3000 = Protocol(
+    name='kvh_dsp3000',
+    description='KVH DSP-3000 fibre-optic gyro, text with deg/s',
+    baud=38400,
+    rate=100.0,
+    sensitivity=math.radians(1.0),
+    splitter=partial(LineSplitter, 64, (b' ',)),
+    parser=stateless(_parse),
+    writer=stateless(_write),
+    invert=True,
+    full_scale=math.radians(500.0),
+    startup=b'RRR',
+)

@@ -1,0 +1,53 @@
+"""
+KVH E-Core 2000 family, a fibre-optic gyro with one axis: binary frames of 8 bytes, bit 7 set in the first one only.
+
+The 56 low bits, most significant first, make seven bytes m[0] to m[6]. They add up to 0 modulo 256, and m[5], m[6] are the rate, a
+signed 16-bit number; what m[1] to m[4] hold is not known. One count is 0.00183 deg/s in a unit for 60 deg/s and half of that in a unit
+for 30 deg/s. The RD2100 is assumed to speak alike. Baud and sense of rotation were inferred, not read in a manual.
+
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+from gyro_calibration.driver.protocols.frames import FrameSplitter
+from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, stateless
+
+_COUNT = math.radians(0.00183)
+
+
+def _content(frame: bytes) -> bytes:
+    bits = 0
+    for byte in frame:
+        bits = bits << 7 | byte & 0x7F
+    return bits.to_bytes(7, 'big')
+
+
+def _is_intact(frame: bytes) -> bool:
+    return sum(_content(frame)) % 256 == 0
+
+
+def _parse(frame: bytes, settings: Settings) -> Reading:
+    return Reading(int.from_bytes(_content(frame)[5:], 'big', signed=True))
+
+
+def _write(reading: Written, settings: Settings) -> bytes:
+    count = min(max(round(reading.value), -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
+    bits = int.from_bytes(bytes([-sum(count) % 256, 0, 0, 0, 0]) + count, 'big')
+    frame = bytes(bits >> shift & 0x7F for shift in range(49, -1, -7))
+    return bytes([frame[0] | 0x80]) + frame[1:]
+
+
+KVH_ECORE = Protocol(
+    name='kvh_ecore',
+    description='KVH E-Core 2000 fibre-optic gyro (also RD2100, not verified), binary',
+    baud=9600,
+    rate=10.0,
+    sensitivity=_COUNT,
+    splitter=partial(FrameSplitter, rb'[\x80-\xff][\x00-\x7f]{7}', 8, _is_intact),
+    parser=stateless(_parse),
+    writer=stateless(_write),
+    largest_count=0x8000,
+)

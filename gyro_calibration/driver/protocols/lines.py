@@ -1,0 +1,74 @@
+"""Find lines of text in a stream of bytes."""
+
+from __future__ import annotations
+
+import re
+
+from gyro_calibration.driver.protocols.protocol import Frame
+
+_LINE_END = re.compile(rb'[\r\n]')
+
+
+class LineSplitter:
+    """
+    Gives whole lines without their ends, and no empty ones.
+
+    A port is opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``: so the first line is thrown away, unless it begins
+    as only whole lines do.
+
+    Parameters
+    ----------
+    longest : int
+        Bytes; a longer line is thrown away, so that an endless one does not fill the memory.
+    beginnings : tuple of bytes
+        With what only a whole line begins.
+
+    """
+
+    def __init__(self, longest: int, beginnings: tuple[bytes, ...] = ()):
+        self._longest = longest
+        self._beginnings = beginnings
+        self._tail = b''
+        self._begun = False
+        self._too_long = False
+        self._garbage = 0
+        self.discarded_bytes = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the lines that these bytes complete."""
+        first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
+        *lines, tail = self._tail + first, *rest
+        whole = [self._framed(line) for line in lines if self._is_whole(line)]
+        self._hold(tail)
+        return whole
+
+    def reset(self) -> None:
+        """Forget the line that has begun."""
+        self._discard(len(self._tail))
+        self._tail, self._garbage, self._begun, self._too_long = b'', 0, False, False
+
+    def _framed(self, line: bytes) -> Frame:
+        garbage, self._garbage = self._garbage, 0
+        return Frame(line, garbage)
+
+    def _is_whole(self, line: bytes) -> bool:
+        good = not self._too_long and len(line) <= self._longest and (self._begun or line.startswith(self._beginnings))
+        self._begun, self._too_long = True, False
+        if not good:
+            self._discard(len(line))
+        return good and bool(line)
+
+    def _discard(self, count: int) -> None:
+        self.discarded_bytes += count
+        self._garbage += count
+
+    def _hold(self, tail: bytes) -> None:
+        if self._too_long or len(tail) > self._longest:
+            self._discard(len(tail))
+            self._tail, self._too_long = b'', True
+        else:
+            self._tail = tail
+
+
+NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
+"""A finite number in text: `float` also takes nan, inf and 1_0."""

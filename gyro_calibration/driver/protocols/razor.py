@@ -1,0 +1,57 @@
+"""
+Razor AHRS firmware (SparkFun 9DoF Razor IMU, Sensor Stick, OpenLog Artemis): lines ``#YPRAG=`` with nine numbers parted by commas.
+
+They hold yaw, pitch and roll, the accelerations and the rates about x, y and z. The rates are in rad/s, with two decimals: 0.01 rad/s is
+0.57 deg/s, which is coarse. The accelerations are in 1/256 g and negated, so that the axis that points down has 256. The firmware's axes
+point forward, right and down; here they are turned to forward, left and up (REP-103), so that y and z change their sign. ``#ox`` asks for
+these lines, and ``#o1`` for a stream of them.
+
+Source: the comments of the firmware and the driver in `razor_imu_9dof` 1.3.0 (file Razor_AHRS.ino, on axes and serial commands; node
+imu_node.py). Older firmware may send counts: set the sensitivity then.
+
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import partial
+
+from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
+from gyro_calibration.driver.protocols.protocol import STANDARD_GRAVITY, Protocol, Reading, Settings, Written, stateless
+
+_LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
+_ANGLES = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')  # what the firmware sends when it is not asked for more
+_FORCE = STANDARD_GRAVITY / 256.0
+_TURNED = {'x': 1.0, 'y': -1.0, 'z': -1.0}  # from forward, right, down to forward, left, up
+
+
+def _parse(line: bytes, settings: Settings) -> Reading | None:
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return Reading(None) if _ANGLES.fullmatch(line) else None
+    axis, turned = 'xyz'.index(settings.axis), _TURNED[settings.axis]
+    numbers = match[1].split(b',')
+    force = -turned * float(numbers[3 + axis]) * _FORCE
+    return Reading(turned * float(numbers[6 + axis]), specific_force=force if math.isfinite(force) else None)
+
+
+def _write(reading: Written, settings: Settings) -> bytes:
+    turned, force = _TURNED[settings.axis], STANDARD_GRAVITY if reading.specific_force is None else reading.specific_force
+    values = [(-turned * force / _FORCE, turned * reading.value) if axis == settings.axis else (0.0, 0.0) for axis in 'xyz']
+    accelerations, rates = zip(*values, strict=True)
+    return b'#YPRAG=0.00,0.00,0.00,%.2f,%.2f,%.2f,%.2f,%.2f,%.2f\r\n' % (*accelerations, *rates)
+
+
+RAZOR = Protocol(
+    name='razor',
+    description='Razor AHRS firmware, text with rad/s',
+    baud=57600,
+    rate=50.0,
+    sensitivity=1.0,
+    splitter=partial(LineSplitter, 256, (b'#',)),
+    parser=stateless(_parse),
+    writer=stateless(_write),
+    full_scale=40.0,  # a hair above the 16 bits of an ITG-3200, 0.06957 deg/s each, which is the widest range of the gyros in use
+    startup=b'#ox#o1',
+)

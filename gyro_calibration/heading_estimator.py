@@ -1,0 +1,405 @@
+"""
+The heading on a robot, sample by sample: model, calibration, temperature and what rests teach, joined.
+
+What is computed is in `compensation`, `tracking` and `bias_table`. Here a calibration is carried to the time and temperature of now, the
+bias follows the temperature while the robot drives, and what rests show of it goes into the table for the next run.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
+
+import numpy as np
+
+from gyro_calibration.assumptions import Assumptions, Way, assumed, sensitive, uncertain
+from gyro_calibration.bias_table import BiasTable, carry
+from gyro_calibration.compensation import Compensated, compensate, quadratic_form, rate_sensitivity
+from gyro_calibration.effects import Channels
+from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
+from gyro_calibration.tracking import HeadingTracker, Settings
+
+#: Means over so long at rest go into the table, s.
+STRETCH = 10.0
+#: A mean that is so many standard deviations off what the tracker believes in the end was no rest.
+_FAR = 4.5
+#: The tracker begins anew at a rest so far from the temperature at which it began, K: what this run taught the table counts from there on.
+_AWAY = 5.0
+#: A temperature that comes no more is taken to go away so fast, K/s, up to so far, K.
+_LOST_RATE, _LOST = 1.0 / 60.0, 15.0
+#: What the rate at rest depends on is computed so often, s.
+_STILL = 0.5
+#: In motion that is computed so often, s, and where the rate has changed by more than so much, rad/s, and such a part of it.
+_HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
+#: A calibration that turns out to be older or younger by so much is carried anew, s.
+_OLDER = 3600.0
+#: A calibration without a date is so old, s.
+_YEAR = 365.25 * 86400.0
+
+
+@dataclass
+class _Stretch:
+    """
+    Samples at rest, as sums.
+
+    Attributes
+    ----------
+    begin : from when on, s
+    seen : what the rate changes by for each uncertain value, shape (m,), at the begin, and in the end on the mean
+    count, modelled, temperature : how many, rates after the model, rad/s, and temperatures, degC
+
+    """
+
+    begin: float
+    seen: Array
+    count: int = 0
+    modelled: float = 0.0
+    temperature: float = 0.0
+
+    def mean(self) -> tuple[float, float]:
+        """Return the mean rate after the model, and temperature."""
+        return self.modelled / self.count, self.temperature / self.count
+
+
+class HeadingEstimator:
+    """
+    Follow the heading of a robot.
+
+    Attributes
+    ----------
+    model : with the calibration as it is stored
+    used : the model with the calibration of now, with which samples are compensated
+    tracker : of the heading
+    table : of biases at rest
+    temperature : the last that came, degC; None before
+    rate : the last, rad/s; zero at rest
+    corrected : the same before the tracker saw it
+    last : what the compensation made of the last sample
+    beginnings : how often the tracker began anew
+
+    """
+
+    def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions, settings: Settings, temperature_timeout: float,
+                 now: float):
+        """
+        Begin at heading zero.
+
+        Parameters
+        ----------
+        model : with its stored self-calibration, if it has one
+        assumptions : of what nobody calibrated
+        settings : of the tracker
+        temperature_timeout : an older temperature is held, and counts as less and less known, s
+        now : s since 1970
+
+        """
+        self._assumptions, self._settings, self._timeout = assumptions, settings, temperature_timeout
+        self.temperature: float | None = None
+        self._heard_temperature, self._anchored, self._this_run, self._other_age = -math.inf, False, False, False
+        self.rate = self.corrected = 0.0
+        self.last, self.beginnings = Compensated(0.0, 0.0, 0.0, False, False), 0
+        self._time, self._elapsed, self._turned_before = -math.inf, 0.0, 0.0
+        self._stretch: _Stretch | None = None
+        self._pending: deque[_Stretch] = deque(maxlen=8)
+        self.model, self.table = model, table
+        self._tracker: HeadingTracker | None = None
+        self._history = model.history()
+        self._begin(now)
+
+    @property
+    def tracker(self) -> HeadingTracker:
+        """Return the tracker of the heading."""
+        assert self._tracker is not None
+        return self._tracker
+
+    def use(self, model: GyroModel, now: float) -> None:
+        """Go on with another self-calibration, which was made just now; the heading does not jump."""
+        self.model, self._this_run = model, True
+        self._begin(now, fresh=True)
+
+    def begin_run(self, now: float) -> None:
+        """Expect another bias, as after the gyro was without power; the heading does not jump."""
+        self.table.begin_run()
+        self._this_run = False
+        self._begin(now)
+
+    def set(self, settings: Settings) -> None:
+        """Go on with other settings of the tracker."""
+        self._settings = settings
+        self.tracker.set(settings)
+
+    def reset(self) -> None:
+        """Call this direction zero."""
+        self._turned_before += self.tracker.heading
+        self.tracker.reset()
+
+    @property
+    def calibrated_now(self) -> bool:
+        """Tell whether the calibration was made in this run."""
+        return self._this_run
+
+    def clock_was_set(self, step: float) -> None:
+        """Take all dates of this run for those of a clock that was then set by a step, s."""
+        self._begun += step
+        self.table.clock_was_set(step)
+        calibration = self.model.self_calibration
+        old = not self._this_run and (calibration is not None or len(self.table.entries) > 0)
+        self._other_age = self._other_age or (old and abs(step) > _OLDER)
+        if self._this_run and calibration is not None and calibration.time:
+            then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
+            self.model = with_self_calibration(self.model, replace(calibration, time=then.isoformat(timespec='seconds')))
+
+    # What is known at the begin
+
+    def _begin(self, now: float, fresh: bool = False) -> None:
+        """Carry the calibration, unless it is of just now, to the time and temperature of now, and track from here on."""
+        self._sentence = ''
+        self.used, age = (assumed(self.model, self._assumptions), 0.0) if fresh else self._carried(now)
+        self.covariance = uncertain(self.used, self._assumptions)
+        if self._tracker is None:
+            self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age)
+        else:
+            self._tracker.use(self.used.noise, self.covariance, age)
+        self._begun = now
+        self._anchor(now)
+        self._unheard_since = self._time if fresh and not self._anchored else math.inf
+        self._shift, self._astray, self._other_age = 0.0, 0.0, False
+        self._sensitivity: Array = np.zeros(len(self.covariance))
+        self._still: Array = self._sensitivity
+        self._still_at, self._looked = -math.inf, (-math.inf, 0.0)
+        self._stretch = None
+        self._pending.clear()
+        self.beginnings += 1
+
+    def _anchor(self, now: float) -> None:
+        """Let the bias follow the temperature from that of now on, if it is known."""
+        here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
+        self._anchored = here is not None
+        self._way = Way(self.table, here, now, coefficient) if here is not None and coefficient else None
+
+    def _hear_again(self, now: float, around: Channels | None) -> None:
+        """
+        Go on from the temperature of now with what was calibrated in this run while none came.
+
+        It was calibrated behind the model at the temperature that was held up to the last sample. What the model makes of another one is
+        no change of the rate.
+
+        """
+        here = compensate(self.used, 0.0, self.temperature, around).modelled
+        before = None if around is None else replace(around, temperature=self.last.temperature)
+        held = compensate(self.used, 0.0, self.last.temperature, before).modelled
+        self._shift, self._astray = float(here) - float(held), _unheard(self._time - self._unheard_since)
+        self._anchor(now)
+
+    def _carried(self, now: float) -> tuple[GyroModel, float | None]:
+        """Return the model to compensate with, and the age of its self-calibration, s; None where it is an assumption."""
+        model = assumed(self.model, self._assumptions)
+        calibration = model.self_calibration
+        if calibration is None:
+            return self._from_table(model, now)
+        if self.model.self_calibration is None and not self.table.entries:
+            return model, None
+        carried = carry(calibration, self.table, self.age(now), now, self._known_temperature, self._this_run)
+        self._sentence = carried.sentence
+        return with_self_calibration(model, carried.calibration), 0.0
+
+    def _from_table(self, model: GyroModel, now: float) -> tuple[GyroModel, float | None]:
+        """Return a calibrated model with the bias of earlier runs on top."""
+        here = self._known_temperature
+        if here is None or not self.table.entries:
+            return model, None
+        bias, variance = self.table.predict(here, now)
+        return with_self_calibration(model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
+
+    @property
+    def sentence(self) -> str:
+        """Say what age, temperature and table leave of the calibration; '' where that is not worth a word, or rests have mended it."""
+        return self._sentence if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else ''
+
+    def age(self, now: float) -> float:
+        """Return how long ago the bias was calibrated, s; a year where nobody wrote it down."""
+        calibration = self.model.self_calibration
+        written = calibration.time if calibration else str(self.model.origin.get('date', ''))
+        try:
+            when = datetime.fromisoformat(written)
+        except ValueError:
+            return _YEAR
+        return max(now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp(), 0.0)
+
+    def known_for(self, now: float) -> float:
+        """Return since when the variance of the bias holds, s: a carried calibration has its age in it."""
+        return self.age(now) if self.used.self_calibration is None else max(now - self._begun, 0.0)
+
+    @property
+    def claimed(self) -> SelfCalibration:
+        """Return the calibration in use as it holds at the temperature of now; a scale that it does not know has an infinite variance."""
+        used = self.used.self_calibration or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0)))
+        assert used.covariance is not None  # where nobody knows it, it is assumed
+        variance = self.bias_variance / used.scale ** 2
+        return replace(used, bias=used.bias + self._gone(self._time)[0], covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
+
+    @property
+    def bias_variance(self) -> float:
+        """Return the variance of the corrected rate at rest by the calibration, (rad/s)², at the temperature of the last sample."""
+        return float(quadratic_form(self.covariance, self._still))
+
+    # Samples
+
+    def hear_temperature(self, time: float, temperature: float) -> None:
+        """Take a temperature, degC, with its stamp, s."""
+        self.temperature, self._heard_temperature = temperature, time
+
+    @property
+    def temperature_is_lost(self) -> bool:
+        """Tell whether the last temperature is too old at the last sample."""
+        return abs(self._time - self._heard_temperature) > self._timeout
+
+    @property
+    def _known_temperature(self) -> float | None:
+        """Return the temperature of now, degC; None where none came, or the last one is too old."""
+        return None if self.temperature_is_lost else self.temperature
+
+    def add(self, time: float, output: float, now: float, force: float | None = None, wheels: bool | None = None) -> str:
+        """
+        Take a sample.
+
+        Parameters
+        ----------
+        time : stamp, s
+        output : rad/s
+        now : s since 1970
+        force : specific force, m/s², if it came
+        wheels : whether wheels or commands move the robot; None where nobody says so
+
+        Returns
+        -------
+        '', or why the integration began anew with this sample
+
+        """
+        last, self._time = self._time, time
+        heard, goes_on = not self._anchored and self._known_temperature is not None, self._this_run and last > -math.inf
+        if self._other_age or heard and not goes_on:
+            self._begin(now)
+        around = self._look_around(time - last, force) if self.used.looks_around else None
+        if heard and goes_on:
+            self._hear_again(now, around)
+        self.last = result = compensate(self.used, output, self.temperature, around)
+        gone, distance = self._gone(time)
+        calibration = self.used.self_calibration
+        rate = float(result.rate) - gone * (1.0 if calibration is None else calibration.scale)
+        if abs(time - self._still_at) > _STILL:
+            self._still, self._still_at = self._sensitive(output, 0.0, around, distance), time
+        self._look_at(time, output, float(result.rate), around, distance)
+        said = self.tracker.add(time, rate, self._sensitivity, wheels, self._still)
+        self.corrected = rate
+        self.rate = self.tracker.rate
+        self._gather(time, bool(said))
+        return said
+
+    def _look_at(self, time: float, output: float, rate: float, around: Channels | None, distance: float) -> None:
+        """Keep the sensitivity while it hardly changes, for it is half of the work: at rest, and for a moment at nearly the same rate."""
+        if self.tracker.resting:
+            self._sensitivity, self._looked = self._still, (time, 0.0)
+            return
+        at, looked = self._looked
+        if abs(time - at) > _HELD or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
+            self._sensitivity, self._looked = self._sensitive(output, rate, around, distance), (time, rate)
+
+    def _sensitive(self, output: float, rate: float, around: Channels | None, distance: float) -> Array:
+        """Return what the rate changes by for each uncertain value, shape (m,)."""
+        return sensitive(self.used, rate_sensitivity(self.used, output, rate, self.last.temperature, around), distance)
+
+    def _gone(self, time: float) -> tuple[float, float]:
+        """Return how far the bias has gone with the temperature, rad/s, and its distance from where it was known, K."""
+        if self.temperature is None:
+            return 0.0, 0.0
+        if self._way is None:
+            return self._shift, _unheard(time - self._unheard_since)
+        gone, distance = self._way.at(self.temperature)
+        late = abs(time - self._heard_temperature) - self._timeout
+        return self._shift + gone, self._astray + distance + math.copysign(_unheard(late), distance)
+
+    def _look_around(self, interval: float, force: float | None) -> Channels:
+        """
+        Return what effects look at beside rate, output and temperature.
+
+        Time goes on with the stamps, also over gaps, and stands while they jump back. The heading is the own one, as if it had never been
+        reset, and goes on at the last rate up to this sample.
+
+        """
+        interval = max(interval, 0.0) if interval < math.inf else 0.0
+        self._elapsed += interval
+        ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
+        return self._history.follow(self._elapsed, self.temperature, force, heading=self._turned_before + self.tracker.heading + ahead)
+
+    # What rests teach the next run
+
+    def _gather(self, time: float, restarted: bool) -> None:
+        """Gather samples at rest to stretches."""
+        if restarted or not self.tracker.resting or self.temperature is None or self.temperature_is_lost:
+            self._stretch = None
+            return
+        if self._stretch is None:
+            self._stretch = _Stretch(time, self._still)
+        stretch = self._stretch
+        stretch.count += 1
+        stretch.modelled += float(self.last.modelled)
+        stretch.temperature += self.temperature
+        if time - stretch.begin >= STRETCH:
+            stretch.seen = 0.5 * (stretch.seen + self._still)
+            self._pending.append(stretch)
+            self._stretch = None
+
+    def learn(self, now: float, ending: bool = False) -> str:
+        """
+        Bring what rests have shown into the table; to be called now and then.
+
+        A stretch waits until the next one is complete, or the rest or the run has ended: if the robot has turned slowly meanwhile, the
+        tracker knows by then.
+
+        Returns
+        -------
+        '', or what the table said
+
+        """
+        said = ''
+        while len(self._pending) > (self.tracker.resting and not ending):
+            said = self._teach(self._pending.popleft(), now) or said
+        return said
+
+    def _teach(self, stretch: _Stretch, now: float) -> str:
+        bias, temperature = stretch.mean()
+        variance = self.used.noise.angle_random_walk ** 2 / STRETCH
+        expected, deviation = self._believed(temperature, stretch.seen)
+        if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
+            return ''
+        said = self.table.add(temperature, bias, variance, now)
+        if self._way is not None and self.tracker.resting and abs(temperature - self._way.begin) > _AWAY:
+            self._begin(now)
+        return said
+
+    def _believed(self, temperature: float, seen: Array) -> tuple[float, float]:
+        """
+        Return the bias at a temperature, and its standard deviation, as the tracker has them now, rad/s.
+
+        It is that after the model and before the self-calibration. A rest may be over, and it may be warmer, when its stretch is judged.
+
+        """
+        calibration = self.used.self_calibration or SelfCalibration()
+        gone = self._shift + (0.0 if self._way is None else self._way.at(temperature)[0])
+        off, deviation = self.tracker.bias_by(seen)
+        return calibration.bias + gone + off / calibration.scale, deviation / calibration.scale
+
+    def missing(self, brought: Collection[str]) -> list[str]:
+        """Return the channels that the model looks at and no message brings."""
+        return [channel for channel in ('supply', 'specific_force') if self.used.looks_at(channel) and channel not in brought]
+
+
+def _unheard(late: float) -> float:
+    """Return how far a temperature that has not been heard for some time, s, may have gone, K."""
+    return min(max(late, 0.0) * _LOST_RATE, _LOST)

@@ -1,0 +1,226 @@
+"""
+Takes messages from topics as they are, for a recorder.
+
+Types come from the graph, so that any message whose package is installed can be recorded. A subscription asks for what is offered: a best
+effort publisher is heard, and a reliable one loses nothing. Publishers may come late, go and come again with another quality.
+
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from gyro_calibration.log import LogError
+from gyro_calibration.ros.runner import call_every
+from gyro_calibration.storage import Message
+
+_DEPTH = 5000  # as SENSOR_QUALITY: a recorder that is busy for five seconds loses nothing at 1 kHz
+_LAST = 2.0  # s; within it is taken what had come before a recorder was told to stop
+_LOOK_INTERVAL = 0.3  # s; between two looks at the graph
+_LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process by itself
+_LINE = '=' * 80
+_WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
+
+
+class RecorderNode(Node):
+    """
+    Subscribes to topics as soon as they are there, and hands over each message with the definition of its kind.
+
+    Parameters
+    ----------
+    topics : sequence of str
+    everything : bool
+        Whether all other topics are wanted as well.
+    take : callable
+        Gets each message, and the definition.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        Those that were asked for, as the graph names them.
+    unknown : dict of str to str
+        Topics whose kind is not installed here, and why they cannot be recorded.
+    taken : int
+        How many messages were handed over.
+
+    Raises
+    ------
+    LogError : a topic cannot have such a name
+
+    """
+
+    def __init__(self, topics: Sequence[str], everything: bool, take: Callable[[Message, str], None], context: rclpy.Context):
+        super().__init__('gyro_calibration_recorder', context=context, start_parameter_services=False, enable_rosout=False)
+        self.topics = tuple(_resolved(self, topic) for topic in topics)
+        self.unknown: dict[str, str] = {}
+        self.taken = 0
+        self._everything, self._take = everything, take
+        self._subscriptions_of: dict[str, tuple] = {}
+        self._begin = time.time_ns() - time.monotonic_ns()
+        self.look()
+        call_every(self, _LOOK_INTERVAL, self.look)
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that were asked for, and that nobody publishes so far."""
+        return [topic for topic in self.topics if topic not in self._subscriptions_of]
+
+    def known(self) -> list[str]:
+        """Return the topics that there are."""
+        return sorted(name for name, _ in self.get_topic_names_and_types())
+
+    def look(self) -> None:
+        """Subscribe to what is new in the graph."""
+        for topic, kinds in self.get_topic_names_and_types():
+            wanted = topic in self.topics or self._everything
+            publishers = self.get_publishers_info_by_topic(topic) if wanted else []
+            if publishers and topic not in self.unknown:
+                self._subscribe(topic, kinds[0], _quality(publishers))
+
+    def _subscribe(self, topic: str, kind: str, quality: QoSProfile) -> None:
+        offered = quality.reliability, quality.durability
+        before = self._subscriptions_of.get(topic)
+        if before is not None:
+            if before[0] == offered:
+                return
+            self.destroy_subscription(before[1])
+        try:
+            definition = definition_of(kind)
+        except (ImportError, AttributeError) as error:
+            self.unknown[topic] = f'{kind} is not installed here ({error})'
+            return
+        subscription = self.create_subscription(load(kind), topic, self._taker(topic, kind, definition), quality, raw=True)
+        self._subscriptions_of[topic] = offered, subscription
+
+    def _taker(self, topic: str, kind: str, definition: str) -> Callable[[bytes], None]:
+        # By the monotonic clock: the time of receiving must not jump where somebody sets the clock.
+        def take(data: bytes) -> None:
+            self.taken += 1
+            self._take(Message(topic, kind, self._begin + time.monotonic_ns(), bytes(data)), definition)
+        return take
+
+
+def _resolved(node: Node, topic: str) -> str:
+    try:
+        return str(node.resolve_topic_name(topic))
+    except (RuntimeError, ValueError) as error:
+        raise LogError(f'{topic} is no name of a topic ({_reason(error)}); name another') from None
+
+
+def _reason(error: Exception) -> str:
+    """Return what rclpy says in an error, without the place in its source."""
+    return str(error).partition(', at /')[0]
+
+
+def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """Return a quality that all publishers can serve, and that keeps what was sent before where all of them keep it."""
+    best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for each in publishers)
+    latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers)
+    return QoSProfile(
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+
+
+def load(kind: str) -> Any:
+    """
+    Return the class of a kind such as ``sensor_msgs/msg/Imu``.
+
+    Raises
+    ------
+    ImportError : it is no kind of messages; anybody in the graph can name one, and must not choose what else is imported here
+
+    """
+    if not re.fullmatch(r'\w+/msg/\w+', kind):
+        raise ImportError(f'{kind} is no kind of messages')
+    package, _, name = kind.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), name)
+
+
+def definition_of(kind: str) -> str:
+    """Return the fields of a kind, and then those of all kinds in it, as ROS 2 writes them."""
+    kinds, parts = [kind], []
+    for each in kinds:
+        fields = load(each).get_fields_and_field_types()
+        head = '' if each == kind else f'{_LINE}\nMSG: {each.replace("/msg/", "/")}\n'
+        parts.append(head + ''.join(f'{_field(text)} {name}\n' for name, text in fields.items()))
+        inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/') for text in fields.values()]
+        kinds += [found for found in dict.fromkeys(inner) if '/' in found and found not in kinds]
+    return ''.join(parts)
+
+
+def _field(text: str) -> str:
+    """Return the type of a field as it stands in a definition: of ``sequence<double, 3>``, ``float64[<=3]``."""
+    if text.startswith('sequence<'):
+        inner, _, most = text.removeprefix('sequence<').removesuffix('>').partition(', ')
+        return f'{_field(inner)}[{f"<={most}" if most else ""}]'
+    word, bracket, length = text.partition('[')
+    word = re.sub(r'<(\d+)>', r'<=\1', word)
+    return _WORDS.get(word, word) + bracket + length
+
+
+def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Message, str], None], tick: Callable[[RecorderNode], None],
+                  stop: threading.Event) -> None:
+    """
+    Hand over the messages of topics until told to stop.
+
+    Parameters
+    ----------
+    topics, everything, take : as for `RecorderNode`
+    tick : is called often, with the node
+    stop : is set by whoever wants it to end
+
+    Raises
+    ------
+    LogError : a topic cannot have such a name, or ROS 2 cannot be started, as with an impossible ROS_DOMAIN_ID
+
+    """
+    context = rclpy.Context()
+    _start(context)
+    executor = SingleThreadedExecutor(context=context)
+    try:
+        node = RecorderNode(topics, everything, take, context)
+        executor.add_node(node)
+        try:
+            while not stop.is_set():
+                executor.spin_once(timeout_sec=0.05)
+                tick(node)
+            _take_what_came(executor, node)
+        finally:
+            executor.remove_node(node)
+            node.destroy_node()
+    finally:
+        executor.shutdown()
+        rclpy.shutdown(context=context)
+
+
+def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
+    """Hand over what waits in the queues: messages that came before the recorder was told to stop belong to the recording."""
+    deadline, idle = time.monotonic() + _LAST, 0
+    while idle < 3 and time.monotonic() < deadline:  # now and then it is a timer that is served
+        before = node.taken
+        executor.spin_once(timeout_sec=0.0)
+        idle = 0 if node.taken > before else idle + 1
+
+
+def _start(context: rclpy.Context) -> None:
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but the largest is {_LARGEST_DOMAIN}; set another')
+    try:
+        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except (RuntimeError, ValueError) as error:
+        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); set its variables otherwise') from None

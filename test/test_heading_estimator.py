@@ -1,0 +1,378 @@
+"""
+The heading on a robot as it is followed sample by sample: rests, temperature, what earlier runs taught, and stamps that jump.
+
+The gyro is simulated with the noise of the XV-3500 at 25 Hz.
+
+"""
+
+import math
+from dataclasses import replace
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+
+from gyro_calibration.assumptions import Assumptions, Way, assumed, sensitive, uncertain
+from gyro_calibration.bias_table import BiasTable, Entry, Prior
+from gyro_calibration.compensation import covariance, rate_sensitivity
+from gyro_calibration.effects import BIAS, BIAS_TEMPERATURE, RATE_RAMP
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.ros.health_monitor import changed
+from gyro_calibration.tracking import Settings
+
+INTERVAL, NOW = 0.04, 1.7e9
+NOISE = Noise(2.5 * DEGREE / 60, 18 * DEGREE / 3600)
+DATE = datetime.fromtimestamp(NOW, timezone.utc).isoformat()
+CALIBRATED = SelfCalibration(0.0, 0.1 * DEGREE, ((1e-8, 0.0), (0.0, (0.01 * DEGREE) ** 2)), DATE, 25.0)
+MODEL = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
+
+
+def begun(model=MODEL, table=None, assumptions=None, settings=None, now=NOW, temperature=25.0):
+    """Return a heading that begins; with a temperature, if one is given."""
+    live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(), settings or Settings(), 10.0, now)
+    if temperature is not None:
+        live.hear_temperature(0.0, temperature)
+    return live
+
+
+class Gyro:
+    """Simulated samples, with a bias over temperature."""
+
+    def __init__(self, live, seed=0, bias=0.1 * DEGREE, coefficient=0.0, now=NOW):
+        self.live, self.time, self.now, self.turned = live, 0.0, now, 0.0
+        self._bias, self._coefficient, self._generator = bias, coefficient, np.random.default_rng(seed)
+        self.headings, self.said, self._rate = [], [], 0.0
+
+    def go(self, seconds, rate=0.0, temperature=25.0, wheels=None):
+        """Turn at a rate, rad/s, for some time, at one temperature or along those between two; None brings none."""
+        count = round(seconds / INTERVAL)
+        noise = simulate_noise(NOISE, count, INTERVAL, self._generator)
+        known = np.full(count, np.nan) if temperature is None else np.linspace(*np.broadcast_to(temperature, 2), count)
+        for degc, wandering in zip(known, noise):
+            self.time += INTERVAL
+            if temperature is not None:
+                self.live.hear_temperature(self.time, degc)
+            offset = self._bias + self._coefficient * (0.0 if temperature is None else degc - 25.0)
+            now = self.now + self.time
+            self.said.append(self.live.add(self.time, rate + offset + wandering, now, wheels=wheels))
+            self.headings.append(self.live.tracker.heading)
+            if round(self.time / INTERVAL) % 25 == 0:
+                self.live.learn(now)
+        self.turned += INTERVAL * (rate * (count - 1) + 0.5 * (rate + self._rate))
+        self._rate = rate
+        return self
+
+    @property
+    def error(self):
+        """Return what the heading is off by, rad."""
+        return self.live.tracker.heading - self.turned
+
+    @property
+    def deviation(self):
+        """Return what it says of that, rad."""
+        return math.sqrt(self.live.tracker.variance)
+
+
+@pytest.mark.parametrize('temperature', [25.0, None])
+def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_been_right(temperature):
+    later, deviations, headings = NOW + 300.0 * 86400.0, [], []
+    for begin in (1000.0, later):
+        live = begun(now=begin, temperature=temperature)
+        for index in range(100):
+            live.add(INTERVAL * index, 0.3, begin)
+        live.clock_was_set(later - begin)
+        headings.append(live.tracker.heading)
+        live.add(INTERVAL * 100, 0.3, later)
+        deviations.append(live.tracker.bias[1])
+        assert live.tracker.heading - headings[-1] == pytest.approx(INTERVAL * 0.3, rel=0.05)
+    assert deviations[0] == pytest.approx(deviations[1], rel=1e-3) and live.age(later) == pytest.approx(300.0 * 86400.0)
+
+
+def test_a_clock_that_is_set_by_seconds_lets_the_tracker_go_on():
+    live = begun()
+    for index in range(10):
+        live.add(INTERVAL * index, 0.0, NOW)
+    before = live.beginnings
+    live.clock_was_set(5.0)
+    live.add(INTERVAL * 10, 0.0, NOW + 5.0)
+    assert live.beginnings == before
+
+
+def test_what_nobody_calibrated_is_assumed_and_what_is_known_is_left_alone():
+    assumptions, temperature = Assumptions(), (0.03 * DEGREE) ** 2
+    expected = np.diag([temperature, 0.03 ** 2, (0.5 * DEGREE) ** 2])
+    assert uncertain(assumed(GyroModel(), assumptions), assumptions) == pytest.approx(expected)
+    of_nobody_knows = GyroModel(self_calibration=SelfCalibration(0.01, 0.02))
+    assert uncertain(assumed(of_nobody_knows, assumptions), assumptions) == pytest.approx(expected)
+    assert assumed(of_nobody_knows, assumptions).self_calibration.bias == 0.02
+    assert assumed(MODEL, assumptions) is MODEL
+    model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-6]]))
+    assert assumed(model, assumptions) is model and uncertain(model, assumptions) == pytest.approx(np.diag([1e-6, temperature]))
+
+
+def test_sensitivities_have_the_order_of_the_covariance_and_foretell_what_the_rate_changes_by():
+    model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-6]]), self_calibration=CALIBRATED)
+    found = sensitive(model, rate_sensitivity(model, 0.5, 0.5, 25.0), distance=3.0)
+    assert found == pytest.approx([-1.0, -3.0, -0.5, -1.0])
+    inside = uncertain(model, Assumptions())
+    assert np.delete(np.delete(inside, 1, 0), 1, 1) == pytest.approx(covariance(model))
+
+
+def test_a_way_is_that_of_the_table_at_its_steps_and_in_between_and_does_not_learn():
+    table = BiasTable(MODEL, entries=[Entry(t, 0.001 * t, 1e-10, NOW - 1e5, 0) for t in (20.0, 25.0, 30.0, 35.0)])
+    way = Way(table, 25.0, NOW, 0.03 * DEGREE)
+    for temperature in (25.0, 25.13, 31.7, 19.9):
+        change, variance = table.difference(25.0, temperature, NOW)
+        gone, distance = way.at(temperature)
+        assert gone == pytest.approx(change, abs=2e-6)
+        assert distance == pytest.approx(math.copysign(math.sqrt(variance) / (0.03 * DEGREE), temperature - 25.0), abs=0.1)
+    before = way.at(40.0)
+    for number in range(5):
+        table.add(40.0, 0.05, 1e-10, NOW + number)
+    assert way.at(40.0) == before and Way(table, 25.0, NOW, 0.03 * DEGREE).at(40.0) != before
+
+
+def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
+    gyro = Gyro(begun(GyroModel(noise=NOISE)), bias=0.3 * DEGREE).go(60.0)
+    stood = gyro.error
+    assert gyro.live.tracker.resting and abs(stood) < 0.5 * DEGREE
+    gyro.go(10.0, 0.5).go(5.0)
+    assert abs(gyro.error - stood) < 0.5 * DEGREE and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_drive_with_stops_stands_at_rest_and_stays_inside_what_it_says(seed):
+    gyro = Gyro(begun(), seed)
+    for rate in (0.3, -0.5, 0.2, -0.2, 0.4):
+        gyro.go(10.0, rate).go(3.0)
+        begin = len(gyro.headings)
+        gyro.go(17.0)
+        assert gyro.live.tracker.resting and np.ptp(gyro.headings[begin:]) == 0.0 and gyro.live.rate == 0.0
+    assert abs(gyro.error) < 4.0 * gyro.deviation < 4.0 * DEGREE
+
+
+def test_a_slow_turn_is_followed_with_wheels_and_the_slowest_that_shows_without_is_said():
+    turned = {}
+    for wheels in (True, None):
+        gyro = Gyro(begun()).go(60.0, wheels=False if wheels else None)
+        gyro.go(120.0, 0.05 * DEGREE, wheels=wheels)
+        turned[wheels] = gyro.live.tracker.heading / DEGREE
+        assert abs(gyro.error) < 3.0 * gyro.deviation or not wheels
+    assert 3.0 < turned[True] < 9.0 and turned[None] < turned[True]
+    assert 0.01 * DEGREE < Gyro(begun()).go(60.0).live.tracker.slowest_noticed < 0.1 * DEGREE
+
+
+def test_the_variance_grows_with_the_distance_of_the_temperature_and_a_rest_takes_that_back():
+    coefficient = 0.03 * DEGREE
+    gyro = Gyro(begun(), coefficient=coefficient).go(30.0).go(20.0, 0.3, (25.0, 35.0))
+    known = gyro.live.tracker.bias[1]
+    assert 0.5 < known / (10.0 * coefficient) < 1.5
+    gyro.go(30.0, temperature=35.0)
+    assert gyro.live.tracker.bias[1] < 0.1 * known and abs(gyro.error) < 3.0 * gyro.deviation
+    assert Gyro(begun(assumptions=Assumptions(bias_temperature_coefficient=0.0))).go(30.0).go(
+        20.0, 0.3, (25.0, 35.0)).live.tracker.bias[1] < 0.1 * known
+
+
+def heated(live, seed=0, now=NOW):
+    """Return a gyro that rested from 25 to 45 degC and back."""
+    gyro = Gyro(live, seed, coefficient=0.03 * DEGREE, now=now).go(60.0)
+    for degc in (25.0, 30.0, 35.0, 40.0, 45.0):
+        gyro.go(20.0, 0.3, (degc, min(degc + 5.0, 45.0))).go(40.0, temperature=min(degc + 5.0, 45.0))
+    return gyro
+
+
+def test_what_one_run_learned_of_the_temperature_serves_the_next_without_compensating_twice():
+    table = BiasTable(MODEL)
+    heated(begun(table=table))
+    assert len(table.entries) >= 4
+    errors = {}
+    for name, entries in (('learned', table.entries), ('new', [])):
+        live = begun(MODEL, BiasTable(MODEL, entries=entries), now=NOW + 7200.0)
+        gyro = Gyro(live, 1, coefficient=0.03 * DEGREE, now=NOW + 7200.0).go(30.0)
+        before = gyro.error
+        gyro.go(60.0, 0.3, (25.0, 44.0))
+        errors[name] = abs(gyro.error - before), gyro.deviation
+    assert errors['new'][0] > 10.0 * DEGREE and errors['learned'][0] < 0.1 * errors['new'][0], errors
+    for error, deviation in errors.values():
+        assert error < 3.0 * deviation
+
+
+def test_the_tracker_begins_anew_where_it_is_warm_and_the_heading_does_not_jump():
+    gyro = heated(begun())
+    assert 3 <= gyro.live.beginnings <= 8
+    steps = np.abs(np.diff(gyro.headings))
+    assert steps.max() < 0.5 * INTERVAL and abs(gyro.error) < 3.0 * gyro.deviation
+
+
+def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_it():
+    deviations = []
+    for days, temperature in ((0.0, 25.0), (300.0, 25.0), (0.0, 45.0)):
+        live = begun(now=NOW + 86400.0 * days, temperature=temperature)
+        live.add(0.1, 0.0, NOW + 86400.0 * days)
+        assert 'let the robot rest, or calibrate again' in live.sentence and f'{temperature:.1f} degC' in live.sentence
+        deviations.append(math.sqrt(live.covariance[-1, -1]) / DEGREE)
+    on, old, far = deviations
+    assert 0.05 < on < old < far  # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
+
+
+@pytest.mark.parametrize('temperature', [25.0, None])
+def test_a_calibration_of_now_is_used_as_it_is(temperature):
+    live = begun(temperature=temperature)
+    live.add(0.1, 0.0, NOW)
+    live.use(MODEL, NOW)
+    live.add(0.2, 0.0, NOW)
+    assert math.sqrt(live.covariance[-1, -1]) == pytest.approx(0.01 * DEGREE) and not live.sentence
+
+
+def test_a_gyro_that_was_without_power_may_have_another_bias():
+    gyro = Gyro(begun()).go(40.0)
+    gyro.live.use(MODEL, gyro.now + gyro.time)
+    heading, variance = gyro.live.tracker.heading, gyro.live.covariance[-1, -1]
+    gyro.live.begin_run(gyro.now + gyro.time)
+    assert gyro.live.tracker.heading == heading and gyro.live.covariance[-1, -1] > 9.0 * variance
+    gyro._bias += 0.1 * DEGREE
+    gyro.go(40.0).go(10.0, 0.3)
+    assert len({each.run for each in gyro.live.table.entries}) == 2 and abs(gyro.error) < 3.0 * gyro.deviation
+
+
+def test_a_rest_mends_an_old_calibration_and_it_is_no_longer_said():
+    gyro = Gyro(begun(now=NOW + 1e7), now=NOW + 1e7)
+    gyro.go(INTERVAL)
+    assert gyro.live.sentence
+    assert not gyro.go(20.0).live.sentence
+
+
+def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_doubt_of_it():
+    none = Assumptions(bias_temperature_coefficient=0.0)
+    table = BiasTable(MODEL, Prior(coefficient=0.0))
+    gyro = Gyro(begun(table=table, assumptions=none)).go(40.0).go(10.0, 0.3, (25.0, 45.0)).go(40.0, temperature=45.0)
+    assert len(table.entries) == 2 and abs(gyro.error) < 3.0 * gyro.deviation < 3.0 * DEGREE
+
+
+def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
+    model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE)
+    table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
+    live = begun(model, table)
+    live.add(0.1, 0.0, NOW)
+    assert live.used.self_calibration.bias == pytest.approx(0.003, abs=1e-4) and live.model.self_calibration is None
+
+
+def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_known():
+    model = GyroModel((Term(BIAS_TEMPERATURE, (25.0, 0.03 * DEGREE)),), np.array([[1e-14]]), noise=NOISE, self_calibration=CALIBRATED)
+    gyro = Gyro(begun(model), coefficient=0.03 * DEGREE).go(30.0, temperature=30.0)
+    known, rate = gyro.live.tracker.bias[1], gyro.live.corrected
+    assert not gyro.live.temperature_is_lost
+    gyro.go(1.0, 0.3, temperature=30.0)
+    gyro._bias += 5.0 * 0.03 * DEGREE  # it stays as warm as it is, but nobody says so
+    before = len(gyro.headings)
+    gyro.go(60.0, 0.3, None)
+    assert gyro.live.temperature_is_lost and gyro.live.tracker.bias[1] > 2.0 * known and abs(rate) < 2.0 * DEGREE
+    assert np.abs(np.diff(gyro.headings[before:])).max() < 2.0 * 0.3 * INTERVAL
+    assert abs(gyro.error) < 3.0 * gyro.deviation
+
+
+@pytest.mark.parametrize('terms', [(), (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)),),
+                                   (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(RATE_RAMP, (1e-9,)))],
+                         ids=['no effect', 'of temperature', 'of temperature and time'])
+def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(terms):
+    model = GyroModel(terms, noise=NOISE)
+    table = BiasTable(model, entries=[Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0) for degc in range(15, 45)])
+    gyro = Gyro(begun(model, table), bias=0.0).go(20.0)
+    gyro._bias = 0.3 * DEGREE  # it has become warmer by 10 K, but nobody says so
+    gyro.go(20.0, temperature=None)
+    assert gyro.live.temperature_is_lost
+    calibration = SelfCalibration(0.0, 0.3 * DEGREE, ((1e-8, 0.0), (0.0, (0.002 * DEGREE) ** 2)), DATE)
+    gyro.live.use(replace(model, self_calibration=calibration), gyro.now + gyro.time)
+    before = gyro.go(4.0, 0.3, None).error
+    assert not gyro.live.tracker.resting
+    gyro.go(40.0, 0.3, 35.0)
+    assert abs(gyro.error - before) < 2.0 * DEGREE, 'what the table knows of 10 K makes 12 degrees of it'
+
+
+def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is_known():
+    known = []
+    for seconds in (1.0, 300.0, 3600.0):
+        gyro = Gyro(begun()).go(1.0).go(20.0, temperature=None)
+        gyro.live.use(MODEL, gyro.now + gyro.time)
+        gyro.live.add(gyro.time + seconds, 0.0, NOW)
+        known.append(gyro.live.bias_variance)
+        gyro.live.hear_temperature(gyro.time + seconds + INTERVAL, 25.0)
+        gyro.live.add(gyro.time + seconds + INTERVAL, 0.0, NOW)
+        assert gyro.live.bias_variance == pytest.approx(known[-1], rel=0.01)
+    assert known[0] < 1.1 * (0.01 * DEGREE) ** 2 and 9.0 * known[0] < known[1] < known[2]
+
+
+@pytest.mark.parametrize('jump, words', [(3600.0, 'no samples for 3600.040'), (-3600.0, 'jumps back by 3599.960')])
+def test_a_clock_that_jumps_makes_no_jump_of_the_heading_and_the_variance_says_so(jump, words):
+    gyro = Gyro(begun()).go(30.0).go(5.0, 0.3)
+    heading, deviation = gyro.headings[-1], gyro.deviation
+    gyro.time += jump
+    gyro.go(INTERVAL, 0.3)
+    assert words in gyro.said[-1] and abs(gyro.headings[-1] - heading) < 0.02 * DEGREE
+    assert gyro.deviation > 0.3 * 3600.0 if jump > 0.0 else gyro.deviation >= deviation
+    assert gyro.live.rate == pytest.approx(0.3, abs=0.1)
+    before = gyro.error
+    gyro.go(10.0, 0.3).go(30.0)
+    assert gyro.live.tracker.resting and abs(gyro.error - before) < 1.0 * DEGREE
+
+
+@pytest.mark.parametrize('away', [-10.0, 10.0])
+def test_a_temperature_that_comes_no_more_is_less_and_less_known_on_either_side(away):
+    live, known = begun(), []
+    for second in range(0, 1200, 60):
+        if second < 120:
+            live.hear_temperature(second, 25.0 + away * (second > 0))
+        live.add(second, 0.0, NOW + second)
+        known.append(live.bias_variance)
+    assert (np.diff(known) >= 0.0).all() and known[-1] > known[1]
+
+
+@pytest.mark.parametrize('known', [False, True], ids=['unknown coefficient', 'known coefficient'])
+def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
+    entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0) for degc in range(15, 45)] if known else []
+    live = begun(table=BiasTable(MODEL, entries=entries))
+    live.add(0.1, 0.0, NOW)
+    live.use(MODEL, NOW)
+    assert live.claimed.bias == pytest.approx(CALIBRATED.bias)
+    for index in range(100):
+        live.hear_temperature(INTERVAL * index, 35.0)
+        live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
+    warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
+    assert not changed(live.claimed, warm, NOISE, 300.0) and changed(CALIBRATED, warm, NOISE, 300.0)
+    assert bool(changed(live.claimed, replace(warm, bias=0.1 * DEGREE), NOISE, 300.0)) == known
+
+
+def test_a_model_without_a_calibration_claims_no_scale():
+    live = begun(GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE))
+    live.add(0.1, 0.0, NOW)
+    assert live.claimed.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8))) and live.claimed.bias == 0.0
+
+
+def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
+    gyro = Gyro(begun()).go(12.0)
+    assert not gyro.live.table.entries
+    gyro.live.learn(gyro.now + gyro.time, ending=True)
+    assert len(gyro.live.table.entries) == 1
+
+
+def test_a_rest_in_which_the_robot_turned_slowly_does_not_teach_the_table():
+    table = BiasTable(MODEL)
+    gyro = Gyro(begun(table=table)).go(40.0, wheels=False)
+    entries = list(table.entries)
+    gyro.go(25.0, 0.3 * DEGREE)
+    gyro.go(10.0, 0.3)
+    assert len(entries) == 1 and table.entries[0].bias == pytest.approx(0.1 * DEGREE, abs=0.03 * DEGREE)
+    assert all(abs(each.bias - 0.1 * DEGREE) < 0.05 * DEGREE for each in table.entries)
+
+
+@pytest.mark.parametrize('rested', [12.0, 25.0])
+def test_a_rest_that_is_judged_when_it_is_warmer_teaches_the_table_all_the_same(rested):
+    gyro = Gyro(begun(temperature=25.0), coefficient=0.02 * DEGREE)
+    gyro.live.learn = lambda now: ''
+    gyro.go(rested).go(5.0, 0.3, temperature=35.0).go(8.0, temperature=35.0).go(1.0, 0.3, temperature=35.0)
+    del gyro.live.learn
+    gyro.live.learn(gyro.now + gyro.time)
+    assert [entry.bias for entry in gyro.live.table.entries] == [pytest.approx(0.1 * DEGREE, abs=0.05 * DEGREE)]

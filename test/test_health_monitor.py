@@ -1,0 +1,167 @@
+"""The live check against simulated gyros: as few false alarms as it states, over hours at rest, and none missed that matter."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyro_calibration.allan import even_record, fit_noise
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.model import SelfCalibration
+from gyro_calibration.motion import ROBOT
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.ros.health_monitor import STRETCH, Check, changed, examine, step_of
+
+INTERVAL = 0.02
+MEMS = Noise(1e-4, 3e-5, 2e-6)
+FOG = Noise(3e-5, 5e-6, 1e-7)
+
+
+def stretches(noise, hours, generator, scale=1.0):
+    """Return outputs of a gyro at rest as stretches of a check, shape (n, samples), less the mean of one ten minutes before."""
+    size, before = round(STRETCH / INTERVAL), round(600.0 / INTERVAL)
+    count = round(hours * 3600.0 / INTERVAL) // size * size
+    whole = simulate_noise(Noise(scale * noise.angle_random_walk, noise.bias_instability, noise.rate_random_walk), before + count, INTERVAL,
+                           generator)
+    return (whole[before:] - whole[:size].mean()).reshape(-1, size)
+
+
+def examined(outputs, noise, false_alarms, step=0.0):
+    """Examine each stretch by itself, with the level that a check would take, and return what they showed."""
+    time, level = np.arange(outputs.shape[1]) * INTERVAL, 0.25 * false_alarms * STRETCH / 3600.0
+    variance = noise.angle_random_walk ** 2 / STRETCH
+    return [examine(time, output, output, noise, level, step, variance, 600.0 + STRETCH * number) for number, output in enumerate(outputs)]
+
+
+@pytest.mark.parametrize('noise', [MEMS, FOG, Noise(1e-4)], ids=['MEMS', 'FOG', 'white'])
+@pytest.mark.parametrize('step', [0.0, 1e-4, 3e-3], ids=['fine', 'coarse', 'very coarse'])
+def test_single_stretches_alarm_in_vain_no_more_often_than_stated(noise, step):
+    """Stated are 40 in an hour, so that there would be something to see; within a run they come together, from run to run they do not."""
+    stated, minutes, generator, alarms, rests = 40.0, 6.0, np.random.default_rng(11), [], []
+    for _ in range(100):
+        outputs = stretches(noise, minutes / 60.0, generator)
+        if step:
+            outputs = (np.round(outputs / step + 0.3) - 0.3) * step
+        rests += examined(outputs, noise, stated, step)
+        alarms.append(sum(not rest.noise_fits or not rest.bias_fits for rest in rests[-len(outputs):] if rest is not None))
+    assert np.mean(alarms) <= stated * minutes / 60.0 + 4.0 * np.std(alarms) / math.sqrt(len(alarms))
+    assert sum(rest is not None for rest in rests) > 0.98 * len(rests), 'rest is not taken for motion'
+
+
+def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
+    """White noise, and a bias known to a standard deviation that was drawn each time: half of the stated alarms belong to the bias."""
+    stated, generator, size = 40.0, np.random.default_rng(12), round(STRETCH / INTERVAL)
+    level, time, deviation = 0.25 * stated * STRETCH / 3600.0, np.arange(size) * INTERVAL, 1e-4
+    outputs = generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), (4000, size)) + generator.normal(0.0, deviation, (4000, 1))
+    misfits = sum(not examine(time, output, output, Noise(1e-4), level, 0.0, deviation ** 2).bias_fits for output in outputs)
+    assert misfits == pytest.approx(4000 * 2.0 * level, abs=4.0 * math.sqrt(4000 * 2.0 * level))
+
+
+def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.0):
+    """Feed a check as the node does."""
+    for number, output in enumerate(np.ravel(outputs).tolist()):
+        if check.add(begin + number * INTERVAL, output, output):
+            check.examine(bias_variance, age, promised)
+    return check
+
+
+def test_a_check_of_a_day_at_rest_is_silent():
+    check, generator = Check(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(13)
+    for hour in range(24):
+        fed(check, stretches(MEMS, 1.0, generator)[:20], begin=3600.0 * hour)
+        assert not check.noise_alarm and not check.bias_alarm, hour
+    assert check.examined >= 24 * 18
+
+
+@pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
+def test_three_times_the_noise_is_found_in_one_stretch_where_rest_was_promised_and_in_three_otherwise(noise):
+    outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
+    assert 'the noise at rest is 3.' in fed(Check(noise, 0.001), outputs[:2], promised=True).noise_alarm.replace('2.9', '3.0')
+    assert not fed(Check(noise, 0.001), outputs[:2]).noise_alarm
+    assert 'or the robot shakes' in fed(Check(noise, 0.001), outputs[:5]).noise_alarm
+
+
+def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_misfit():
+    generator = np.random.default_rng(15)
+    double, more = (examined(stretches(MEMS, 1.0, generator, scale), MEMS, 0.001) for scale in (2.0, 1.1))
+    assert sum(rest is None or rest.noise_fits for rest in double) < 0.02 * len(double)
+    assert all(rest is None or rest.noise_fits for rest in more)
+
+
+@pytest.mark.parametrize('moved', [0.05 * DEGREE, 1.0 * DEGREE])
+def test_a_bias_that_moved_is_found(moved):
+    outputs = moved + stretches(MEMS, 0.1, np.random.default_rng(16))
+    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:5])
+    assert f'{check.last.bias / DEGREE:.4f} deg/s' in check.bias_alarm and not check.noise_alarm
+    assert check.last.bias == pytest.approx(moved, abs=0.02 * DEGREE)
+    check.recalibrated()
+    assert not check.bias_alarm
+    assert not fed(check, outputs[5:8] - moved, begin=100.0).bias_alarm
+
+
+def test_a_bias_whose_uncertainty_nobody_knows_is_not_judged():
+    outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
+    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
+    assert not check.bias_alarm and math.isnan(check.last.sigmas)
+
+
+def test_motion_is_not_taken_for_a_misfit():
+    """Half of the drive the robot stands, in the other half it turns, and its own wobble is a hundredth of that."""
+    time = np.arange(0.0, ROBOT.duration, INTERVAL)
+    check, generator = Check(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(18)
+    for drive in range(20):
+        wobble = np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same') * ROBOT.rate_at(time)
+        fed(check, ROBOT.rate_at(time) + wobble + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
+        assert not check.noise_alarm and not check.bias_alarm, drive
+
+
+def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(data):
+    """An ADIS16405 at rest for 10 000 s; the model has the noise of that record and the bias of its first 15 s."""
+    log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
+    record = even_record(log.time, log.output)
+    noise, rate = fit_noise(record.rate, record.interval).noise, log.output - log.output[:1500].mean()
+    half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
+    for claimed, length in ((noise, len(rate)), (half, 4000)):
+        check, alarmed = Check(claimed, 0.001, 0.3 * DEGREE), 0
+        for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(), rate[:length].tolist()):
+            if check.add(*sample):
+                check.examine(claimed.angle_random_walk ** 2 / 15.0, sample[0])
+                alarmed += bool(check.noise_alarm or check.bias_alarm)
+        assert check.examined == length // 1001 and bool(alarmed) == (claimed is half)
+
+
+def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged():
+    check = Check(MEMS, 0.001)
+    assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0) for number in range(600))
+    fed(check, np.zeros(2000), begin=100.0)
+    assert not check.examined and not check.noise_alarm
+
+
+def test_a_gyro_that_died_is_said_once_its_codes_are_known():
+    outputs = stretches(MEMS, 0.1, np.random.default_rng(19))
+    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:2])
+    fed(check, np.zeros(2500), begin=100.0)
+    assert 'look whether the gyro is alive' in check.noise_alarm
+
+
+def test_without_noise_figures_there_is_nothing_to_check():
+    assert not Check(Noise(), 0.001).works and not Check(MEMS, 0.0).works and Check(MEMS, 0.001).works
+
+
+def test_the_step_of_codes_is_their_smallest_difference():
+    assert step_of(np.array([0.0, 3.0, 3.0, 1.0, 2.5])) == 1.5 and step_of(np.zeros(5)) == math.inf
+
+
+def test_a_calibration_that_changed_by_more_than_chance_is_said_in_vain_as_often_as_stated():
+    generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
+    covariance, said, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
+    wander = math.sqrt(MEMS.wander(age, STRETCH))
+    for _ in range(2000):
+        first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(), covariance) for _ in range(2))
+        second = SelfCalibration(second.scale_factor_error, second.bias + wander * generator.normal(), covariance)
+        said += bool(changed(first, second, MEMS, age, level))
+    assert said == pytest.approx(2000 * level, abs=4.0 * math.sqrt(2000 * level))
+    moved = changed(first, SelfCalibration(first.scale_factor_error + 0.02, first.bias + 1.0 * DEGREE, covariance), MEMS, age, 1e-3)
+    assert 'the scale factor error by 2.000 % and the bias by 1.0000 deg/s' in moved
+    assert not changed(SelfCalibration(), second, MEMS, age, level), 'nothing was known before'
