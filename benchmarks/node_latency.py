@@ -41,7 +41,7 @@ from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise
-from gyro_calibration.ros.runner import SENSOR_QUALITY
+from gyro_calibration.ros.runner import SENSOR_QOS
 
 RATES = (100, 1000)  # Hz
 ROUNDS = 4
@@ -81,8 +81,8 @@ def relay() -> None:
     """Publish each message as it comes, run as most nodes in Python are."""
     rclpy.init(args=sys.argv)
     node = rclpy.create_node('relay')
-    publisher = node.create_publisher(Imu, 'imu/data', SENSOR_QUALITY)
-    node.create_subscription(Imu, 'imu/data_raw', publisher.publish, SENSOR_QUALITY)
+    publisher = node.create_publisher(Imu, 'imu/data', SENSOR_QOS)
+    node.create_subscription(Imu, 'imu/data_raw', publisher.publish, SENSOR_QOS)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
@@ -116,9 +116,9 @@ class Probe:
     def __init__(self, subject: str, process: int):
         self._subject, self._process = subject, process
         self._node = rclpy.create_node('probe', namespace=subject)
-        self._imu = self._node.create_publisher(Imu, 'imu/data_raw', SENSOR_QUALITY)
-        self._temperature = self._node.create_publisher(Temperature, 'imu/temperature', SENSOR_QUALITY)
-        self._subscription = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QUALITY).handle
+        self._imu = self._node.create_publisher(Imu, 'imu/data_raw', SENSOR_QOS)
+        self._temperature = self._node.create_publisher(Temperature, 'imu/temperature', SENSOR_QOS)
+        self._subscription = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QOS).handle
         self._wait_set = implementation.WaitSet(1, 0, 0, 0, 0, 0, self._node.context.handle)
         self._listen_idly()
         self._message = Imu()
@@ -129,7 +129,7 @@ class Probe:
         """Have the other messages sent as well, but take no time here to read them: nobody serves these subscriptions."""
         self._listener = rclpy.create_node('listener', namespace=self._subject)
         for topic in ('yaw_rate', 'heading'):
-            self._listener.create_subscription(Float64, topic, print, SENSOR_QUALITY)
+            self._listener.create_subscription(Float64, topic, print, SENSOR_QOS)
 
     def wait_for_subject(self) -> None:
         """

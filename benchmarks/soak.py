@@ -7,7 +7,7 @@ The whole graph for an hour: emulated gyro -> driver_node -> compensation_node -
 
 The emulated KVH 1750 turns at rates that hold the number of the sample, so the subscriber knows of each corrected rate which sample it is:
 none may be missing and none come twice. Latency is counted from when a sample is due on the line until its corrected rate is taken by the
-subscriber, so emulator, driver, compensation and two hops of DDS are in it. Memory is the resident memory of a process: the median of the
+subscriber, so emulator, driver, compensation and two hops of DDS are in it. StateStore is the resident memory of a process: the median of the
 last tenth of the run against that of its second tenth, for the first one is the warm-up.
 
 At the full line rate the baud decides how many samples come. A driver that gets more than 1 kHz publishes means of several samples; the
@@ -48,7 +48,7 @@ from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise
-from gyro_calibration.ros.runner import SENSOR_QUALITY
+from gyro_calibration.ros.runner import SENSOR_QOS
 
 SOAKED, SOAKED_RATE = 'kvh_1750', 1000.0  # Hz
 SMALLEST = 0.5  # rad/s; of a numbered sample
@@ -166,7 +166,7 @@ class Counter:
     def __init__(self, given: argparse.Namespace):
         self._given, self._numbers = given, shared(given.folder)
         self._node = rclpy.create_node('counter')
-        self._rates = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QUALITY).handle
+        self._rates = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QOS).handle
         self._reports = self._node.create_subscription(DiagnosticArray, '/diagnostics', print, 10).handle
         self._wait_set = implementation.WaitSet(2, 0, 0, 0, 0, 0, self._node.context.handle)
         self._latencies = np.zeros(1000, int)

@@ -39,7 +39,7 @@ from gyro_calibration.motion import CALIBRATION, Motion, turns
 from gyro_calibration.noise import simulate_noise
 from gyro_calibration.picture import draw_headings
 from gyro_calibration.reproduction.hong_park import TABLE_1
-from gyro_calibration.ros.runner import SENSOR_QUALITY
+from gyro_calibration.ros.runner import SENSOR_QOS
 
 PROTOCOL = 'kvh_dsp3000'
 NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
@@ -109,8 +109,8 @@ class Client:
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', self._hear_raw, SENSOR_QUALITY)
-        self._node.create_subscription(Imu, 'imu/data', self._hear_heading, SENSOR_QUALITY)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._hear_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', self._hear_heading, SENSOR_QOS)
         self._node.create_subscription(Twist, 'cmd_vel', robot.obey, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()

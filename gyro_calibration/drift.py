@@ -163,11 +163,12 @@ class Drift:
         covariance[place, place] += variance
         return replace(self, covariance=covariance)
 
-    def turned_to(self, heading: float) -> Drift:
-        """Return the state with the heading known exactly."""
+    def turned_to(self, heading: float, variance: float = 0.0) -> Drift:
+        """Return the state with another heading, rad, and its variance, rad²."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[HEADING] = heading
         covariance[HEADING] = covariance[:, HEADING] = 0.0
+        covariance[HEADING, HEADING] = variance
         return replace(self, mean=mean, covariance=covariance)
 
 

@@ -194,6 +194,14 @@ class HeadingTracker:
         if self.resting:
             self._rest()
 
+    def rewind(self, heading: float, variance: float) -> None:
+        """Go back to a heading, rad, with its variance, rad²; the bias stays."""
+        self._settle()
+        self._recognize()
+        self.heading, self._doubt = heading, None
+        self._drift = self._drift.turned_to(heading, variance)
+        self._take()
+
     @property
     def variance(self) -> float:
         """Return the variance of the heading, rad²; what is still to be taken over counts too."""

@@ -336,8 +336,8 @@ class Ros:
 
 
 def _sensor_quality():
-    from gyro_calibration.ros.runner import SENSOR_QUALITY
-    return SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QOS
+    return SENSOR_QOS
 
 
 @pytest.fixture

@@ -121,5 +121,5 @@ def start_with_gyro(start_node, ros, wait_until, folder, model, interval, restin
 
 
 def _latched():
-    from gyro_calibration.ros.runner import LATCHED_QUALITY
-    return LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QOS
+    return LATCHED_QOS

@@ -439,6 +439,7 @@ def wild_value(data: bytes) -> object:
 
 def check_parameters(data: bytes) -> bool:
     from gyro_calibration.ros.compensation_settings import PARAMETERS
+
     from gyro_calibration.ros.driver_node import PARAMETERS as OF_DRIVER
     table = [*PARAMETERS, *OF_DRIVER]
     parameter, value = table[(data[0] if data else 0) % len(table)], wild_value(data[1:])

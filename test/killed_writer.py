@@ -19,7 +19,7 @@ from pathlib import Path
 
 from gyro_calibration.bias_table import Prior
 from gyro_calibration.model import SelfCalibration
-from gyro_calibration.ros.state_store import Memory
+from gyro_calibration.ros.state_store import StateStore
 
 FILES = ('calibration.yaml', 'biases.yaml')
 BEGIN, STEP = 1.7e9, 86400.0  # s since 1970, and from one run of the robot to the next
@@ -27,7 +27,7 @@ BEGIN, STEP = 1.7e9, 86400.0  # s since 1970, and from one run of the robot to t
 
 def opened(folder):
     """Return the memory of a robot that starts."""
-    return Memory('', folder / FILES[0], folder / FILES[1], Prior())
+    return StateStore('', folder / FILES[0], folder / FILES[1], Prior())
 
 
 def write(memory, number):

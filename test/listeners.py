@@ -15,7 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
-from gyro_calibration.ros.runner import SENSOR_QUALITY
+from gyro_calibration.ros.runner import SENSOR_QOS
 
 
 def listener(number):
@@ -23,7 +23,7 @@ def listener(number):
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node(f'listener_{number}', context=context)
-    node.create_subscription(Imu, 'imu/data', lambda message: None, SENSOR_QUALITY)
+    node.create_subscription(Imu, 'imu/data', lambda message: None, SENSOR_QOS)
     node.create_subscription(DiagnosticArray, '/diagnostics', lambda message: None, 10)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

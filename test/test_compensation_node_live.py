@@ -106,8 +106,8 @@ def _parameters_act_and_are_checked(gyro, ros):
 
 
 def _latched():
-    from gyro_calibration.ros.runner import LATCHED_QUALITY
-    return LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QOS
+    return LATCHED_QOS
 
 
 def test_wheels_and_commands_decide_on_slow_turns(start, ros):

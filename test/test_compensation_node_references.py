@@ -74,8 +74,8 @@ def test_odometry_is_a_reference(start, ros, tmp_path):
 
 
 def _latched():
-    from gyro_calibration.ros.runner import LATCHED_QUALITY
-    return LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QOS
+    return LATCHED_QOS
 
 
 def test_without_odometry_it_is_refused_and_the_reason_stays_in_the_diagnostics(start):

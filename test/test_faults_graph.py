@@ -93,8 +93,8 @@ class Heard:
 
 
 def _quality():
-    from gyro_calibration.ros.runner import SENSOR_QUALITY
-    return SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QOS
+    return SENSOR_QOS
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import STRETCH, Check, changed, examine, step_of
+from gyro_calibration.ros.health_monitor import STRETCH, HealthMonitor, changed, examine, step_of
 
 INTERVAL = 0.02
 MEMS = Noise(1e-4, 3e-5, 2e-6)
@@ -67,7 +67,7 @@ def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.
 
 
 def test_a_check_of_a_day_at_rest_is_silent():
-    check, generator = Check(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(13)
+    check, generator = HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(13)
     for hour in range(24):
         fed(check, stretches(MEMS, 1.0, generator)[:20], begin=3600.0 * hour)
         assert not check.noise_alarm and not check.bias_alarm, hour
@@ -77,9 +77,9 @@ def test_a_check_of_a_day_at_rest_is_silent():
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
 def test_three_times_the_noise_is_found_in_one_stretch_where_rest_was_promised_and_in_three_otherwise(noise):
     outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
-    assert 'the noise at rest is 3.' in fed(Check(noise, 0.001), outputs[:2], promised=True).noise_alarm.replace('2.9', '3.0')
-    assert not fed(Check(noise, 0.001), outputs[:2]).noise_alarm
-    assert 'or the robot shakes' in fed(Check(noise, 0.001), outputs[:5]).noise_alarm
+    assert 'the noise at rest is 3.' in fed(HealthMonitor(noise, 0.001), outputs[:2], promised=True).noise_alarm.replace('2.9', '3.0')
+    assert not fed(HealthMonitor(noise, 0.001), outputs[:2]).noise_alarm
+    assert 'or the robot shakes' in fed(HealthMonitor(noise, 0.001), outputs[:5]).noise_alarm
 
 
 def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_misfit():
@@ -92,7 +92,7 @@ def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_mi
 @pytest.mark.parametrize('moved', [0.05 * DEGREE, 1.0 * DEGREE])
 def test_a_bias_that_moved_is_found(moved):
     outputs = moved + stretches(MEMS, 0.1, np.random.default_rng(16))
-    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:5])
+    check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5])
     assert f'{check.last.bias / DEGREE:.4f} deg/s' in check.bias_alarm and not check.noise_alarm
     assert check.last.bias == pytest.approx(moved, abs=0.02 * DEGREE)
     check.recalibrated()
@@ -102,14 +102,14 @@ def test_a_bias_that_moved_is_found(moved):
 
 def test_a_bias_whose_uncertainty_nobody_knows_is_not_judged():
     outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
-    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
+    check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
     assert not check.bias_alarm and math.isnan(check.last.sigmas)
 
 
 def test_motion_is_not_taken_for_a_misfit():
     """Half of the drive the robot stands, in the other half it turns, and its own wobble is a hundredth of that."""
     time = np.arange(0.0, ROBOT.duration, INTERVAL)
-    check, generator = Check(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(18)
+    check, generator = HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(18)
     for drive in range(20):
         wobble = np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same') * ROBOT.rate_at(time)
         fed(check, ROBOT.rate_at(time) + wobble + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
@@ -123,7 +123,7 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(da
     noise, rate = fit_noise(record.rate, record.interval).noise, log.output - log.output[:1500].mean()
     half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
     for claimed, length in ((noise, len(rate)), (half, 4000)):
-        check, alarmed = Check(claimed, 0.001, 0.3 * DEGREE), 0
+        check, alarmed = HealthMonitor(claimed, 0.001, 0.3 * DEGREE), 0
         for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(), rate[:length].tolist()):
             if check.add(*sample):
                 check.examine(claimed.angle_random_walk ** 2 / 15.0, sample[0])
@@ -132,7 +132,7 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(da
 
 
 def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged():
-    check = Check(MEMS, 0.001)
+    check = HealthMonitor(MEMS, 0.001)
     assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0) for number in range(600))
     fed(check, np.zeros(2000), begin=100.0)
     assert not check.examined and not check.noise_alarm
@@ -140,13 +140,13 @@ def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged
 
 def test_a_gyro_that_died_is_said_once_its_codes_are_known():
     outputs = stretches(MEMS, 0.1, np.random.default_rng(19))
-    check = fed(Check(MEMS, 0.001, 0.3 * DEGREE), outputs[:2])
+    check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:2])
     fed(check, np.zeros(2500), begin=100.0)
     assert 'look whether the gyro is alive' in check.noise_alarm
 
 
 def test_without_noise_figures_there_is_nothing_to_check():
-    assert not Check(Noise(), 0.001).works and not Check(MEMS, 0.0).works and Check(MEMS, 0.001).works
+    assert not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works and HealthMonitor(MEMS, 0.001).works
 
 
 def test_the_step_of_codes_is_their_smallest_difference():

@@ -6,7 +6,7 @@ import pytest
 
 from gyro_calibration.bias_table import INTERVAL, Prior
 from gyro_calibration.model import SelfCalibration
-from gyro_calibration.ros.state_store import Memory
+from gyro_calibration.ros.state_store import StateStore
 
 NOW = 1.7e9
 
@@ -18,7 +18,7 @@ def remember(tmp_path):
             (tmp_path / 'model.yaml').write_text(model)
         for name, text in files.items():
             (tmp_path / f'{name}.yaml').write_text(text)
-        return Memory(str(tmp_path / 'model.yaml') if model else '', tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
+        return StateStore(str(tmp_path / 'model.yaml') if model else '', tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
     return remember
 
 
@@ -66,7 +66,7 @@ def test_a_damaged_table_is_told_and_kept(remember, tmp_path):
 
 def test_a_folder_that_cannot_be_written_to_is_told_and_not_tried_each_second(tmp_path):
     (tmp_path / 'file').write_text('')
-    memory = Memory('', tmp_path / 'calibration.yaml', tmp_path / 'file' / 'biases.yaml', Prior())
+    memory = StateStore('', tmp_path / 'calibration.yaml', tmp_path / 'file' / 'biases.yaml', Prior())
     taught(memory)
     memory.keep_table(NOW)
     assert 'cannot be written' in memory.table_hint and memory.written is None

@@ -421,8 +421,8 @@ def test_publishers_that_come_late_or_with_another_quality_are_heard(ros, record
 
 
 def ros_quality():
-    from gyro_calibration.ros.runner import SENSOR_QUALITY
-    return SENSOR_QUALITY
+    from gyro_calibration.ros.runner import SENSOR_QOS
+    return SENSOR_QOS
 
 
 def _messages(path, topic):

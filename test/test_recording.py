@@ -15,7 +15,7 @@ try:
     from sensor_msgs.msg import Imu
     from std_srvs.srv import Trigger
 
-    from gyro_calibration.ros.runner import LATCHED_QUALITY
+    from gyro_calibration.ros.runner import LATCHED_QOS
 except ImportError:
     pass  # the fixture `ros` skips, and says why
 
@@ -77,7 +77,7 @@ def test_calibrated_on_20_s_the_published_heading_follows_the_encoder_for_five_m
     calibrate = ros.node.create_client(Trigger, 'calibrate')
     assert calibrate.wait_for_service(30.0)
     answer = calibrate.call_async(Trigger.Request())
-    status = ros.collect(DiagnosticStatus, 'calibration_status', LATCHED_QUALITY)
+    status = ros.collect(DiagnosticStatus, 'calibration_status', LATCHED_QOS)
     wait_until(lambda: status and status[-1].message.startswith('calibrating'), what='the calibration to begin')
     samples = [Sample(rate, time=t) for t, rate in zip(time.tolist(), output.tolist())]
     settings = Settings(columns=('time_s', 'gyro_dps'))

@@ -1,9 +1,8 @@
 """
-From raw to corrected rates, and from those to the heading, on a robot.
+Corrected rates and the heading on a robot: joins `pipeline` to topics, services and timers.
 
-Joins the rooms to topics: ``imu/data_raw``, ``imu/temperature``, and what is known of the wheels, to `live_heading`; that to ``imu/data``,
-``yaw_rate``, ``heading`` and ``heading_with_covariance``. Calibrations are in `calibration_services`, diagnostics in
-`compensation_report`, files in `memory`.
+``imu/data_raw``, ``imu/temperature``, ``odom`` and ``cmd_vel`` go in; ``imu/data``, ``heading``,
+``yaw_rate``, ``~/calibration_status`` and diagnostics come out.
 
 """
 
@@ -12,323 +11,345 @@ from __future__ import annotations
 import math
 import os
 import sys
-import time as clock
-from collections.abc import Callable
+import time
 from pathlib import Path
-from typing import TypeVar
+from types import SimpleNamespace
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry
-from rclpy.clock import ROSClock
-from rclpy.node import Node, PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Bool, Float64, Header
-
-from gyro_calibration.bias_table import Prior
-from gyro_calibration.driver.host_clock import Stamps, both, steady
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.ros.calibration_run import REST
-from gyro_calibration.ros.calibration_services import CalibrationServices
-from gyro_calibration.ros.compensation_report import Journal, Rooms, state, trouble, values
-from gyro_calibration.ros.compensation_settings import PARAMETERS, assumptions, standing_wheels, tracking_settings
-from gyro_calibration.ros.diagnostics import Diagnostics, Report
-from gyro_calibration.ros.health_monitor import Check
-from gyro_calibration.ros.runner import (
-    LATCHED_QUALITY,
-    NOT_REPORTED,
-    SENSOR_QUALITY,
-    UNMEASURED_VARIANCE,
-    call_every,
-    current,
-    declare,
-    run,
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import (
+    PoseWithCovarianceStamped,
+    Twist,
+    TwistStamped,
+    TwistWithCovarianceStamped,
 )
-from gyro_calibration.ros.state_store import Memory
-from gyro_calibration.ros.wheels import COMMAND, ODOMETRY, Wheels
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import ROSClock
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.task import Future
+from sensor_msgs.msg import Imu, Temperature
+from std_srvs.srv import Trigger
 
-# By default rclpy watches each topic for partners whose quality does not fit, and asks at every wake-up, which at 1 kHz costs 2 % of a
-# core a topic. Every quality fits a subscription that asks for the least, and a publisher that offers the most.
-_UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
-_UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
+from gyro_calibration.driver.host_clock import steady
+from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
+from gyro_calibration.ros.calibration_session import REST, Drive
+from gyro_calibration.ros.compensation_report import CompensationReport, calibration_status
+from gyro_calibration.ros.diagnostics import Diagnostics, Report, status_array
+from gyro_calibration.ros.pipeline import NSEC_PER_SEC, PARAMETERS, Output, Pipeline
+from gyro_calibration.ros.runner import (
+    LATCHED_QOS,
+    call_every,
+    declare,
+    publish_on,
+    run,
+    subscribe_to,
+)
+from gyro_calibration.ros.wheels import Velocity
 
-_Message = TypeVar('_Message')
+Answer = tuple[bool, str]
+_NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
 
-#: Samples that are used before services, timers and other topics have their turn.
-_MOST_AT_ONCE = 100
-#: A gyro that was silent for so long, s, may have been without power, and turned on with another bias.
-SILENT = 10.0
+
+class NodeClock:
+    """The clocks of a node; see `clock.Clock`."""
+
+    def __init__(self, node: Node):
+        """Read ROS time from a node."""
+        self._clock = node.get_clock()
+
+    def steady(self) -> float:
+        """Return seconds that nobody sets."""
+        return steady()
+
+    def date(self) -> float:
+        """Return seconds since 1970."""
+        return time.time()
+
+    def simulated(self) -> float | None:
+        """Return the time of a simulation, s; None where there is none."""
+        clock = self._clock
+        if isinstance(clock, ROSClock) and clock.ros_time_is_active:
+            return clock.now().nanoseconds / NSEC_PER_SEC
+        return None
 
 
 class CompensationNode(Node):
     """Publish corrected rates and the heading, and calibrate on request."""
 
     def __init__(self) -> None:
-        """Read the model and the last calibration; what is wrong with them is reported, and raw rates are published meanwhile."""
+        """Read the model and the last calibration; raw rates go on where they are wrong."""
         super().__init__('compensation_node')
-        settings = self._settings = declare(self, PARAMETERS)
-        calibration = Path(settings.calibration_file or self._default_path()).expanduser()
-        bias_file = Path(settings.bias_file or calibration.with_name(f'{calibration.stem}_biases.yaml')).expanduser()
-        memory = Memory(settings.model_file, calibration, bias_file, Prior(coefficient=settings.bias_temperature_coefficient))
-        if memory.problem:
-            self.get_logger().error(memory.problem)
-        self._tracking = tracking_settings(settings, memory.model.noise)
-        live = HeadingEstimator(memory.model, memory.table, assumptions(settings), self._tracking,
-                                settings.temperature_timeout, clock.time())
-        check = Check(memory.model.noise, settings.check_false_alarms, self._tracking.threshold.rate)
-        self._rooms = Rooms(live, memory, check, Wheels(standing_wheels(settings)), Journal(self._now()))
-        self._epoch: int | None = None
-        self._stamps = Stamps()
-        self._last_time, self._interval, self._offset = -math.inf, math.inf, round(1e9 * memory.model.true_time(0.0))
-        self._make_messages()
+        values = declare(self, PARAMETERS, self._set)
+        self._values, clock = values, NodeClock(self)
+        self._velocity: Publisher | None = None
+        self._stamped = values.cmd_vel_stamped
+        self._pipeline = Pipeline(values, self._calibration_file(), clock, self._command)
+        if problem := self._pipeline.store.problem:
+            self.get_logger().error(problem)
+        self._sources: list[str] = []
+        self._receivers = 0
+        self._answered: Future | None = None
+        self._assumed_variance = values.assumed_bias ** 2
         self._connect()
-        self._calibrations = CalibrationServices(self, self._rooms, self._show_state, self._now)
-        self._show_state()
+        self._report = CompensationReport(self._pipeline, clock)
+        self._diagnostics = Diagnostics(self, 'heading', self._make_report)
+        self._offer_services()
+        call_every(self, 0.2, self._watch)
+        call_every(self, 1.0, self._pipeline.learn)
+        self._timer = call_every(self, Drive.INTERVAL, self._drive)
+        self._timer.cancel()  # a wake-up costs as much as a sample
+        self._show_status()
 
-    def _default_path(self) -> Path:
-        home = os.environ.get('ROS_HOME', '~/.ros')
-        return Path(home) / 'gyro_calibration' / f'{self.get_fully_qualified_name().strip("/").replace("/", "_")}.yaml'
+    def _calibration_file(self) -> Path:
+        if self._values.calibration_file:
+            return Path(self._values.calibration_file).expanduser()
+        home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
+        name = self.get_fully_qualified_name().strip('/').replace('/', '_')
+        return home / 'gyro_calibration' / f'{name}.yaml'
 
     def _connect(self) -> None:
-        self._imu = self.create_publisher(Imu, 'imu/data', SENSOR_QUALITY)
-        self._yaw_rate = self.create_publisher(Float64, 'yaw_rate', SENSOR_QUALITY)
-        self._yaw = self.create_publisher(Float64, 'heading', SENSOR_QUALITY)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'heading_with_covariance', SENSOR_QUALITY)
-        self._status = self.create_publisher(DiagnosticStatus, 'calibration_status', LATCHED_QUALITY, event_callbacks=_UNWATCHED_PUBLISHER)
-        self._calibrated = self.create_publisher(Bool, 'calibrated', LATCHED_QUALITY, event_callbacks=_UNWATCHED_PUBLISHER)
-        self._samples = self._listen(Imu, 'imu/data_raw', self._on_imu)
-        self._temperatures = self._listen(Temperature, 'imu/temperature', self._on_temperature)
-        self._hears_odometry = False
-        if self._settings.wheels in ('odom', 'both'):
-            self._hear_odometry()
-        if self._settings.wheels in ('cmd_vel', 'both'):
-            self._listen(TwistStamped if self._settings.cmd_vel_stamped else Twist, 'cmd_vel', self._on_command)
-        self._diagnostics = Diagnostics(self, 'heading', self._report)
-        call_every(self, 0.2, self._watch)
-        call_every(self, 1.0, self._learn)
-
-    def _listen(self, message_type: type[_Message], topic: str, callback: Callable[[_Message], None]) -> Subscription:
-        return self.create_subscription(message_type, topic, callback, SENSOR_QUALITY, event_callbacks=_UNWATCHED_SUBSCRIPTION)
-
-    def _hear_odometry(self) -> None:
-        if not self._hears_odometry:
-            self._hears_odometry = True
-            self._listen(Odometry, 'odom', self._on_odometry)
-
-    def _make_messages(self) -> None:
-        """Make the messages once; only their values change from sample to sample."""
-        self._imu_message, self._rate_message, self._heading_message = Imu(), Float64(), Float64()
-        self._imu_message.linear_acceleration_covariance[0] = NOT_REPORTED
-        self._pose_message, self._pose_wanted = PoseWithCovarianceStamped(), False
+        self._imu = publish_on(self, Imu, 'imu/data')
+        self._heading = publish_on(self, PoseWithCovarianceStamped, 'heading')
+        self._yaw_rate = publish_on(self, TwistWithCovarianceStamped, 'yaw_rate')
+        self._status = publish_on(self, DiagnosticArray, '~/calibration_status', LATCHED_QOS)
+        self._wanted = {self._heading: False, self._yaw_rate: False}
+        self._pose_message = PoseWithCovarianceStamped()
+        self._pose_message.header.frame_id = self._values.heading_frame
+        self._rate_message = TwistWithCovarianceStamped()
         for place in range(5):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
+            self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
+        subscribe_to(self, Temperature, 'imu/temperature', self._on_temperature)
+        self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
+        subscribe_to(self, Odometry, 'odom', self._on_odometry)
+        subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
+        if self._values.calibration_drive:
+            self._learn_to_drive()  # where it cannot, calibrate reports it
 
-    # Samples
+    def _set(self, values: SimpleNamespace) -> None:
+        self._values = values
+        self._pipeline.set(values)
 
-    def _now(self) -> float:
-        """Return seconds that nobody sets, or those of a simulation."""
-        return self.get_clock().now().nanoseconds * 1e-9 if self._simulated else steady()
-
-    @property
-    def _simulated(self) -> bool:
-        own = self.get_clock()
-        return isinstance(own, ROSClock) and own.ros_time_is_active
-
-    def _since_epoch(self, header: Header) -> float:
-        """Return a stamp in s since the first one's second, where a double still resolves nanoseconds."""
-        stamp = header.stamp
-        if self._epoch is None:
-            self._epoch = stamp.sec
-        return stamp.sec - self._epoch + 1e-9 * stamp.nanosec
-
-    def _time(self, header: Header) -> float:
-        """Return the time of what came beside the samples, s."""
-        since = self._since_epoch(header)
-        return since if self._last_time == -math.inf else self._stamps.of_other(since, self._last_time)
-
-    def _time_of_sample(self, header: Header) -> float:
-        """Return the time of a sample, s; where somebody set the clock of this host, its times go on all the same."""
-        if self._simulated:
-            return self._since_epoch(header)
-        self._see_clock()
-        return self._stamps.of_sample(self._since_epoch(header), self._last_time, self._interval)
-
-    def _see_clock(self) -> None:
-        """Look whether somebody set the clock of this host, and take dates that the old one gave for those of the new one."""
-        read, rooms = both(), self._rooms
-        if not read or not (step := self._stamps.watch(*read)):
-            return
-        rooms.journal.event = f'the clock of this computer was set by {step:+.1f} s; the heading goes on'
-        rooms.journal.clock_set = f'{self._stamps.steps} time{"s" * (self._stamps.steps > 1)}, last by {step:+.1f} s'
-        rooms.live.clock_was_set(step)
-        if rooms.memory.written is not None:
-            rooms.memory.written += step
-        if rooms.live.calibrated_now and rooms.live.model.self_calibration:
-            rooms.memory.keep(rooms.live.model.self_calibration)
+    # What comes in
 
     def _on_temperature(self, message: Temperature) -> None:
-        if math.isfinite(message.temperature):
-            self._rooms.live.hear_temperature(self._time(message.header), message.temperature)
+        self._pipeline.temperature(_stamp(message.header), message.temperature)
 
     def _on_odometry(self, message: Odometry) -> None:
-        if self._settings.wheels in ('odom', 'both'):
-            self._rooms.wheels.hear(ODOMETRY, message.twist.twist, self._now())
-        if self._calibrations.run:
-            turned = message.pose.pose.orientation
-            heading = math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y ** 2 + turned.z ** 2))
-            self._calibrations.run.odometry.append((self._time(message.header), heading, message.twist.twist.angular.z))
+        turned = message.pose.pose.orientation
+        heading = math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y),
+                             1.0 - 2.0 * (turned.y ** 2 + turned.z ** 2))
+        self._pipeline.odometry(_stamp(message.header), heading, _velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
-        self._rooms.wheels.hear(COMMAND, message.twist if isinstance(message, TwistStamped) else message, self._now())
+        self._pipeline.command(_velocity(message.twist if self._stamped else message))
+        self._answer_ended()
 
     def _on_imu(self, message: Imu) -> None:
-        """Use a sample, and at once those that wait behind it: a round of the executor takes longer than a sample does."""
-        self._use(message)
-        for _ in range(_MOST_AT_ONCE):
-            if not (taken := self._samples.handle.take_message(Imu, False)):
-                return
-            # a driver sends the temperature first, and a sample shall not overtake its own
-            if temperature := self._temperatures.handle.take_message(Temperature, False):
-                self._on_temperature(temperature[0])
-            self._use(taken[0])
-
-    def _use(self, message: Imu) -> None:
-        output, journal, live = message.angular_velocity.z, self._rooms.journal, self._rooms.live
-        journal.counts['samples'] += 1
-        if not math.isfinite(output):
-            journal.counts['not_finite'] += 1
-            return
-        now = self._now()
-        time = self._time_of_sample(message.header)
-        if time == self._last_time:
-            journal.counts['stamps_ignored'] += 1
-            journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
-            return
-        if 0.0 < time - self._last_time <= self._settings.maximum_gap:
-            self._interval = min(time - self._last_time, live.tracker.intervals.usual)
-        if self._was_silent(time, now):
-            live.begin_run(clock.time())
-        self._last_time, journal.heard = time, now
-        said = live.add(time, output, clock.time(), self._force(message), self._rooms.wheels.moving(now))
-        journal.counts['temperature_clipped'] += int(live.last.temperature_clipped)
-        journal.counts['beyond_range'] += int(live.last.beyond_range)
-        journal.counts['lost_samples'] = live.tracker.intervals.lost
-        if said:
-            self._note(said)
-        check = self._rooms.check
-        if check.works and check.add(time, output, live.corrected):
-            self._examine()
-        self._calibrations.add(time, output, now)
-        self._publish(message.header)
-
-    def _was_silent(self, time: float, now: float) -> bool:
-        """Tell whether the gyro may have been without power before this sample; it was not where samples waited while the node was busy."""
-        since = time - self._last_time
-        return now - self._rooms.journal.heard > SILENT and since < math.inf and not 0.0 < since < SILENT
-
-    def _force(self, message: Imu) -> float | None:
-        """Return the specific force about z, where the message reports it."""
         force = message.linear_acceleration.z
-        known = message.linear_acceleration_covariance[0] != NOT_REPORTED and math.isfinite(force)
-        self._rooms.journal.brought = {'specific_force'} if known else set()
-        return force if known else None
+        reported = message.linear_acceleration_covariance[0] != NOT_REPORTED
+        known = force if reported and math.isfinite(force) else None
+        output = message.angular_velocity.z
+        if message.angular_velocity_covariance[0] == NOT_REPORTED:
+            output = math.nan  # REP-145: the message holds no rate
+        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers)
+        if found is not None:
+            self._publish(message, found)
+        if self._answered is not None:
+            self._answer_ended()
 
-    def _examine(self) -> None:
-        """Compare a stretch of samples with what the calibration claims; during a calibration at rest, rest is promised."""
-        live, run = self._rooms.live, self._calibrations.run
-        self._rooms.check.examine(live.bias_variance, live.known_for(clock.time()), run is not None and run.kind == REST)
+    # What goes out
 
-    def _note(self, restarted: str) -> None:
-        """Report that integration began anew; a calibration cannot go on over that."""
-        self._rooms.check.restart()
-        self._rooms.journal.counts['restarts'] += 1
-        self._rooms.journal.event = f'{restarted}: integration began anew'
-        self._calibrations.interrupt(restarted)
-
-    # What is published
-
-    def _publish(self, header: Header) -> None:
-        imu, live = self._imu_message, self._rooms.live
-        heading = live.tracker.heading
-        imu.header = self._true(header)
-        imu.angular_velocity.z = live.rate
-        imu.orientation.z, imu.orientation.w = math.sin(0.5 * heading), math.cos(0.5 * heading)
-        known = live.model.noise.angle_random_walk > 0.0 and not self._rooms.memory.problem and self._interval < math.inf
-        self._set_covariances(imu, known)
+    def _publish(self, imu: Imu, found: Output) -> None:
+        """Publish the message that came with its z corrected, and the heading."""
+        sec, nanosec = divmod(found.stamp, NSEC_PER_SEC)
+        imu.header.stamp.sec, imu.header.stamp.nanosec = sec, nanosec
+        imu.angular_velocity.z = found.rate
+        xx, xy, _, yx, yy, *_ = imu.angular_velocity_covariance.tolist()
+        x, y, acceleration = imu.angular_velocity.x, imu.angular_velocity.y, imu.linear_acceleration
+        if not math.isfinite(x + y + xx + xy + yx + yy):
+            imu.angular_velocity.x = imu.angular_velocity.y = xy = yx = 0.0
+            xx = yy = UNMEASURED_VARIANCE
+        elif not (xx or yy):  # all zeros: not known
+            xx = yy = self._assumed_variance
+        imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
+                                              found.rate_variance)
+        if not math.isfinite(acceleration.x + acceleration.y + acceleration.z
+                             + sum(imu.linear_acceleration_covariance.tolist())):
+            acceleration.x = acceleration.y = acceleration.z = 0.0
+            imu.linear_acceleration_covariance[:] = _NOT_REPORTED
+        half = 0.5 * found.heading
+        turned = imu.orientation
+        turned.x = turned.y = 0.0
+        turned.z, turned.w = math.sin(half), math.cos(half)
+        imu.orientation_covariance[:] = (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE,
+                                         0.0, 0.0, 0.0, found.heading_variance)
         self._imu.publish(imu)
-        self._rate_message.data, self._heading_message.data = live.rate, heading
-        self._yaw_rate.publish(self._rate_message)
-        self._yaw.publish(self._heading_message)
-        if self._pose_wanted:
+        if self._wanted[self._heading]:
             pose = self._pose_message
-            pose.header, pose.pose.pose.orientation = imu.header, imu.orientation
-            pose.pose.covariance[35] = imu.orientation_covariance[8] if known else UNMEASURED_VARIANCE
-            self._pose.publish(pose)
+            pose.header.stamp, pose.pose.pose.orientation = imu.header.stamp, turned
+            pose.pose.covariance[35] = found.heading_variance
+            self._heading.publish(pose)
+        if self._wanted[self._yaw_rate]:
+            rate = self._rate_message
+            rate.header, rate.twist.twist.angular.z = imu.header, found.rate
+            rate.twist.covariance[35] = found.rate_variance
+            self._yaw_rate.publish(rate)
 
-    def _true(self, header: Header) -> Header:
-        """Move the stamp to when the gyro was in the motion that it reports."""
-        if self._offset:
-            nanoseconds = header.stamp.sec * 10 ** 9 + header.stamp.nanosec + self._offset
-            header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10 ** 9)
-        return header
+    def _make_report(self) -> Report:
+        return self._report.make()
 
-    def _set_covariances(self, imu: Imu, known: bool) -> None:
-        """Set both covariances; all zeros, unknown, where the noise of the gyro is not known or its model could not be read."""
-        tracker = self._rooms.live.tracker
-        variances = (tracker.rate_variance, tracker.variance) if known else (0.0, 0.0)
-        for matrix, variance in zip((imu.angular_velocity_covariance, imu.orientation_covariance), variances):
-            matrix[0] = matrix[4] = UNMEASURED_VARIANCE if known else 0.0
-            matrix[8] = variance
+    def _show_status(self) -> None:
+        """Publish the latched state of the calibration."""
+        status = calibration_status(self._pipeline.store, self._pipeline.session.run)
+        self._status.publish(status_array(self, 'calibration', status))
 
     def _watch(self) -> None:
-        """Show the progress of a calibration, take on changed parameters, ask who listens, and tell of bad news at once."""
-        self._calibrations.watch()
-        if self._calibrations.run:
-            self._show_state()
-        self._pose_wanted = self._pose.get_subscription_count() > 0
-        now = current(self, PARAMETERS)
-        if now.reference == 'odometry':
-            self._hear_odometry()
-        tracking = tracking_settings(now, self._rooms.memory.model.noise)
-        if tracking != self._tracking:
-            self._tracking = tracking
-            self._rooms.live.set(tracking)
-            self._rooms.check.standing = tracking.threshold.rate
-        level, _ = trouble(self._rooms, self._rooms.journal.growing(), self._now())
+        """Look who is there, whether time goes on, and whether the report has become worse."""
+        names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
+                 for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
+        self._sources = names
+        self._pipeline.publishers(names)
+        self._wanted = {each: each.get_subscription_count() > 0 for each in self._wanted}
+        self._look_for_receivers()
+        if not self._pipeline.session.drives:  # else `_drive` does
+            self._pipeline.watch(self._receivers)
+        self._answer_ended()
+        if self._pipeline.session.run:
+            self._show_status()
+        level = self._report.level()
         if self._diagnostics.level is not None and level > self._diagnostics.level:
             self._diagnostics.now()
 
-    def _show_state(self) -> None:
-        """Publish the latched state of the calibration."""
-        level, message, shown = state(self._rooms.memory, self._calibrations.run)
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in shown.items()]
-        self._status.publish(DiagnosticStatus(level=level, name=f'{self.get_name()}: calibration', message=message, values=pairs))
-        self._calibrated.publish(Bool(data=bool(shown['calibrated'])))
+    # Services
 
-    def _learn(self) -> None:
-        """Let the table of biases learn, once a second."""
-        if not self._simulated:
-            self._see_clock()
-        date = clock.time()
-        said = self._rooms.live.learn(date)
-        if said:
-            self._rooms.journal.event = said
-        self._rooms.memory.keep_table(date)
-        self._rooms.memory.look()
+    def _offer_services(self) -> None:
+        # A run answers after 20 s; in a group where callbacks may overlap it delays nobody.
+        group = ReentrantCallbackGroup()
+        for name, callback in (
+                ('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
+                ('finish_calibration', self._on_finish), ('cancel_calibration', self._on_cancel),
+                ('reset_heading', self._on_reset)):
+            self.create_service(Trigger, f'~/{name}', callback, callback_group=group)
 
-    def _report(self) -> Report:
-        """Return how it goes."""
-        now = self._now()
-        grown, rate = self._rooms.journal.grown(now)
-        return *trouble(self._rooms, grown, now), values(self._rooms, rate, current(self, PARAMETERS).standing, now, clock.time())
+    async def _on_calibrate(self, _: Trigger.Request,
+                            response: Trigger.Response) -> Trigger.Response:
+        return self._fill(response, await self._calibrate(self._values.calibration_reference))
+
+    async def _on_calibrate_bias(self, _: Trigger.Request,
+                                 response: Trigger.Response) -> Trigger.Response:
+        return self._fill(response, await self._calibrate(REST))
+
+    async def _calibrate(self, kind: str) -> Answer:
+        """Collect a run, fit it and use it; or change nothing and say why."""
+        session = self._pipeline.session
+        obstacle = self._obstacle() if self._values.calibration_drive else ''
+        if refusal := session.begin(kind, self._values, steady(), obstacle):
+            return self._refused(refusal)
+        self._answered = Future()
+        if session.drives:
+            self._timer.reset()
+        self._show_status()
+        self._look_for_receivers()
+        await self._answered
+        self._answered = None
+        self._timer.cancel()
+        success, message = session.conclude()
+        self._show_status()
+        return (True, message) if success else self._refused(message)
+
+    def _answer_ended(self) -> None:
+        """Let the service of a run that has ended go on to its answer."""
+        run = self._pipeline.session.run
+        if self._answered and run and run.reason is not None and not self._answered.done():
+            self._answered.set_result(None)
+
+    def _refused(self, reason: str) -> Answer:
+        journal = self._pipeline.journal
+        journal.refused += 1
+        journal.reasons.append(reason)
+        return False, reason
+
+    def _fill(self, response: Trigger.Response, answer: Answer) -> Trigger.Response:
+        success, text = answer
+        response.success, response.message = success, text if success else f'refused: {text}'
+        self._pipeline.journal.event = response.message
+        log = self.get_logger()
+        (log.info if success else log.warning)(response.message)
+        return response
+
+    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._fill(response, self._pipeline.session.finish())
+
+    def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        answer = self._pipeline.session.cancel()
+        self._answer_ended()
+        return self._fill(response, answer)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._fill(response, (True, self._pipeline.reset()))
+
+    # Driving
+
+    def _obstacle(self) -> str:
+        """Return why the robot must not be driven now; ''."""
+        if forbidden := self._learn_to_drive():
+            return forbidden
+        return self._pipeline.obstacle(len(self._sources))
+
+    def _learn_to_drive(self) -> str:
+        """Become a publisher of cmd_vel, or return why not; who never drives is none."""
+        if self._velocity is None:
+            kind = TwistStamped if self._stamped else Twist
+            try:
+                self._velocity = self.create_publisher(kind, 'cmd_vel', 10)
+            except RuntimeError as error:  # the policy of a secured graph may forbid it
+                reason = str(error).partition(',')[0]
+                return (f'this node may not publish cmd_vel ({reason}): allow it in the policy, '
+                        'or set calibration.drive to false')
+        return ''
+
+    def _look_for_receivers(self) -> None:
+        """Count the other nodes that receive cmd_vel; this one is a subscriber too."""
+        count = self._velocity.get_subscription_count() if self._velocity else 0
+        self._receivers = max(count - 1, 0)
+
+    def _drive(self) -> None:
+        """Send the next command, and let guards look, while a run drives the robot."""
+        self._look_for_receivers()
+        self._pipeline.watch(self._receivers)
+        self._answer_ended()
+
+    def _command(self, rate: float) -> None:
+        """Publish a rate about z, rad/s."""
+        message = TwistStamped() if self._stamped else Twist()
+        twist = message.twist if self._stamped else message
+        if self._stamped:
+            message.header.stamp = self.get_clock().now().to_msg()
+        twist.angular.z = rate
+        assert self._velocity is not None  # `_learn_to_drive` comes before a run
+        self._velocity.publish(message)
 
     def destroy_node(self) -> None:
-        """Stop the robot, if it is being driven, keep what was learned, and close."""
-        self._calibrations.close()
-        self._rooms.live.learn(clock.time(), ending=True)
-        self._rooms.memory.keep_table(clock.time(), ending=True)
+        """Stop the robot if it is being driven, keep what was learned, and close."""
+        if self._pipeline.session.stop_robot():
+            assert self._velocity is not None
+            self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+        self._pipeline.learn(ending=True)
         super().destroy_node()
+
+
+def _stamp(header: Any) -> int:
+    """Return a stamp in ns."""
+    return header.stamp.sec * NSEC_PER_SEC + header.stamp.nanosec
+
+
+def _velocity(twist: Twist) -> Velocity:
+    linear, angular = twist.linear, twist.angular
+    return Velocity((linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z))
 
 
 def main() -> int:

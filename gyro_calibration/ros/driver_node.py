@@ -21,9 +21,11 @@ from sensor_msgs.msg import Imu, Temperature
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.timestamps import ClockDifference
+from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
 from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport
-from gyro_calibration.ros.runner import NOT_REPORTED, SENSOR_QUALITY, UNMEASURED_VARIANCE, Parameter, call_every, declare, run
+from gyro_calibration.ros.parameters import Parameter
+from gyro_calibration.ros.runner import SENSOR_QOS, call_every, declare, run
 
 _THREE_WAYS = {'default': None, 'always': True, 'never': False}  # no yes and no: YAML makes truth values of them
 _USE_DEVICE_TIME = {'fit': False, 'device': True}
@@ -145,8 +147,8 @@ class _Output:
     """Publishes samples, each or the mean of several."""
 
     def __init__(self, node: Node, values: SimpleNamespace):
-        self._imu_publisher = node.create_publisher(Imu, 'imu/data_raw', SENSOR_QUALITY)
-        self._temperature_publisher = node.create_publisher(Temperature, 'imu/temperature', SENSOR_QUALITY)
+        self._imu_publisher = node.create_publisher(Imu, 'imu/data_raw', SENSOR_QOS)
+        self._temperature_publisher = node.create_publisher(Temperature, 'imu/temperature', SENSOR_QOS)
         self._imu, self._temperature = Imu(), Temperature()
         self._imu.header.frame_id = self._temperature.header.frame_id = values.frame_id
         self._imu.orientation_covariance[0] = NOT_REPORTED

@@ -70,9 +70,9 @@ class _Gathered:
     rate: list[float] = field(default_factory=list)
 
 
-class Check:
+class HealthMonitor:
     """
-    The live check.
+    Compare noise and bias at rest with the model, on a robot.
 
     Attributes
     ----------

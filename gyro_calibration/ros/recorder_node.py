@@ -27,7 +27,7 @@ from gyro_calibration.log import LogError
 from gyro_calibration.ros.runner import call_every
 from gyro_calibration.storage import Message
 
-_DEPTH = 5000  # as SENSOR_QUALITY: a recorder that is busy for five seconds loses nothing at 1 kHz
+_DEPTH = 5000  # as SENSOR_QOS: a recorder that is busy for five seconds loses nothing at 1 kHz
 _LAST = 2.0  # s; within it is taken what had come before a recorder was told to stop
 _LOOK_INTERVAL = 0.3  # s; between two looks at the graph
 _LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process by itself

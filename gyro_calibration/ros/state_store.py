@@ -11,7 +11,7 @@ from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, wit
 from gyro_calibration.model_file import ModelError, read_model, write_model
 
 
-class Memory:
+class StateStore:
     """
     The files of one gyro.
 

@@ -1,53 +1,68 @@
-"""Whether the wheels of a robot turn, as far as odometry and commands of the last second say."""
+"""Whether the wheels of a robot turn, as far as odometry and commands of the last second show."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
-#: What is older, by its arrival, says nothing, s.
+#: What came longer ago shows nothing, s.
 FRESH = 1.0
-#: A robot coasts so long after its last command to move, s.
+#: A robot coasts for this time after its last command to move, s.
 COASTING = 0.5
+#: Wheels stand up to these speeds, m/s and rad/s.
+LINEAR, ANGULAR = 0.001, 0.0002
 ODOMETRY, COMMAND = 'odom', 'cmd_vel'
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Speeds up to which wheels stand, m/s and rad/s."""
+class Velocity:
+    """A velocity as `geometry_msgs/Twist` has it, m/s and rad/s."""
 
-    linear: float = 0.001
-    angular: float = 0.0002
+    linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def is_finite(self) -> bool:
+        """Tell whether all parts are finite."""
+        return all(math.isfinite(part) for part in (*self.linear, *self.angular))
+
+    @property
+    def moves(self) -> bool:
+        """Tell whether it is more than wheels that stand show."""
+        return (any(abs(part) > LINEAR for part in self.linear)
+                or any(abs(part) > ANGULAR for part in self.angular))
 
 
 class Wheels:
-    """What was heard of the wheels, by its source."""
+    """The last velocity from each source, by the steady clock."""
 
-    def __init__(self, standing: Standing):
-        """Begin with nothing heard."""
-        self._standing = standing
-        self._heard: dict[str, tuple[float, bool]] = {}
+    def __init__(self) -> None:
+        """Begin with nothing received."""
+        self._last: dict[str, tuple[float, Velocity]] = {}
         self._commanded = -math.inf
 
-    def hear(self, source: str, twist: Any, now: float) -> None:
-        """Take a velocity with the parts of a `geometry_msgs/Twist`, that came at a time, s; one that is not finite says nothing."""
-        limits = ((twist.linear, self._standing.linear), (twist.angular, self._standing.angular))
-        given = [(value, limit) for part, limit in limits for value in (part.x, part.y, part.z)]
-        if not all(math.isfinite(value) for value, _ in given):
+    def add(self, source: str, velocity: Velocity, now: float) -> None:
+        """Take a velocity that came at a time, s; one that is not finite shows nothing."""
+        if not velocity.is_finite:
             return
-        moving = any(abs(value) > limit for value, limit in given)
-        self._heard[source] = now, moving
-        if moving and source == COMMAND:
+        self._last[source] = now, velocity
+        if velocity.moves and source == COMMAND:
             self._commanded = now
 
-    def moving(self, now: float) -> bool | None:
-        """Return whether they turn; None where nobody says so."""
-        fresh = [moving for heard, moving in self._heard.values() if abs(now - heard) <= FRESH]
+    def moving(self, now: float, sources: Collection[str] = (ODOMETRY, COMMAND)) -> bool | None:
+        """Return whether the wheels turn by these sources; None where none shows it."""
+        fresh = [velocity.moves for source, (then, velocity) in self._last.items()
+                 if source in sources and now - then <= FRESH]
         if not fresh:
             return None
-        return any(fresh) or 0.0 <= now - self._commanded < COASTING
+        return any(fresh) or COMMAND in sources and now - self._commanded < COASTING
+
+    def turning(self, now: float) -> float:
+        """Return the rate about z that odometry shows, rad/s; 0 where none came in time."""
+        then, velocity = self._last.get(ODOMETRY, (-math.inf, Velocity()))
+        return velocity.angular[2] if now - then <= FRESH else 0.0
 
     def age(self, now: float) -> float:
-        """Return how old the newest word of them is, s."""
-        return now - max((heard for heard, _ in self._heard.values()), default=-math.inf)
+        """Return how long ago the last velocity came, s."""
+        return now - max((then for then, _ in self._last.values()), default=-math.inf)

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from gyro_calibration.ros.calibration_run import LONGEST, MARKED, ODOMETRY, PROFILE, REST, TURNS, Rules, Run, calibrated, wanted_after
 
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.motion import CALIBRATION, turns
 from gyro_calibration.noise import Noise
-from gyro_calibration.ros.calibration_run import LONGEST, MARKED, ODOMETRY, PROFILE, REST, TURNS, Rules, Run, calibrated, wanted_after
 from gyro_calibration.self_calibration import Limits, Reference
 
 INTERVAL, S, B = 0.02, 0.0373, 0.75 * DEGREE / 60

@@ -1,0 +1,546 @@
+"""
+Calibrations on a robot, without rclpy: what a run collects, who may drive meanwhile, what it gives.
+
+Samples, odometry and commands go in with the time of the steady clock; commands come out through
+`send`. Every guard of a drive looks at the steady clock, whatever ROS time does. A run ends with
+`Run.reason` set ('' where its samples are complete); `CalibrationSession.conclude` then fits it.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.model import SelfCalibration
+from gyro_calibration.motion import CALIBRATION, Motion, MotionError, from_headings, from_rates, read_motion
+from gyro_calibration.noise import Noise
+from gyro_calibration.ros.clock import Clock
+from gyro_calibration.ros.health_monitor import HealthMonitor, changed
+from gyro_calibration.ros.state_store import StateStore
+from gyro_calibration.ros.wheels import Velocity
+from gyro_calibration.self_calibration import (
+    SETTLED,
+    Limits,
+    Reference,
+    calibrate_bias,
+    check_rest,
+    record,
+    rest_after,
+    self_calibrate,
+)
+from gyro_calibration.whole_turns import calibrate_turns
+
+PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
+#: Length of a calibration of the bias alone, s.
+REST_DURATION = 15.0
+#: After whole turns are finished the robot rests for this time, s.
+MARKED = 2.5
+#: A run that waits for `finish` ends after this time, s.
+LONGEST = 600.0
+#: A run that does not drive the robot ends after this time without a sample, s.
+SILENCE = 5.0
+#: A robot is driven on for this time, s, or this number of intervals, after the last sample.
+BLIND, BLIND_INTERVALS = 0.25, 4.0
+#: Another node must receive the commands within this time, s; discovery may take 3 s.
+DISCOVERY = 5.0
+#: After the last command the robot may turn on for this time, s: latency and deceleration.
+STOPPING = 1.5
+#: Odometry headings that change by less than this over a run show no turn, rad.
+_TURNED = 1.0 * DEGREE
+#: Own commands that have not come back yet; at 50 Hz that is 5 s.
+_ECHOES = 256
+
+
+@dataclass
+class Run:
+    """
+    A calibration in progress.
+
+    Attributes
+    ----------
+    kind : PROFILE, ODOMETRY, TURNS or REST
+    duration : of the motion that is compared, s; infinite until `CalibrationSession.finish`
+    after : further samples that are wanted, s
+    received : when the last sample, or else the request, came, s of the steady clock
+    motion : the profile; None for other kinds
+    reason : why it ended; '' where its samples are complete; None while it goes on
+    times, outputs, rates : stamps, s, output and rate after the model, rad/s
+    odometry : stamp, s, heading, rad, and rate, rad/s, of each message
+
+    """
+
+    kind: str
+    duration: float
+    after: float
+    received: float
+    motion: Motion | None = None
+    reason: str | None = None
+    times: list[float] = field(default_factory=list)
+    outputs: list[float] = field(default_factory=list)
+    rates: list[float] = field(default_factory=list)
+    temperatures: list[float] = field(default_factory=list)
+    odometry: list[tuple[float, float, float]] = field(default_factory=list)
+
+    @property
+    def elapsed(self) -> float:
+        """Return the time from the first sample to the last, s."""
+        return self.times[-1] - self.times[0] if self.times else 0.0
+
+    @property
+    def progress(self) -> float:
+        """Return which part is done."""
+        total = LONGEST if math.isinf(self.duration) else self.duration + self.after
+        return min(self.elapsed / total, 1.0)
+
+    @property
+    def status(self) -> str:
+        """Return the progress in words."""
+        if math.isinf(self.duration):
+            return (f'{self.elapsed:.0f} s; rest, turn, rest on the mark and call '
+                    'finish_calibration')
+        return f'{self.elapsed:.0f} of {self.duration + self.after:.0f} s'
+
+    @property
+    def temperature(self) -> float | None:
+        """Return the mean temperature, degC; None where none came."""
+        return float(np.mean(self.temperatures)) if self.temperatures else None
+
+
+@dataclass(frozen=True)
+class Rules:
+    """
+    What a run is accepted by.
+
+    Attributes
+    ----------
+    limits, odometry : of any run; how accurate the odometry is
+    turns : whole turns; 0 takes the number that the gyro shows
+    check : whether a rest after the run decides
+
+    """
+
+    limits: Limits = Limits()
+    odometry: Reference = Reference()
+    turns: int = 0
+    check: bool = True
+
+    def after(self, kind: str) -> float:
+        """Return how long samples are wanted after the motion, s."""
+        if kind in (TURNS, REST):
+            return MARKED if kind == TURNS else 0.0
+        return self.limits.time_offset + (SETTLED + self.limits.rest if self.check else 0.0)
+
+
+def rules(values: SimpleNamespace) -> Rules:
+    """Return the rules that the parameters of the node state."""
+    return Rules(Limits(bias=values.calibration_maximum_bias),
+                 Reference(scale_deviation=values.calibration_odometry_scale_deviation),
+                 values.calibration_turns)
+
+
+class Drive:
+    """
+    The commands of a run that drives the robot, and the guards that end it.
+
+    Attributes
+    ----------
+    command_lateness, sample_lateness : the largest of the run, s
+
+    """
+
+    INTERVAL = 0.02
+    """Time between commands, s."""
+
+    def __init__(self, run: Run, begun: float, blind: Callable[[], float]):
+        """Begin to wait for somebody who receives the commands; `blind` in s, see `BLIND`."""
+        assert run.motion is not None
+        self._run, self._motion, self._blind, self._begun = run, run.motion, blind, begun
+        self._heard, self._suspected, self._due = False, False, math.inf
+        self._earliest = math.inf
+        self.command_lateness = self.sample_lateness = 0.0
+
+    def see_sample(self, time: float, now: float) -> None:
+        """Measure how much later than the earliest one a sample came."""
+        self._earliest = min(self._earliest, now - time)
+        self.sample_lateness = max(self.sample_lateness, now - time - self._earliest)
+
+    def waits(self, receivers: int) -> bool:
+        """Tell whether the run has not begun because nobody receives its commands."""
+        self._heard = self._heard or receivers > 0
+        return not self._heard
+
+    def command(self, now: float, receivers: int, ros_time_stands: bool) -> tuple[float, str]:
+        """Return the rate to command, rad/s, and why the run must end; '' where it goes on."""
+        if self.waits(receivers):
+            return 0.0, self._not_received if now - self._begun > DISCOVERY else ''
+        if not receivers:
+            return 0.0, self._not_received
+        if ros_time_stands:
+            return 0.0, STANDING_TIME
+        if self._due < math.inf:
+            self.command_lateness = max(self.command_lateness, now - self._due)
+        self._due = now + self.INTERVAL
+        silence = now - self._run.received
+        # Decided at the second look: after a pause of this process the samples that wait in its
+        # queue come after its timers.
+        suspected, self._suspected = self._suspected, silence > self._blind()
+        if self._suspected:
+            return 0.0, (f'no sample came for {silence:.2f} s while the robot was driven: look at '
+                         'the gyro and its driver') if suspected else ''
+        if not self._run.times:
+            return 0.0, ''
+        return float(self._motion.rate_at(np.array(self._run.elapsed + silence))), ''
+
+    _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '
+                     'to its topic, or change cmd_vel_stamped')
+
+    def lateness(self, limits: Limits) -> str:
+        """Say how late commands and samples were, where that turns the robot beyond the limit."""
+        fastest = float(np.abs(self._motion.rate_at(
+            np.linspace(0.0, self._motion.duration, 1000))).max())
+        if max(self.command_lateness, self.sample_lateness) * fastest <= limits.residual:
+            return ''
+        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s late '
+                f'and samples up to {self.sample_lateness:.2f} s; give it less to do and run again')
+
+
+STANDING_TIME = ('ROS time stands still: start or resume the simulation that publishes /clock, or '
+                 'set use_sim_time to false')
+
+
+class CalibrationSession:
+    """
+    Calibrate on request.
+
+    Attributes
+    ----------
+    run : the one in progress, or None
+    warning : after a run that drove the robot: that it kept turning; ''
+
+    """
+
+    def __init__(self, estimator: HeadingEstimator, store: StateStore, monitor: HealthMonitor,
+                 send: Callable[[float], None], clock: Clock):
+        """
+        Begin with no run.
+
+        Parameters
+        ----------
+        estimator, store, monitor : of the pipeline
+        send : publishes a rate about z on cmd_vel, rad/s
+        clock : of the node
+
+        """
+        self.run: Run | None = None
+        self.warning = ''
+        self._estimator, self._store, self._monitor = estimator, store, monitor
+        self._send, self._clock = send, clock
+        self._rules = Rules()
+        self._drive: Drive | None = None
+        self._sent: deque[float] = deque(maxlen=_ECHOES)
+        self._others = self._stopped = -math.inf
+        self._suspected = False
+
+    @property
+    def drives(self) -> bool:
+        """Tell whether a run drives the robot."""
+        return self._drive is not None
+
+    # The begin
+
+    def begin(self, kind: str, values: SimpleNamespace, now: float, obstacle: str = '') -> str:
+        """
+        Begin a run.
+
+        Parameters
+        ----------
+        kind : PROFILE, ODOMETRY, TURNS or REST
+        values : the parameters of the node
+        now : s of the steady clock
+        obstacle : why the robot must not be driven now; ''
+
+        Returns
+        -------
+        '', or why not
+
+        """
+        if self.run:
+            return ('a calibration is in progress; wait for its end, or call '
+                    'cancel_calibration')
+        if self._store.problem:
+            return self._store.problem
+        motion, duration = None, values.calibration_duration
+        if kind == PROFILE:
+            try:
+                file = values.calibration_profile_file
+                motion = read_motion(Path(file).expanduser()) if file else CALIBRATION
+            except MotionError as error:
+                return str(error)
+            duration = motion.duration
+        elif kind != ODOMETRY:
+            duration = REST_DURATION if kind == REST else math.inf
+        drives = motion is not None and values.calibration_drive
+        if drives and (obstacle := obstacle or self._commanded(now)):
+            return obstacle
+        self._rules, self._suspected, self.warning = rules(values), False, ''
+        self.run = run = Run(kind, duration, self._rules.after(kind), now, motion)
+        self._drive = Drive(run, now, self._blind) if drives else None
+        self._monitor.restart()
+        return ''
+
+    def _commanded(self, now: float) -> str:
+        if now - self._others < 1.0:
+            return ('another node sends commands on cmd_vel: stop it, or take the robot from it, '
+                    'and run again')
+        return ''
+
+    def _blind(self) -> float:
+        usual = BLIND_INTERVALS * self._estimator.tracker.intervals.usual
+        return min(max(BLIND, usual), self._rules.limits.gap)
+
+    # What comes in
+
+    def add(self, time: float, output: float, now: float, receivers: int) -> None:
+        """Take a sample; `receivers` is the number of other nodes that receive the commands."""
+        run = self.run
+        if run is None or run.reason is not None:
+            return
+        run.received = now
+        if self._drive:
+            self._drive.see_sample(time, now)
+            if self._drive.waits(receivers):
+                return
+        estimator = self._estimator
+        run.times.append(time)
+        run.outputs.append(output)
+        run.rates.append(float(estimator.last.modelled))
+        if estimator.temperature is not None and not estimator.temperature_is_lost:
+            run.temperatures.append(estimator.temperature)
+        if run.elapsed >= run.duration + run.after:
+            self.end('')
+        elif math.isinf(run.duration) and run.elapsed > LONGEST:
+            self.end(f'nobody called finish_calibration within {LONGEST:g} s: call it when the '
+                     'robot stands on the mark again')
+
+    def add_odometry(self, time: float, heading: float, rate: float, now: float) -> None:
+        """Take a heading, rad, and a rate, rad/s, of the odometry."""
+        if self.run:
+            self.run.odometry.append((time, heading, rate))
+        late = now - self._stopped
+        if STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
+            self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
+                            f'{late:.1f} s after it was commanded to stop: set the command '
+                            'time-out of its base, and look at who else commands it')
+
+    def add_command(self, velocity: Velocity, now: float) -> None:
+        """
+        Take a command from cmd_vel, where those of this node come back too.
+
+        They come back in the order in which they were sent. A command that is none of them is that
+        of another node, and ends a run that drives the robot.
+
+        """
+        for place, rate in enumerate(self._sent):
+            if velocity == Velocity(angular=(0.0, 0.0, rate)):
+                for _ in range(place + 1):
+                    self._sent.popleft()
+                return
+        self._others = now
+        if self._drive:
+            self.end('another node sent a command on cmd_vel while the robot was driven; it has '
+                     'the robot now: stop it and run again')
+
+    # Guards
+
+    def watch(self, values: SimpleNamespace, now: float, receivers: int,
+              ros_time_stands: bool = False, conflict: str = '') -> None:
+        """
+        Send the next command of a run that drives the robot, or end a run that must not go on.
+
+        To be called every `Drive.INTERVAL` while `drives`, else a few times a second.
+
+        Parameters
+        ----------
+        values : the parameters of the node
+        now : s of the steady clock
+        receivers : number of other nodes that receive the commands
+        ros_time_stands : ROS time has stood still for longer than `BLIND`
+        conflict : why the samples cannot be used at all; ''
+
+        """
+        run = self.run
+        if run is None or run.reason is not None:
+            return
+        if self._drive:
+            rate, reason = self._drive.command(now, receivers, ros_time_stands)
+            if not values.calibration_drive:
+                reason = ('calibration.drive was set to false while the robot was driven: set it '
+                          'to true and run again')
+            if reason or conflict:
+                self.end(conflict or reason)
+            else:
+                self._command(rate)
+        elif conflict:
+            self.end(conflict)
+        suspected, self._suspected = self._suspected, now - run.received > SILENCE
+        if suspected and self._suspected:
+            self.end(f'no sample came for {SILENCE:g} s: look at the gyro and its driver')
+
+    def interrupt(self, reason: str) -> None:
+        """End a run over which integration began anew."""
+        if self.run and self.run.times:
+            self.end(f"{reason}: look at the gyro's line and run again")
+
+    def _command(self, rate: float) -> None:
+        self._sent.append(rate)
+        self._send(rate)
+
+    def stop_robot(self) -> bool:
+        """Command zero if the robot is being driven; return whether it was."""
+        if not self._drive:
+            return False
+        self._command(0.0)
+        self._stopped = self._clock.steady()
+        return True
+
+    # The end
+
+    def end(self, reason: str) -> None:
+        """End the run, and stop the robot at once; '' where its samples are complete."""
+        if self.run and self.run.reason is None:
+            self.run.reason = reason
+            self.stop_robot()
+
+    def finish(self) -> tuple[bool, str]:
+        """Let the motion of a run by turns or by odometry be over now."""
+        run = self.run
+        if run is None or run.kind not in (ODOMETRY, TURNS):
+            return False, 'no calibration by turns or by odometry is in progress'
+        if not run.times:
+            return False, ('no sample has come since the calibration began: look at the gyro and '
+                           'its driver')
+        run.duration = min(run.duration, run.elapsed)
+        left = run.duration + run.after - run.elapsed
+        return True, f'leave the robot at rest for {left:.1f} s more'
+
+    def cancel(self) -> tuple[bool, str]:
+        """Give the run up, and change nothing."""
+        if self.run is None:
+            return False, 'no calibration is in progress'
+        if self.run.reason is not None:
+            return False, ('the calibration has just ended; its own answer says whether it is in '
+                           'use')
+        self.end('cancelled')
+        return True, 'cancelled; the previous calibration is in use'
+
+    def conclude(self) -> tuple[bool, str]:
+        """Fit a run that has ended and use what it gives, or say why nothing was changed."""
+        run, drive = self.run, self._drive
+        assert run is not None and run.reason is not None
+        try:
+            if run.reason:
+                raise DataRefused(run.reason)
+            return True, self._use(run)
+        except DataRefused as error:
+            late = drive.lateness(self._rules.limits) if drive and not run.reason else ''
+            return False, f'{late} (the run shows: {error})' if late else str(error)
+        except Exception as error:  # the robot stands, the caller hears of it, the node goes on
+            return False, f'the fit failed and nothing was changed: {error!r}'
+        finally:
+            self.run = self._drive = None
+
+    def _use(self, run: Run) -> str:
+        estimator, now = self._estimator, datetime.fromtimestamp(self._clock.date(), timezone.utc)
+        noise = estimator.model.noise
+        calibration, remark = calibrated(run, self._rules, noise,
+                                         now.isoformat(timespec='seconds'))
+        if run.kind == REST:
+            calibration = self._with_scale(calibration)
+        difference = changed(estimator.claimed, calibration, noise,
+                             estimator.known_for(now.timestamp()))
+        trouble = self._store.keep(calibration)
+        estimator.use(self._store.model, now.timestamp())
+        self._monitor.recalibrated()
+        return '; '.join(filter(None, [f'{calibration}, from {len(run.times)} samples', remark,
+                                       difference, trouble]))
+
+    def _with_scale(self, bias: SelfCalibration) -> SelfCalibration:
+        """Return a calibration of the bias with the scale factor error that is in use."""
+        used = self._estimator.used.self_calibration
+        unknown = SelfCalibration(covariance=((0.0, 0.0), (0.0, 0.0)))
+        last = self._estimator.model.self_calibration or used or unknown
+        known = last.covariance or used and used.covariance or unknown.covariance
+        assert known is not None and bias.covariance is not None
+        covariance = ((known[0][0], 0.0), (0.0, bias.covariance[1][1]))
+        return replace(bias, scale_factor_error=last.scale_factor_error, covariance=covariance)
+
+
+def calibrated(run: Run, rules: Rules, noise: Noise, when: str) -> tuple[SelfCalibration, str]:
+    """
+    Return the calibration that a complete run gives, and a remark.
+
+    Raises
+    ------
+    DataRefused : with the reason and the remedy
+
+    """
+    time, rate, output = (np.array(each) for each in (run.times, run.rates, run.outputs))
+    if run.kind == REST:
+        bias, deviation = calibrate_bias(time - time[0], rate, rules.limits, noise, output)
+        return SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, deviation ** 2)), when,
+                               run.temperature, 'rest'), ''
+    if run.kind == TURNS:
+        found = calibrate_turns(time - time[0], rate, rules.turns or None, rules.limits, noise,
+                                output=output)
+        return (record(found.fit, 'turns', when, run.temperature),
+                f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
+    begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
+    return _compared(run, time - begin, rate, output, motion, rules, noise, when)
+
+
+def _odometry_motion(run: Run) -> tuple[float, Motion]:
+    """Return when the odometry begins, s, and the motion that it shows."""
+    end = run.times[0] + run.duration
+    rows = np.array([each for each in run.odometry if each[0] <= end])
+    increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
+    if len(rows) < 10 or not increases or np.ptp(rows[:, 0]) < 0.8 * run.duration:
+        raise DataRefused(
+            f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 over '
+            'most of the run, with stamps that increase, are needed: look at the odometry')
+    time, heading, rate = rows.T
+    heading = np.unwrap(heading)
+    turned = np.ptp(heading) > _TURNED
+    motion = from_headings(time, heading) if turned else from_rates(time - time[0], rate)
+    return float(time[0]), motion
+
+
+def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion, rules: Rules,
+              noise: Noise, when: str) -> tuple[SelfCalibration, str]:
+    """Fit a run to its motion, and check it by the rest after it."""
+    limits, odometry = rules.limits, run.kind == ODOMETRY
+    inside = (time >= -limits.time_offset) & (time <= motion.duration + limits.time_offset)
+    fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
+                         reference=rules.odometry if odometry else None, output=output[inside])
+    remarks = [f'the gyro lags by {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
+    if fit.goodness:
+        remarks.append(str(fit.goodness))
+    if rules.check:
+        # After odometry the robot may drive on; a profile ends at rest.
+        begin = motion.duration + max(fit.time_offset, 0.0) + SETTLED
+        after = rest_after(time, rate, fit, motion, limits) if odometry else time > begin
+        if after is not None:
+            rest = check_rest(time[after], rate[after], fit, noise, limits)
+            remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, up to '
+                           f'{rest.limit / DEGREE:.4f} is explained')
+    method = 'odometry' if odometry else 'likelihood'
+    return record(fit, method, when, run.temperature), '; '.join(remarks)

@@ -1,0 +1,46 @@
+"""The clocks of a node: even seconds, the date, and ROS time, which may stand still."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """What a node reads its times from; tests bring their own."""
+
+    def steady(self) -> float:
+        """Return seconds that nobody sets; every guard and time-out looks at these."""
+
+    def date(self) -> float:
+        """Return seconds since 1970 by the clock of the host."""
+
+    def simulated(self) -> float | None:
+        """Return the time of a simulation, s, 0 before it began; None where there is none."""
+
+
+class RosTime:
+    """
+    Whether ROS time goes on.
+
+    Attributes
+    ----------
+    standing : for how long it has stood still, s of the steady clock; 0 where it is not simulated
+
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing seen."""
+        self.standing = 0.0
+        self._last, self._changed = -1.0, 0.0
+
+    def look(self, clock: Clock) -> float:
+        """Compare with the last look, and return `standing`; inf before a simulation begins."""
+        now, time = clock.steady(), clock.simulated()
+        if time is not None and time != self._last:
+            self._last, self._changed = time, now
+        if time is None:
+            self.standing = 0.0
+        else:
+            self.standing = now - self._changed if time else math.inf
+        return self.standing

@@ -1,0 +1,103 @@
+"""The parameters of a node as one table; values are checked here, without rclpy."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+_WORDS: dict[type, str] = {
+    bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text',
+    list: 'a list of texts'}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter of a node; its type is the type of its default.
+
+    Attributes
+    ----------
+    name : str
+        Groups are separated by a dot, as in ``calibration.maximum_bias``.
+    default : bool, int, float, str or sequence of str
+    description : str
+        One sentence, without the unit.
+    unit : str
+        Empty where there is none.
+    range : tuple of two numbers, or None
+        Lowest and highest value, both allowed.
+    dynamic : bool
+        Whether it may be set while the node runs.
+    choices : tuple of str
+        The values that a text may have; empty for any.
+
+    """
+
+    name: str
+    default: bool | int | float | str | Sequence[str]
+    description: str
+    unit: str = ''
+    range: tuple[float, float] | None = None
+    dynamic: bool = False
+    choices: tuple[str, ...] = ()
+
+    @property
+    def attribute(self) -> str:
+        """Return the name in the record of values: ``calibration_maximum_bias``."""
+        return self.name.replace('.', '_')
+
+    @property
+    def allowed(self) -> str:
+        """Return the choices in words; '' where any value is possible."""
+        return f'{", ".join(self.choices[:-1])} or {self.choices[-1]}' if self.choices else ''
+
+    def check(self, value: object) -> object:
+        """
+        Return the value as the type of the default; a whole number may stand for a float.
+
+        Raises
+        ------
+        ValueError : the value has another type, is not finite, or is none of those allowed
+
+        """
+        if isinstance(self.default, float) and type(value) is int and abs(value) < 1 << 63:
+            value = float(value)
+        several = isinstance(self.default, Sequence) and not isinstance(self.default, str)
+        wanted: type = list if several else type(self.default)
+        texts = value if isinstance(value, list) else [value]
+        if type(value) is not wanted or several and not all(isinstance(each, str) for each in texts):
+            self._refuse(value, self.allowed or f'{_WORDS[wanted]}, for example {self.default!r}')
+        if any('\0' in each for each in texts if isinstance(each, str)):
+            self._refuse(value, 'without a zero byte')
+        if isinstance(value, float) and not math.isfinite(value):
+            self._refuse(value, f'finite, for example {self.default!r}')
+        if self.range and isinstance(value, (int, float)):
+            low, high = self.range
+            if not low <= value <= high:
+                self._refuse(value, f'from {low} to {high} {self.unit}'.rstrip())
+        if self.choices and value not in self.choices:
+            self._refuse(value, self.allowed)
+        return value
+
+    def _refuse(self, value: object, wanted: str) -> None:
+        raise ValueError(
+            f'parameter {self.name} is {reprlib.repr(value)}, but must be {wanted}')
+
+
+def record(table: Sequence[Parameter], given: Mapping[str, object] | None = None
+           ) -> SimpleNamespace:
+    """
+    Return the values of a table by attribute: the given ones, else the defaults.
+
+    Raises
+    ------
+    ValueError : a value is not possible
+
+    """
+    given = given or {}
+    return SimpleNamespace(**{
+        each.attribute: each.check(given[each.name]) if each.name in given else each.default
+        for each in table})

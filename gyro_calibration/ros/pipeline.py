@@ -1,0 +1,455 @@
+"""
+What the compensation node does with samples, wheels and time, without rclpy.
+
+Samples, temperatures, odometry and commands go in with their stamps; corrected rates and headings
+come out. Stamps are nanoseconds since 1970 or of a simulation; guards and time-outs look at the
+steady clock.
+
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+from gyro_calibration.assumptions import Assumptions
+from gyro_calibration.bias_table import Prior
+from gyro_calibration.driver.host_clock import Stamps as HostClock
+from gyro_calibration.heading import Threshold
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model import GyroModel
+from gyro_calibration.noise import Noise
+from gyro_calibration.ros import UNMEASURED_VARIANCE
+from gyro_calibration.ros.calibration_session import BLIND, REST, STANDING_TIME, CalibrationSession
+from gyro_calibration.ros.clock import Clock, RosTime
+from gyro_calibration.ros.health_monitor import HealthMonitor
+from gyro_calibration.ros.parameters import Parameter
+from gyro_calibration.ros.state_store import StateStore
+from gyro_calibration.ros.wheels import COMMAND, ODOMETRY, Velocity, Wheels
+from gyro_calibration.tracking import Settings
+
+PARAMETERS = (
+    Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
+    Parameter('calibration_file', '',
+              'Where self-calibrations are kept, and beside it biases at rest; empty for a file '
+              'in ROS_HOME named after the node.'),
+    Parameter('heading_frame', 'odom', 'Fixed frame in which the heading is given.'),
+    Parameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
+              choices=('none', 'odom', 'cmd_vel', 'both')),
+    Parameter('cmd_vel_stamped', False, 'Whether cmd_vel is a TwistStamped.'),
+    Parameter('maximum_gap', 1.0, 'Over a longer gap in the stamps nothing is integrated.', 's',
+              (0.01, 60.0)),
+    Parameter('stationary.method', 'rest',
+              'How standstill is found: by the statistics of the rate, by the threshold filter, '
+              'or not at all.', dynamic=True, choices=('rest', 'threshold', 'none')),
+    Parameter('stationary.threshold', 0.3 * DEGREE,
+              'Threshold filter: a mean rate over 0.2 s below it is zero; 0 switches it off.',
+              'rad/s', (0.0, 0.1), True),
+    Parameter('assumed.bias', 0.5 * DEGREE,
+              'Standard deviation of the bias without a calibration.', 'rad/s', (0.0, 1.0)),
+    Parameter('assumed.scale_factor_error', 0.03,
+              'Standard deviation of the scale factor error without a calibration.', '1',
+              (0.0, 1.0)),
+    Parameter('assumed.bias_temperature_coefficient', 0.03 * DEGREE,
+              'Standard deviation of the change of the bias with temperature; 0 for a gyro that '
+              'compensates it.', 'rad/s/K', (0.0, 0.1)),
+    Parameter('calibration.reference', 'profile', 'What calibrate compares the gyro with.',
+              dynamic=True, choices=('profile', 'odometry', 'turns')),
+    Parameter('calibration.profile_file', '',
+              'Motion profile (CSV); empty for the built-in one of 20 s.'),
+    Parameter('calibration.drive', False, 'Drive the motion profile on cmd_vel.', dynamic=True),
+    Parameter('calibration.duration', 20.0, 'Length of a calibration by odometry.', 's',
+              (5.0, 600.0), True),
+    Parameter('calibration.turns', 0,
+              'Whole turns of a calibration by turns, counter-clockwise positive; 0 takes the '
+              'number that the gyro shows.', '', (-100, 100), True),
+    Parameter('calibration.odometry_scale_deviation', 0.01,
+              'Standard deviation of the scale of turns by odometry.', '1', (0.0, 0.5), True),
+    Parameter('calibration.maximum_bias', 10.0 * DEGREE,
+              'A calibration with a larger bias is refused.', 'rad/s', (0.0, 10.0), True),
+)
+
+#: Rests taken for motion, in an hour at rest, 1/h.
+REST_FALSE_ALARMS = 0.1
+#: False alarms of the monitor of noise and bias, in an hour at rest, 1/h.
+HEALTH_FALSE_ALARMS = 0.001
+#: A temperature that is older is held, and counts as less and less known, s.
+TEMPERATURE_TIMEOUT = 10.0
+#: A gyro that was silent for this time, s, may have been without power, with another bias since.
+POWER_OFF = 10.0
+#: The mean rate over this time shows whether a robot turns that is to be driven, s.
+_LOOKED_BACK = 0.5
+#: A mean rate is a turn from this number of standard deviations of the bias on.
+_SIGMAS = 4.0
+#: Stamps that jump back twice within this time, s, are those of several publishers.
+_INTERLEAVED = 1.0
+#: Clocks that are read with more between them are not read at one time, s.
+_TOGETHER = 0.05
+
+
+NSEC_PER_SEC = 10 ** 9
+
+
+def rate_limit(model: GyroModel) -> float:
+    return 100.0
+
+
+class Output(NamedTuple):
+    """
+    A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
+
+    Where the noise of the gyro is not known, the variance of the heading is that of a quantity that
+    is not measured, and that of the rate holds the assumed bias.
+
+    """
+
+    stamp: int
+    heading: float
+    heading_variance: float
+    rate: float
+    rate_variance: float
+
+
+COUNTED = ('samples', 'refused_samples', 'lost_samples', 'repeated_stamps', 'restarts', 'rebuilt',
+           'temperature_clipped', 'beyond_range')
+
+
+@dataclass
+class Journal:
+    """
+    What happened so far.
+
+    Attributes
+    ----------
+    received : when the last sample came, s of the steady clock
+    counts : of samples, and of what was wrong with some
+    event : the last, in words
+    refused : number of refused calibrations, and the last reasons
+    channels : those that samples bring beside the rate
+    clock_steps : of the clock of the host, in words; ''
+
+    """
+
+    received: float
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
+    event: str = ''
+    clock_steps: str = ''
+    refused: int = 0
+    reasons: deque[str] = field(default_factory=lambda: deque(maxlen=3))
+    channels: set[str] = field(default_factory=set)
+
+
+def tracker_settings(values: SimpleNamespace, noise: Noise) -> Settings:
+    """Return how the heading is tracked; without known noise the threshold filter finds rests."""
+    rate = 0.0 if values.stationary_method == 'none' else values.stationary_threshold
+    threshold = Threshold(rate, angle_random_walk=noise.angle_random_walk)
+    alarms = REST_FALSE_ALARMS if values.stationary_method == 'rest' else 0.0
+    return Settings(alarms, threshold, values.maximum_gap)
+
+
+class Pipeline:
+    """
+    From raw samples to corrected rates and the heading.
+
+    Attributes
+    ----------
+    values : the parameters of the node
+    store, estimator, monitor, wheels, session, journal, ros_time : its parts
+    conflict : why the samples cannot be used, in a sentence; ''
+
+    """
+
+    def __init__(self, values: SimpleNamespace, calibration_file: Path, clock: Clock,
+                 send: Callable[[float], None]):
+        """
+        Read model and last calibration; what is wrong with them is reported.
+
+        Parameters
+        ----------
+        values : record of `PARAMETERS`
+        calibration_file : where self-calibrations are kept
+        clock : of the node
+        send : publishes a rate about z on cmd_vel, rad/s
+
+        """
+        self.values, self._clock = values, clock
+        biases = calibration_file.with_name(f'{calibration_file.stem}_biases.yaml')
+        self._assumed = Assumptions(values.assumed_bias, values.assumed_scale_factor_error,
+                                    values.assumed_bias_temperature_coefficient)
+        prior = Prior(coefficient=values.assumed_bias_temperature_coefficient)
+        self.store = store = StateStore(values.model_file, calibration_file, biases, prior)
+        noise = store.model.noise
+        self._tracking = tracker_settings(values, noise)
+        self.estimator = HeadingEstimator(store.model, store.table, self._assumed,
+                                          self._tracking, TEMPERATURE_TIMEOUT, clock.date())
+        self.monitor = HealthMonitor(noise, HEALTH_FALSE_ALARMS, self._tracking.threshold.rate)
+        self.wheels, self.journal = Wheels(), Journal(clock.steady())
+        self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
+        self.ros_time, self._host = RosTime(), HostClock()
+        self.conflict = ''
+        self._limit = rate_limit(store.model)
+        self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
+        self._epoch: int | None = None
+        self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
+        self._last, self._interval = -math.inf, math.inf
+        self._newest, self._jumps = 0, deque[float](maxlen=2)
+        self._good = 0.0, 0.0, 0.0
+        self._recent: deque[tuple[float, float]] = deque()
+
+    # Time
+
+    @property
+    def simulated(self) -> bool:
+        """Tell whether stamps are those of a simulation."""
+        return self._clock.simulated() is not None
+
+    def _since_epoch(self, stamp: int) -> float:
+        """Return s since the first stamp's second, where a double still resolves nanoseconds."""
+        if self._epoch is None:
+            self._epoch = stamp - stamp % NSEC_PER_SEC
+        return 1e-9 * (stamp - self._epoch)
+
+    def _time(self, stamp: int) -> float:
+        """Return the time of what came beside the samples, s."""
+        since = self._since_epoch(stamp)
+        return since if self._last == -math.inf else self._host.of_other(since, self._last)
+
+    def _time_of_sample(self, stamp: int) -> float:
+        """Return the time of a sample, s; it goes on where the clock of the host is set."""
+        since = self._since_epoch(stamp)
+        if self.simulated:
+            return since
+        self._look_at_host_clock()
+        return self._host.of_sample(since, self._last, self._interval)
+
+    def _look_at_host_clock(self) -> None:
+        """Take dates that the clock of the host gave before it was set for those after it."""
+        clock, journal = self._clock, self.journal
+        now, date = clock.steady(), clock.date()
+        if clock.steady() - now > _TOGETHER or not (step := self._host.watch(now, date)):
+            return
+        journal.event = (f'the clock of this computer was set by {step:+.1f} s; the heading goes '
+                         'on')
+        journal.clock_steps = f'{self._host.steps}, last by {step:+.1f} s'
+        self.estimator.clock_was_set(step)
+        if self.store.written is not None:
+            self.store.written += step
+        if self.estimator.calibrated_now and self.estimator.model.self_calibration:
+            self.store.keep(self.estimator.model.self_calibration)
+
+    # What comes in
+
+    def temperature(self, stamp: int, value: float) -> None:
+        """Take a temperature, degC."""
+        if math.isfinite(value):
+            self.estimator.hear_temperature(self._time(stamp), value)
+
+    def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
+        """Take a heading, rad, and a velocity by the wheels."""
+        now, rate = self._clock.steady(), velocity.angular[2]
+        self.wheels.add(ODOMETRY, velocity, now)
+        if math.isfinite(heading) and math.isfinite(rate):
+            self.session.add_odometry(self._time(stamp), heading, rate, now)
+
+    def command(self, velocity: Velocity) -> None:
+        """Take a command from cmd_vel, those of this node included."""
+        now = self._clock.steady()
+        self.wheels.add(COMMAND, velocity, now)
+        self.session.add_command(velocity, now)
+
+    def sample(self, stamp: int, output: float, specific_force: float | None = None,
+               receivers: int = 0) -> Output | None:
+        """
+        Take a sample.
+
+        Parameters
+        ----------
+        stamp : ns
+        output : rad/s
+        specific_force : along the input axis, m/s², where it came
+        receivers : number of other nodes that receive cmd_vel
+
+        Returns
+        -------
+        what is published, or None where the sample cannot be used
+
+        """
+        counts, now, journal = self.journal.counts, self._clock.steady(), self.journal
+        counts['samples'] += 1
+        if stamp < self._newest:
+            self._see_jump(now)
+        self._newest = stamp
+        if self.conflict or not self._is_possible(output):
+            counts['refused_samples'] += 1
+            return None
+        time = self._time_of_sample(stamp)
+        if time == self._last:
+            counts['repeated_stamps'] += 1
+            journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
+            return None
+        if 0.0 < time - self._last <= self.values.maximum_gap:
+            self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
+        if self._was_silent(time, now):
+            self.estimator.begin_run(self._clock.date())
+        self._last, journal.received = time, now
+        journal.channels = set() if specific_force is None else {'specific_force'}
+        return self._use(stamp, time, output, specific_force, now, receivers)
+
+    def _is_possible(self, output: float) -> bool:
+        if abs(output) <= self._limit:
+            return True
+        self.journal.event = (f'a rate of {output:g} rad/s came, and this gyro reports at most '
+                              f'{self._limit:g}: the sample is not used')
+        return False
+
+    def _see_jump(self, now: float) -> None:
+        """Take the second jump back of the stamps within 1 s for those of several publishers."""
+        self._jumps.append(now)
+        if len(self._jumps) > 1 and now - self._jumps[0] < _INTERLEAVED:
+            self._refuse_all('the stamps on imu/data_raw jump back again and again, as those of '
+                             'several gyros on one topic do: give each gyro a topic of its own')
+
+    def _was_silent(self, time: float, now: float) -> bool:
+        """Tell whether the gyro may have been without power, and samples did not only wait."""
+        since = time - self._last
+        silent = now - self.journal.received > POWER_OFF
+        return silent and since < math.inf and not 0.0 < since < POWER_OFF
+
+    def _use(self, stamp: int, time: float, output: float, force: float | None, now: float,
+             receivers: int) -> Output | None:
+        estimator, counts = self.estimator, self.journal.counts
+        moving = self.wheels.moving(now, self._sources) if self._sources else None
+        restarted = estimator.add(time, output, self._clock.date(), force, moving)
+        tracker = estimator.tracker
+        counts['temperature_clipped'] += int(estimator.last.temperature_clipped)
+        counts['beyond_range'] += int(estimator.last.beyond_range)
+        counts['lost_samples'] = tracker.intervals.lost
+        if restarted:
+            self._note_restart(restarted)
+        if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
+            run = self.session.run
+            self.monitor.examine(estimator.bias_variance,
+                                 estimator.known_for(self._clock.date()),
+                                 run is not None and run.kind == REST)
+        if self.session.run:
+            self.session.add(time, output, now, receivers)
+        known = self._noise_is_known and self._interval < math.inf
+        found = Output(
+            stamp + self._delay, tracker.heading,
+            tracker.variance if known else UNMEASURED_VARIANCE, estimator.rate,
+            tracker.rate_variance + (0.0 if known else self.values.assumed_bias ** 2))
+        if not math.isfinite(found.heading + found.heading_variance + found.rate
+                             + found.rate_variance):
+            self.estimator.rebuild(*self._before(), self._clock.date())
+            counts['rebuilt'] += 1
+            self._note_restart('the state of the heading was not finite')
+            return None
+        self._recent.append((time, estimator.corrected))
+        while time - self._recent[0][0] > _LOOKED_BACK:
+            self._recent.popleft()
+        return found
+
+    @property
+    def _sources(self) -> tuple[str, ...]:
+        return _SOURCES[self.values.wheels]
+
+    def _note_restart(self, reason: str) -> None:
+        self.monitor.restart()
+        self.journal.counts['restarts'] += 1
+        self.journal.event = f'{reason}: integration began anew'
+        self._recent.clear()
+        self.session.interrupt(reason)
+
+    # What must not go on
+
+    def _refuse_all(self, conflict: str) -> None:
+        """Use no more samples, and go back to the heading from before the conflict."""
+        if not self.conflict:
+            self.estimator.rewind(*self._before())
+            self.journal.event = conflict
+        self.conflict = conflict
+        self.session.watch(self.values, self._clock.steady(), 0, conflict=conflict)
+
+    def _before(self) -> tuple[float, float]:
+        """Return the last heading that is known to be good, and its variance of now."""
+        heading, variance, time = self._good
+        fastest = max((abs(rate) for _, rate in self._recent if math.isfinite(rate)), default=0.0)
+        return heading, variance + (fastest * max(self._last - time, 0.0)) ** 2
+
+    def publishers(self, names: Sequence[str]) -> None:
+        """Take the nodes that publish the samples; more than one cannot be told apart."""
+        if len(names) > 1:
+            self._refuse_all(
+                f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), '
+                'whose samples cannot be told apart: give each gyro a topic of its own')
+        elif not self._jumps or self._clock.steady() - self._jumps[-1] > _INTERLEAVED:
+            self.conflict = ''
+            tracker = self.estimator.tracker
+            self._good = tracker.heading, tracker.variance, self._last
+
+    def obstacle(self, publishers: int) -> str:
+        """
+        Return why the robot must not be driven now; '' where nothing is known to stand against it.
+
+        Parameters
+        ----------
+        publishers : of imu/data_raw
+
+        """
+        now = self._clock.steady()
+        if self.ros_time.look(self._clock) > BLIND:
+            return STANDING_TIME
+        if self.conflict:
+            return self.conflict
+        if not publishers or now - self.journal.received > 1.0:
+            return 'no sample comes on imu/data_raw: look at the gyro and its driver'
+        if self.wheels.moving(now):
+            return ('odom or cmd_vel shows that the robot moves: let it stand, and run again')
+        rate = sum(each for _, each in self._recent) / max(len(self._recent), 1)
+        deviation = math.sqrt(self.estimator.tracker.bias[1] ** 2
+                              + self._tracking.threshold.rate ** 2)
+        if abs(rate) > _SIGMAS * deviation:
+            return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: let the robot stand, or '
+                    'call calibrate_bias first where it does')
+        return ''
+
+    # Now and then
+
+    def set(self, values: SimpleNamespace) -> None:
+        """Go on with other values of the parameters."""
+        self.values = values
+        tracking = tracker_settings(values, self.store.model.noise)
+        if tracking != self._tracking:
+            self._tracking = tracking
+            self.estimator.set(tracking)
+            self.monitor.standing = tracking.threshold.rate
+
+    def watch(self, receivers: int) -> None:
+        """Look whether time and samples go on; to be called several times a second."""
+        standing = self.ros_time.look(self._clock) > BLIND
+        self.session.watch(self.values, self._clock.steady(), receivers, standing, self.conflict)
+
+    def learn(self, ending: bool = False) -> None:
+        """Let the bias table learn from rests; to be called once a second, and at the end."""
+        if not self.simulated:
+            self._look_at_host_clock()
+        date = self._clock.date()
+        if event := self.estimator.learn(date, ending):
+            self.journal.event = event
+        self.store.keep_table(date, ending)
+        self.store.look()
+
+    def reset(self) -> str:
+        """Call this direction zero; return what was done."""
+        self.estimator.reset()
+        self._good = 0.0, 0.0, self._last
+        return 'the heading is zero here and now'
+
+
+_SOURCES = {'none': (), 'odom': (ODOMETRY,), 'cmd_vel': (COMMAND,), 'both': (ODOMETRY, COMMAND)}
