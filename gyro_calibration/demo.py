@@ -174,7 +174,7 @@ def _process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     quiet = ['-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error']
-    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.{module}', '--ros-args', *arguments, *quiet])
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}', '--ros-args', *arguments, *quiet])
     try:
         yield
     finally:
@@ -203,8 +203,9 @@ def run_demo(out: Path, seed: int) -> Demonstration:
     robot = Robot(model, np.concatenate(noise))
     with ExitStack() as stack:
         stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port, wait_for_reader=True))
-        stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL, reopen_interval=0.5))
-        stack.enter_context(_process('compensation_node', model_file=model_file, calibration_file=calibration_file, drive_profile=True))
+        stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL))
+        stack.enter_context(_process('compensation_node', model_file=model_file, calibration_file=calibration_file,
+                                     **{'calibration.drive': True}))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
         client = Client(robot)
@@ -229,7 +230,7 @@ def _perform(client: Client) -> float:
         _until(client.is_ready, 20.0)
         bar.set_description('calibrating on the motion profile')
         calibrate(client, bar)
-        client.call('reset_heading', 10.0, lambda: time.sleep(0.01))
+        client.call('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
         begin = time.time()
         _drive(client, DRIVE, bar)
@@ -247,7 +248,7 @@ def calibrate(client: Client, bar: tqdm) -> None:
     """
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            client.call('calibrate', 60.0, lambda: _pass(bar, 0.2))
+            client.call('compensation_node/calibrate', 60.0, lambda: _pass(bar, 0.2))
             return
         except Refused as refusal:
             if attempt == ATTEMPTS:

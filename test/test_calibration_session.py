@@ -4,11 +4,21 @@ import math
 
 import numpy as np
 import pytest
-from gyro_calibration.ros.calibration_run import LONGEST, MARKED, ODOMETRY, PROFILE, REST, TURNS, Rules, Run, calibrated, wanted_after
 
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.motion import CALIBRATION, turns
 from gyro_calibration.noise import Noise
+from gyro_calibration.ros.calibration_session import (
+    LONGEST,
+    MARKED,
+    ODOMETRY,
+    PROFILE,
+    REST,
+    TURNS,
+    Rules,
+    Run,
+    calibrated,
+)
 from gyro_calibration.self_calibration import Limits, Reference
 
 INTERVAL, S, B = 0.02, 0.0373, 0.75 * DEGREE / 60
@@ -21,22 +31,23 @@ def rules(turned=2, check=True):
 
 
 def ran(kind, motion, given, duration=None, drift=0.0):
-    """Return a run over a motion and the rest after it, and what it answered; from the end of the motion on it may drift, rad/s."""
-    answers = []
+    """Return a run over a motion and the rest after it, where it may drift, rad/s."""
     profile = motion if kind == PROFILE else None
-    run = Run(kind, motion.duration if duration is None else duration, wanted_after(kind, given), 0.0, answers.append, profile)
+    length = motion.duration if duration is None else duration
+    run = Run(kind, length, given.after(kind), 0.0, profile)
     noise = 1e-4 * np.random.default_rng(0).standard_normal(2000)
     for number in range(2000):
         time = number * INTERVAL
-        rate = (1 + S) * float(motion.rate_at(np.array(time))) + B + noise[number] + (drift if time > motion.duration else 0.0)
+        heading, turning = (float(of(np.array(time))) for of in (motion.heading_at, motion.rate_at))
+        rate = (1 + S) * turning + B + noise[number] + (drift if time > motion.duration else 0.0)
         if number % 3 == 0:
-            run.odometry.append((BEGIN + time, float(motion.heading_at(np.array(time))), float(motion.rate_at(np.array(time)))))
-        run.add(BEGIN + time, rate, rate, 25.0, time)
-        if run.has_button and time >= motion.duration:
+            run.odometry.append((BEGIN + time, heading, turning))
+        run.add(BEGIN + time, rate, rate, 25.0)
+        if kind in (ODOMETRY, TURNS) and time >= motion.duration:
             run.finish()
-        if answers:
-            return run, answers[0]
-    return run, None
+        if run.over is not None:
+            break
+    return run, run.over
 
 
 @pytest.mark.parametrize('kind, motion, duration, takes', [
@@ -51,36 +62,33 @@ def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration,
 
 
 def test_turns_that_nobody_finishes_are_given_up():
-    run = Run(TURNS, math.inf, MARKED, 0.0, (answers := []).append)
+    run = Run(TURNS, math.inf, MARKED, 0.0)
     for time in (0.0, LONGEST, LONGEST + 1.0):
-        run.add(time, 0.0, 0.0, None, time)
-    assert 'finish_calibration' in answers[0] and 'rest on the mark' in run.says()
+        run.add(time, 0.0, 0.0, None)
+    assert 'finish_calibration' in run.over and 'rest on the mark' in run.status
 
 
 @pytest.mark.parametrize('kind, duration', [(ODOMETRY, 600.0), (PROFILE, 700.0), (TURNS, 599.0)])
-def test_a_run_of_known_length_may_take_longer_than_one_that_waits_for_a_button(kind, duration):
-    run = Run(kind, math.inf if kind == TURNS else duration, 4.0, 0.0, (answers := []).append)
-    run.add(0.0, 0.0, 0.0, None, 0.0)
-    run.add(duration, 0.0, 0.0, None, duration)
+def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind, duration):
+    run = Run(kind, math.inf if kind == TURNS else duration, 4.0, 0.0)
+    run.add(0.0, 0.0, 0.0, None)
+    run.add(duration, 0.0, 0.0, None)
     if kind == TURNS:
         run.finish()
-    run.add(duration + 2.0, 0.0, 0.0, None, duration + 2.0)
-    assert not answers and run.progress < 1.0
-    run.add(duration + 4.0, 0.0, 0.0, None, duration + 4.0)
-    assert answers == ['']
+    run.add(duration + 2.0, 0.0, 0.0, None)
+    assert run.over is None and run.progress < 1.0
+    run.add(duration + 4.0, 0.0, 0.0, None)
+    assert run.over == ''
 
 
-def test_the_button_acts_once_and_tells_how_long_to_wait():
-    run = Run(TURNS, math.inf, 2.5, 0.0, (answers := []).append)
+def test_finishing_acts_once_and_returns_how_long_to_wait():
+    run = Run(TURNS, math.inf, 2.5, 0.0)
     for time in (0.0, 10.0):
-        run.add(time, 0.0, 0.0, None, time)
+        run.add(time, 0.0, 0.0, None)
     assert run.finish() == 'leave the robot at rest for 2.5 s more'
-    run.add(11.0, 0.0, 0.0, None, 11.0)
-    assert run.finish() == 'leave the robot at rest for 1.5 s more' and run.duration == 10.0 and not answers
-
-
-def test_a_profile_and_a_rest_have_no_button():
-    assert [Run(kind, 20.0, 4.0, 0.0, print).has_button for kind in (PROFILE, REST, ODOMETRY, TURNS)] == [False, False, True, True]
+    run.add(11.0, 0.0, 0.0, None)
+    assert run.finish() == 'leave the robot at rest for 1.5 s more'
+    assert run.duration == 10.0 and run.over is None
 
 
 def test_odometry_without_a_yaw_is_taken_by_its_rates():
@@ -126,16 +134,16 @@ def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
 
 
 def test_a_rest_gives_the_bias_alone():
-    run = Run(REST, 10.0, 0.0, 0.0, (answers := []).append)
+    run = Run(REST, 10.0, 0.0, 0.0)
     for number, noise in enumerate(1e-4 * np.random.default_rng(1).standard_normal(520)):
-        run.add(number * INTERVAL, B + noise, B + noise, None, 0.0)
+        run.add(number * INTERVAL, B + noise, B + noise, None)
     calibration, said = calibrated(run, rules(), Noise(), '')
-    assert answers[0] == '' and calibration.bias == pytest.approx(B, abs=1e-5) and calibration.method == 'rest' and not said
+    assert run.over == '' and calibration.bias == pytest.approx(B, abs=1e-5) and calibration.method == 'rest' and not said
 
 
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
-    run = Run(REST, 10.0, 0.0, 0.0, print)
+    run = Run(REST, 10.0, 0.0, 0.0)
     for number, noise in enumerate(1e-5 * np.random.default_rng(1).standard_normal(520)):
-        run.add(number * INTERVAL, B, B + noise, 25.0, 0.0)
+        run.add(number * INTERVAL, B, B + noise, 25.0)
     with pytest.raises(DataRefused, match='the gyro is dead'):
         calibrated(run, rules(), Noise(), '')

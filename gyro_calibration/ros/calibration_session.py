@@ -91,6 +91,30 @@ class Run:
     temperatures: list[float] = field(default_factory=list)
     odometry: list[tuple[float, float, float]] = field(default_factory=list)
 
+    def add(self, time: float, output: float, rate: float, temperature: float | None) -> None:
+        """Take a sample; the temperature in degC, where it is known."""
+        self.times.append(time)
+        self.outputs.append(output)
+        self.rates.append(rate)
+        if temperature is not None:
+            self.temperatures.append(temperature)
+
+    def finish(self) -> str:
+        """Let the motion be over now; return what the robot must do still."""
+        self.duration = min(self.duration, self.elapsed)
+        left = self.duration + self.after - self.elapsed
+        return f'leave the robot at rest for {left:.1f} s more'
+
+    @property
+    def over(self) -> str | None:
+        """Return '' where the samples are complete, why they never will be, or None."""
+        if self.elapsed >= self.duration + self.after:
+            return ''
+        if math.isinf(self.duration) and self.elapsed > LONGEST:
+            return (f'nobody called finish_calibration within {LONGEST:g} s: call it when the '
+                    'robot stands on the mark again')
+        return None
+
     @property
     def elapsed(self) -> float:
         """Return the time from the first sample to the last, s."""
@@ -321,16 +345,10 @@ class CalibrationSession:
             if self._drive.waits(receivers):
                 return
         estimator = self._estimator
-        run.times.append(time)
-        run.outputs.append(output)
-        run.rates.append(float(estimator.last.modelled))
-        if estimator.temperature is not None and not estimator.temperature_is_lost:
-            run.temperatures.append(estimator.temperature)
-        if run.elapsed >= run.duration + run.after:
-            self.end('')
-        elif math.isinf(run.duration) and run.elapsed > LONGEST:
-            self.end(f'nobody called finish_calibration within {LONGEST:g} s: call it when the '
-                     'robot stands on the mark again')
+        run.add(time, output, float(estimator.last.modelled),
+                None if estimator.temperature_is_lost else estimator.temperature)
+        if (reason := run.over) is not None:
+            self.end(reason)
 
     def add_odometry(self, time: float, heading: float, rate: float, now: float) -> None:
         """Take a heading, rad, and a rate, rad/s, of the odometry."""
@@ -429,9 +447,7 @@ class CalibrationSession:
         if not run.times:
             return False, ('no sample has come since the calibration began: look at the gyro and '
                            'its driver')
-        run.duration = min(run.duration, run.elapsed)
-        left = run.duration + run.after - run.elapsed
-        return True, f'leave the robot at rest for {left:.1f} s more'
+        return True, run.finish()
 
     def cancel(self) -> tuple[bool, str]:
         """Give the run up, and change nothing."""

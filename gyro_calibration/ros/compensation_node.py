@@ -89,7 +89,6 @@ class CompensationNode(Node):
         self._pipeline = Pipeline(values, self._calibration_file(), clock, self._command)
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
-        self._sources: list[str] = []
         self._receivers = 0
         self._answered: Future | None = None
         self._assumed_variance = values.assumed_bias ** 2
@@ -211,7 +210,6 @@ class CompensationNode(Node):
         """Look who is there, whether time goes on, and whether the report has become worse."""
         names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
                  for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
-        self._sources = names
         self._pipeline.publishers(names)
         self._wanted = {each: each.get_subscription_count() > 0 for each in self._wanted}
         self._look_for_receivers()
@@ -298,7 +296,7 @@ class CompensationNode(Node):
         """Return why the robot must not be driven now; ''."""
         if forbidden := self._learn_to_drive():
             return forbidden
-        return self._pipeline.obstacle(len(self._sources))
+        return self._pipeline.obstacle()
 
     def _learn_to_drive(self) -> str:
         """Become a publisher of cmd_vel, or return why not; who never drives is none."""

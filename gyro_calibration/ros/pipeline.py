@@ -393,21 +393,14 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._good = tracker.heading, tracker.variance, self._last
 
-    def obstacle(self, publishers: int) -> str:
-        """
-        Return why the robot must not be driven now; '' where nothing is known to stand against it.
-
-        Parameters
-        ----------
-        publishers : of imu/data_raw
-
-        """
+    def obstacle(self) -> str:
+        """Return why the robot must not be driven now; '' where nothing stands against it."""
         now = self._clock.steady()
         if self.ros_time.look(self._clock) > BLIND:
             return STANDING_TIME
         if self.conflict:
             return self.conflict
-        if not publishers or now - self.journal.received > 1.0:
+        if not self._recent or now - self.journal.received > 1.0:
             return 'no sample comes on imu/data_raw: look at the gyro and its driver'
         if self.wheels.moving(now):
             return ('odom or cmd_vel shows that the robot moves: let it stand, and run again')

@@ -19,7 +19,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import rclpy
-from ament_index_python.packages import get_package_share_directory
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -216,8 +215,9 @@ def executor() -> Executor:
     (Jazzy) and 9.1.2 (Kilted).
 
     """
-    manifest = Path(get_package_share_directory('rclpy')) / 'package.xml'
-    text = ElementTree.parse(manifest).findtext('version', '0')
+    # lib/pythonX.Y/site-packages/rclpy/__init__.py stands beside share/rclpy/package.xml
+    manifest = Path(rclpy.__file__).parents[4] / 'share' / 'rclpy' / 'package.xml'
+    text = ElementTree.parse(manifest).findtext('version', '') if manifest.exists() else ''
     version = tuple(int(part) for part in text.split('.') if part.isdigit())
     if (7, 1, 11) <= version < (8,) or version >= (9, 1, 2):
         from rclpy.experimental import EventsExecutor
