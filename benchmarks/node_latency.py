@@ -6,7 +6,8 @@ What the nodes cost: the compensation node beside a bare relay of the same messa
 This process publishes ``imu/data_raw`` and waits for ``imu/data``, now from the compensation node, now from a relay that publishes each
 message as it comes. The two alternate in blocks, so that whatever else the machine does meets both; a row shows the medians of the blocks
 and the median of their ratios. Latency is counted from before the publish here until the message is taken here, so both hops are in it.
-The relay publishes one message a sample, the node three: corrected rates, yaw rate and heading. All three have a subscriber.
+Both have the same topics: four are heard, and three messages a sample are published, which all have a
+subscriber. The relay computes nothing.
 
 Then the driver reads an emulated DSP-3000 on a pseudo-terminal. It takes 80 s in all, needs two idle cores, and nothing leaves the machine.
 
@@ -28,11 +29,12 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from processes import end, processor_time
 from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Float64
 
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import Sample, find
@@ -41,7 +43,7 @@ from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise
-from gyro_calibration.ros.runner import SENSOR_QOS
+from gyro_calibration.ros.runner import PUBLISHED_QOS, SENSOR_QOS
 
 RATES = (100, 1000)  # Hz
 ROUNDS = 4
@@ -52,6 +54,7 @@ COMMANDS = {
     'driver': [sys.executable, '-m', 'gyro_calibration.ros.driver_node'],
 }
 COMPARED = ('relay', 'node')
+PUBLISHED = {'imu/data': Imu, 'heading': PoseWithCovarianceStamped, 'yaw_rate': TwistWithCovarianceStamped}
 
 
 @dataclass(frozen=True)
@@ -78,11 +81,21 @@ class Block:
 
 
 def relay() -> None:
-    """Publish each message as it comes, run as most nodes in Python are."""
+    """Publish three messages for each that comes, run as most nodes in Python are."""
     rclpy.init(args=sys.argv)
     node = rclpy.create_node('relay')
-    publisher = node.create_publisher(Imu, 'imu/data', SENSOR_QOS)
-    node.create_subscription(Imu, 'imu/data_raw', publisher.publish, SENSOR_QOS)
+    imu, heading, rate = (node.create_publisher(kind, topic, PUBLISHED_QOS)
+                          for topic, kind in PUBLISHED.items())
+    pose, twist = PoseWithCovarianceStamped(), TwistWithCovarianceStamped()
+
+    def publish(message: Imu) -> None:
+        imu.publish(message)
+        heading.publish(pose)
+        rate.publish(twist)
+
+    node.create_subscription(Imu, 'imu/data_raw', publish, SENSOR_QOS)
+    for topic, kind in (('imu/temperature', Temperature), ('odom', Odometry), ('cmd_vel', Twist)):
+        node.create_subscription(kind, topic, print, SENSOR_QOS)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
@@ -128,8 +141,8 @@ class Probe:
     def _listen_idly(self) -> None:
         """Have the other messages sent as well, but take no time here to read them: nobody serves these subscriptions."""
         self._listener = rclpy.create_node('listener', namespace=self._subject)
-        for topic in ('yaw_rate', 'heading'):
-            self._listener.create_subscription(Float64, topic, print, SENSOR_QOS)
+        for topic in ('heading', 'yaw_rate'):
+            self._listener.create_subscription(PUBLISHED[topic], topic, print, SENSOR_QOS)
 
     def wait_for_subject(self) -> None:
         """

@@ -37,7 +37,7 @@ from gyro_calibration.driver.host_clock import steady
 from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import REST, Drive
 from gyro_calibration.ros.compensation_report import CompensationReport, calibration_status
-from gyro_calibration.ros.diagnostics import Diagnostics, Report, status_array
+from gyro_calibration.ros.diagnostics import OK, Diagnostics, Report, status_array
 from gyro_calibration.ros.pipeline import NSEC_PER_SEC, PARAMETERS, Output, Pipeline
 from gyro_calibration.ros.runner import (
     LATCHED_QOS,
@@ -50,6 +50,8 @@ from gyro_calibration.ros.runner import (
 from gyro_calibration.ros.wheels import Velocity
 
 Answer = tuple[bool, str]
+#: Between two looks at who is there and whether time goes on, s.
+_WATCH_INTERVAL = 0.2
 _NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
 
 
@@ -96,10 +98,9 @@ class CompensationNode(Node):
         self._report = CompensationReport(self._pipeline, clock)
         self._diagnostics = Diagnostics(self, 'heading', self._make_report)
         self._offer_services()
-        call_every(self, 0.2, self._watch)
-        call_every(self, 1.0, self._pipeline.learn)
-        self._timer = call_every(self, Drive.INTERVAL, self._drive)
-        self._timer.cancel()  # a wake-up costs as much as a sample
+        # Each timer, also a cancelled one, costs time at every sample: one for all.
+        self._watched = 0
+        call_every(self, _WATCH_INTERVAL, self._watch)
         self._show_status()
 
     def _calibration_file(self) -> Path:
@@ -218,8 +219,11 @@ class CompensationNode(Node):
         self._answer_ended()
         if self._pipeline.session.run:
             self._show_status()
-        level = self._report.level()
-        if self._diagnostics.level is not None and level > self._diagnostics.level:
+        self._watched += 1
+        second = self._watched % round(1.0 / _WATCH_INTERVAL) == 0
+        if second:
+            self._pipeline.learn()
+        if second or self._report.level() > (self._diagnostics.level or OK):
             self._diagnostics.now()
 
     # Services
@@ -248,13 +252,13 @@ class CompensationNode(Node):
         if refusal := session.begin(kind, self._values, steady(), obstacle):
             return self._refused(refusal)
         self._answered = Future()
-        if session.drives:
-            self._timer.reset()
+        timer = call_every(self, Drive.INTERVAL, self._drive) if session.drives else None
         self._show_status()
         self._look_for_receivers()
         await self._answered
         self._answered = None
-        self._timer.cancel()
+        if timer:
+            self.destroy_timer(timer)
         success, message = session.conclude()
         self._show_status()
         return (True, message) if success else self._refused(message)

@@ -8,13 +8,8 @@ from collections.abc import Callable, Mapping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from gyro_calibration.ros.runner import call_every
-
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 Report = tuple[bytes, str, Mapping[str, object]]
-
-#: Between two reports, s.
-PERIOD = 1.0
 
 
 def status_array(node: Node, name: str, report: Report, hardware_id: str = '') -> DiagnosticArray:
@@ -31,7 +26,7 @@ def status_array(node: Node, name: str, report: Report, hardware_id: str = '') -
 
 class Diagnostics:
     """
-    Report once a second, and at once when asked.
+    Report when asked: once a second, and at once where something has changed.
 
     Attributes
     ----------
@@ -42,7 +37,7 @@ class Diagnostics:
     def __init__(self, node: Node, name: str, report: Callable[[], Report],
                  hardware_id: str = 'none'):
         """
-        Begin to report.
+        Become a publisher of diagnostics.
 
         Parameters
         ----------
@@ -60,10 +55,9 @@ class Diagnostics:
         self._node, self._name, self._hardware = node, name, hardware_id
         self._report, self._lock = report, threading.Lock()
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        call_every(node, PERIOD, self.now)
 
     def now(self) -> None:
-        """Report at once, from any thread."""
+        """Report, from any thread."""
         with self._lock:
             report = self._report()
             self._publisher.publish(

@@ -87,6 +87,7 @@ class DriverNode(Node):
         self._difference, self._looked = ClockDifference(), 0.0
         self._report, self._told = DriverReport(self._connection, values.port, settings), ''
         self._diagnostics = Diagnostics(self, 'gyro', self._report.make, hardware_id=values.port)
+        call_every(self, 1.0, self._diagnostics.now)
         if self.get_parameter('use_sim_time').value:
             self.get_logger().warning('use_sim_time is set: stamps follow the simulation, but the gyro on the port turns in real time')
         self._stop = threading.Event()

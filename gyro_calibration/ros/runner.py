@@ -28,7 +28,7 @@ from rcl_interfaces.msg import (
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -55,6 +55,11 @@ LATCHED_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last state, also for those who come later."""
 
+# By default rclpy watches each topic for partners whose quality of service does not fit, and asks
+# at every wake-up, which at 1 kHz costs 2 % of a core a topic. Here every quality fits.
+_UNWATCHED_PUBLISHER = PublisherEventCallbacks(use_default_callbacks=False)
+_UNWATCHED_SUBSCRIPTION = SubscriptionEventCallbacks(use_default_callbacks=False)
+
 ENDING = 10.0
 """A node that has not ended after this time is killed, s."""
 
@@ -64,14 +69,15 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
     """Return a publisher whose quality of service parameters may override."""
     return node.create_publisher(
-        kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        kind, topic, qos, event_callbacks=_UNWATCHED_PUBLISHER,
+        qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
 def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[[Any], None],
                  qos: QoSProfile = SENSOR_QOS) -> Subscription:
     """Return a subscription whose quality of service parameters may override."""
     return node.create_subscription(
-        kind, topic, callback, qos,
+        kind, topic, callback, qos, event_callbacks=_UNWATCHED_SUBSCRIPTION,
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
@@ -230,8 +236,10 @@ def spin(node: Node, stop: threading.Event) -> None:
     serving = executor()
     serving.add_node(node)
     try:
+        # Every node has a timer, after which a signal is seen at the latest; a time-out here
+        # would be one more timer for each message.
         while not stop.is_set():
-            serving.spin_once(timeout_sec=0.1)
+            serving.spin_once()
     except ExternalShutdownException:
         pass  # somebody else shut rclpy down: the same end
     finally:
