@@ -1,0 +1,261 @@
+"""
+A small robot for tests: commands in, odometry and the samples of a gyro out.
+
+`Robot` is pure: it computes, with a time that the caller steps. `RosRobot` joins it to topics, in a
+thread. Both know nothing of the package that they test. All units are SI; angles are
+counter-clockwise positive.
+
+"""
+
+import math
+import random
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+try:
+    from geometry_msgs.msg import Twist, TwistStamped
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import QoSProfile
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import Imu
+except ImportError:
+    pass  # the fixture `ros` skips every test that needs them, and says why
+
+INTERVAL = 0.01  # s between samples
+STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """
+    What the robot reports after a step.
+
+    Attributes
+    ----------
+    stamp : float
+        Time of sample and odometry, s.
+    output : float or None
+        Rate that the gyro reports, rad/s; None while it is unplugged.
+    heading, rate : float
+        Odometry: heading, rad, not wrapped, and yaw rate, rad/s.
+
+    """
+
+    stamp: float
+    output: float | None
+    heading: float
+    rate: float
+
+
+class Robot:
+    """
+    A base that follows commands late, and a gyro on it.
+
+    Parameters
+    ----------
+    scale_factor_error, bias, noise : float
+        Errors of the gyro: 1, rad/s, and rad/s (standard deviation of a sample).
+    latency, lag : float
+        Time until a command acts, and time constant of the drives, s.
+    timeout : float
+        The base stops when it has heard no command for so long, s.
+    stamp : float
+        Stamp of the start, s.
+
+    Attributes
+    ----------
+    time : float
+        Since the start, s.
+    heading, rate : float
+        The truth, rad and rad/s.
+    unplugged, stamps_stand, deaf : bool
+        Set by a test: the gyro is silent; stamps do not go on; the base ignores commands and keeps
+        on doing what it did last.
+
+    """
+
+    def __init__(self, *, scale_factor_error=0.0373, bias=0.01, noise=1e-3, latency=0.15, lag=0.2,
+                 timeout=math.inf, stamp=1000.0, seed=0):
+        self.time = self.heading = self.rate = 0.0
+        self.unplugged = self.stamps_stand = self.deaf = False
+        self.scale_factor_error, self.bias, self.noise = scale_factor_error, bias, noise
+        self._latency, self._lag, self._timeout = latency, lag, timeout
+        self._stamp, self._random = stamp, random.Random(seed)
+        self._steps, self._target, self._heard = 0, 0.0, -math.inf
+        self._commands = deque()
+
+    def command(self, rate):
+        """Take a command to turn, rad/s, at the time of the last step; it acts after the latency."""
+        if not self.deaf:
+            self._heard = self.time
+            self._commands.append((self.time + self._latency, rate))
+
+    def step(self):
+        """Go on by the interval of the samples, and return a `Reading`."""
+        self._steps += 1
+        self.time = self._steps * INTERVAL
+        while self._commands and self._commands[0][0] <= self.time + 1e-9:
+            self._target = self._commands.popleft()[1]
+        if not self.deaf and self.time - self._heard > self._timeout + self._latency:
+            self._target = 0.0
+        # exact for a target that is constant over the step
+        kept = math.exp(-INTERVAL / self._lag)
+        self.heading += self._target * INTERVAL + (self.rate - self._target) * self._lag * (1 - kept)
+        self.rate = self._target + (self.rate - self._target) * kept
+        if not self.stamps_stand:
+            self._stamp += INTERVAL
+        output = (1.0 + self.scale_factor_error) * self.rate + self.bias + self._random.gauss(0.0, self.noise)
+        return Reading(self._stamp, None if self.unplugged else output, self.heading, self.rate)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The truth at one time of the steady clock, s: heading, rad, and rate, rad/s."""
+
+    time: float
+    heading: float
+    rate: float
+
+
+class RosRobot:
+    """
+    A `Robot` on topics: cmd_vel in; odom, imu/data_raw and, if it is simulated, /clock out.
+
+    A thread steps it by the steady clock. Callbacks come in the thread of the node's executor.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Its executor is spun by the caller.
+    robot : Robot
+    stamped : bool
+        Whether cmd_vel is a TwistStamped.
+    speed : float or None
+        Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and stamps
+        are those of the node's clock.
+
+    Attributes
+    ----------
+    commands : list of (time, rate)
+        Everything that came on cmd_vel, by the steady clock, s and rad/s.
+    headings : dict
+        True heading, rad, by the stamp of the sample, ns.
+    moments : list of Moment
+        The truth at each step.
+    clock_stands : bool
+        Set by a test: /clock is published no more and stamps stand; the base goes on.
+    also : callable or None
+        Called with each Imu message after it was published: a second driver.
+
+    """
+
+    def __init__(self, node, robot, *, stamped=False, speed=None):
+        self.robot, self.node, self.clock_stands, self.also = robot, node, False, None
+        self.commands, self.headings, self.moments = [], {}, []
+        self._stamped, self._speed, self._lock, self._last = stamped, speed, threading.Lock(), None
+        quality = QoSProfile(depth=100)
+        kind = TwistStamped if stamped else Twist
+        self._imu = node.create_publisher(Imu, 'imu/data_raw', quality)
+        self._odometry = node.create_publisher(Odometry, 'odom', quality)
+        self._clock = node.create_publisher(Clock, '/clock', 10) if speed else None
+        self._heard = node.create_subscription(kind, 'cmd_vel', self._on_command, quality)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _on_command(self, message):
+        twist = message.twist if self._stamped else message
+        with self._lock:
+            self.commands.append((now(), twist.angular.z))
+            self.robot.command(twist.angular.z)
+
+    def _run(self):
+        interval = INTERVAL / (self._speed or 1.0)
+        due = now()
+        while not self._stop.wait(max(0.0, due - now())):
+            due = max(due + interval, now() - 0.5)  # a computer that slept does not hurry
+            with self._lock:
+                self._publish(self.robot.step())
+
+    def _publish(self, reading):
+        self.moments.append(Moment(now(), reading.heading, reading.rate))
+        stamp = self._stamp(reading)
+        self.headings[stamp] = reading.heading
+        header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
+        if self._clock and not self.clock_stands:
+            clock = Clock()
+            clock.clock.sec, clock.clock.nanosec = header['sec'], header['nanosec']
+            self._clock.publish(clock)
+        odometry = Odometry()
+        _set(odometry.header, header, 'odom')
+        odometry.child_frame_id = 'base_link'
+        odometry.pose.pose.orientation.z = math.sin(0.5 * reading.heading)
+        odometry.pose.pose.orientation.w = math.cos(0.5 * reading.heading)
+        odometry.twist.twist.angular.z = reading.rate
+        self._odometry.publish(odometry)
+        if reading.output is not None:
+            imu = Imu()
+            _set(imu.header, header, 'gyro')
+            imu.angular_velocity.z = reading.output
+            imu.orientation_covariance[0] = imu.linear_acceleration_covariance[0] = -1.0
+            self._imu.publish(imu)
+            if self.also:
+                self.also(imu)
+
+    def _stamp(self, reading):
+        """Return the stamp in ns: of the simulation, or of the node's clock."""
+        if not (self.clock_stands or self.robot.stamps_stand) or self._last is None:
+            self._last = round(reading.stamp * 1e9) if self._speed else self.node.get_clock().now().nanoseconds
+        return self._last
+
+    def turned_since(self, since):
+        """Return the angle that it has turned since a time of the steady clock, rad, either way."""
+        after = [moment.heading for moment in self.moments if moment.time >= since]
+        return sum(abs(b - a) for a, b in zip(after, after[1:]))
+
+    def close(self):
+        """End the thread."""
+        self._stop.set()
+        self._thread.join()
+
+
+def _set(header, stamp, frame):
+    header.stamp.sec, header.stamp.nanosec, header.frame_id = stamp['sec'], stamp['nanosec'], frame
+
+
+def now():
+    """Return the steady clock, s."""
+    return time.clock_gettime(STEADY)
+
+
+class SecondCommander:
+    """
+    Somebody else on cmd_vel at 20 Hz: a soft stop (rate 0) or teleop.
+
+    Attributes
+    ----------
+    rate : float or None
+        What it commands, rad/s; None for nothing.
+
+    """
+
+    def __init__(self, node, stamped=False):
+        self.rate, self._node, self._stamped = None, node, stamped
+        self._publisher = node.create_publisher(TwistStamped if stamped else Twist, 'cmd_vel', 10)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        while not self._stop.wait(0.05):
+            if self.rate is not None:
+                message = TwistStamped() if self._stamped else Twist()
+                (message.twist if self._stamped else message).angular.z = self.rate
+                self._publisher.publish(message)
+
+    def close(self):
+        """Say nothing any more."""
+        self._stop.set()
+        self._thread.join()
