@@ -1,0 +1,145 @@
+"""The layouts for Foxglove and PlotJuggler name topics, fields and diagnostics that exist."""
+
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+try:
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+    from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
+    from sensor_msgs.msg import Imu, Temperature
+except ImportError:
+    pytest.skip('ROS 2 messages are not installed', allow_module_level=True)
+
+CONFIG = Path(__file__).parents[1] / 'config'
+FOXGLOVE = json.loads((CONFIG / 'foxglove.json').read_text())
+PLOTJUGGLER = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
+SCRIPT = FOXGLOVE['userNodes']['heading_band']['sourceCode']
+TOPICS = {
+    '/imu/data_raw': Imu, '/imu/temperature': Temperature, '/imu/data': Imu,
+    '/heading': PoseWithCovarianceStamped, '/yaw_rate': TwistWithCovarianceStamped,
+    '/compensation_node/calibration_status': DiagnosticArray, '/diagnostics': DiagnosticArray,
+}
+STATUSES = {'/driver_node: gyro', '/compensation_node: heading'}
+FUNCTIONS = {'degrees', 'sqrt'}  # of the message paths of Foxglove
+
+
+def policy():
+    """Return the topics that driver and compensation publish, by their policy in config/sros2."""
+    enclaves = ElementTree.parse(CONFIG / 'sros2' / 'policy.xml').getroot().iter('enclave')
+    published = set()
+    for enclave in enclaves:
+        for profile in enclave.iter('profile'):
+            for topics in profile.iter('topics'):
+                if topics.get('publish') == 'ALLOW':
+                    names = [topic.text.replace('~', profile.get('node')) for topic in topics]
+                    published |= {f'/{name.lstrip("/")}' for name in names}
+    return published
+
+
+def field(message, names):
+    """Walk along the fields of a message; an array of messages is walked through by its element."""
+    for name in names:
+        assert hasattr(message, name), f'{type(message).__name__} has no {name}'
+        message = getattr(message, name)
+    return message
+
+
+def check_path(path):
+    """Check a message path of Foxglove."""
+    topic = re.match(r'[\w/]+', path)[0]
+    assert topic in TOPICS, path
+    message = TOPICS[topic]()
+    for name in re.findall(r'\{name=="([^"]+)"\}', path):
+        assert name in STATUSES
+    for part in re.sub(r'\{[^}]*\}', '', path[len(topic):]).split('.')[1:]:
+        if part.startswith('@'):
+            assert part[1:] in FUNCTIONS and isinstance(message, float), path
+            continue
+        name, index = re.fullmatch(r'(\w+)(?:\[([\d:]+)\])?', part).groups()
+        message = field(message, [name])
+        if isinstance(message, list) and index:  # of statuses
+            message = DiagnosticStatus()
+        elif index:
+            message = float(message[int(index)])
+
+
+
+def test_the_topics_are_those_that_the_nodes_publish():
+    assert set(TOPICS) <= policy()
+
+
+def paths():
+    """Return all message paths of the Foxglove layout."""
+    found = []
+    for config in FOXGLOVE['configById'].values():
+        found += [series['value'] for series in config.get('paths', [])]
+        found += [config[key] for key in ('topicPath', 'topicToRender') if key in config]
+    return found
+
+
+@pytest.mark.parametrize('path', [path for path in paths() if not path.startswith('/studio_script/')])
+def test_each_path_of_foxglove_exists(path):
+    check_path(path)
+
+
+def test_the_script_of_foxglove_reads_what_exists_and_gives_what_is_plotted():
+    inputs = re.search(r'inputs = \[(.*)\]', SCRIPT)[1].replace('"', '').split(', ')
+    output = re.search(r'output = "(.*)"', SCRIPT)[1]
+    assert inputs == ['/heading'] and TOPICS['/heading'] is PoseWithCovarianceStamped
+    message = PoseWithCovarianceStamped()
+    field(message, ['pose', 'pose', 'orientation', 'z'])
+    assert len(message.pose.covariance) == 36 and 'pose.covariance[35]' in SCRIPT
+    given = set(re.findall(r'(\w+): number', SCRIPT.partition('type Output = ')[2].partition(';\n')[0]))
+    plotted = {path.removeprefix(f'{output}.') for path in paths() if path.startswith('/studio_script/')}
+    assert plotted == given
+
+
+def test_every_panel_of_foxglove_is_shown_once():
+    def panels(node):
+        return [node] if isinstance(node, str) else panels(node['first']) + panels(node['second'])
+    assert sorted(panels(FOXGLOVE['layout'])) == sorted(FOXGLOVE['configById'])
+
+
+def test_the_status_panels_of_foxglove_name_a_status():
+    chosen = [config['selectedName'] for config in FOXGLOVE['configById'].values() if 'selectedName' in config]
+    assert chosen and set(chosen) <= STATUSES
+
+
+def series_exists(name):
+    """Check a series by the names that PlotJuggler's ROS parser gives (read in its source, 2026)."""
+    topic = max((topic for topic in TOPICS if name.startswith(f'{topic}/')), key=len)
+    rest = name.removeprefix(f'{topic}/')
+    if TOPICS[topic] is DiagnosticArray:
+        hardware, status, _key = re.fullmatch(r'(\w+)/(/\w+: \w+)/(\w+)', rest).groups()
+        assert hardware == 'none' and status in STATUSES
+        return
+    names = rest.split('/')
+    message = TOPICS[topic]()
+    if names[-1] == 'yaw':  # it makes angles of quaternions, and rows and columns of covariances
+        names[-1] = 'z'
+    if re.fullmatch(r'\[\d;\d\]', names[-1]):
+        assert len(field(message, names[:-1])) == 9 and names[-1] == '[2;2]'
+        return
+    assert isinstance(field(message, names), float)
+
+
+def test_each_series_of_plotjuggler_exists():
+    snippets = {snippet.get('name'): snippet for snippet in PLOTJUGGLER.iter('snippet')}
+    curves = {curve.get('name') for curve in PLOTJUGGLER.iter('curve')}
+    assert set(snippets) <= curves
+    sources = [element.text for snippet in snippets.values() for element in snippet.iter()
+               if element.tag == 'linked_source' or re.fullmatch(r'v\d', element.tag)]
+    for name in [*(curves - set(snippets)), *sources]:
+        series_exists(name)
+
+
+def test_plotjuggler_subscribes_to_what_it_shows():
+    topics = PLOTJUGGLER.find('.//selected_topics').get('value').split(';')
+    assert set(topics) <= set(TOPICS)
+    shown = [element.text for element in PLOTJUGGLER.iter('linked_source')]
+    shown += [curve.get('name') for curve in PLOTJUGGLER.iter('curve') if curve.get('name').startswith('/')]
+    assert all(any(name.startswith(f'{topic}/') for topic in topics) for name in shown)
