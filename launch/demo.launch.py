@@ -1,8 +1,9 @@
 """
 A gyro that does not exist, on a pseudo-terminal, with its driver and compensation.
 
-The emulated robot drives about, and the compensation knows the model of its gyro: ``ros2 topic echo /heading``. All ends with the
-drive. Nothing leaves this machine, unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise.
+The emulated robot drives about, and the compensation knows the model of its gyro:
+``ros2 topic echo /heading``. All ends with the drive. Nothing leaves this machine, unless
+ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise.
 
 """
 
@@ -10,7 +11,12 @@ import os
 import tempfile
 
 from launch import LaunchDescription
-from launch.actions import ExecuteProcess, IncludeLaunchDescription, SetEnvironmentVariable, Shutdown
+from launch.actions import (
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    SetEnvironmentVariable,
+    Shutdown,
+)
 from launch.substitutions import EnvironmentVariable, PathJoinSubstitution
 from launch_ros.substitutions import ExecutableInPackage, FindPackageShare
 
@@ -21,25 +27,24 @@ PROTOCOL = 'kvh_dsp3000'
 def generate_launch_description():
     """Return the emulated gyro and what gyro.launch.py starts, on the emulator's port."""
     port = os.path.join(tempfile.gettempdir(), f'gyro_calibration_demo_{os.getpid()}')
-    discovery = EnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', default_value='LOCALHOST')
-    arguments = {'port': port, 'protocol': PROTOCOL, 'model_file': _model(), 'calibration_file': f'{port}.yaml'}
-    nodes = IncludeLaunchDescription(_share('launch', 'gyro.launch.py'), launch_arguments=arguments.items())
-    return LaunchDescription([SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', discovery), _emulator(port), nodes])
-
-
-def _emulator(port):
+    range_name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    discovery = EnvironmentVariable(range_name, default_value='LOCALHOST')
+    model = _share('config', 'xv3500.yaml')
+    arguments = {'port': port, 'protocol': PROTOCOL, 'model_file': model,
+                 'calibration_file': f'{port}.yaml'}
+    nodes = IncludeLaunchDescription(_share('launch', 'gyro.launch.py'),
+                                     launch_arguments=arguments.items())
     program = ExecutableInPackage(package=PACKAGE, executable='gyro_calibration')
-    command = [program, 'emulate', '--protocol', PROTOCOL, '--model', _model(), '--motion', 'robot', '--link', port]
-    return ExecuteProcess(cmd=command, name='emulator', output='screen', on_exit=_end)
+    emulator = ExecuteProcess(
+        cmd=[program, 'emulate', '--protocol', PROTOCOL, '--model', model, '--motion', 'robot',
+             '--link', port],
+        name='emulator', output='screen', on_exit=_end)
+    return LaunchDescription([SetEnvironmentVariable(range_name, discovery), emulator, nodes])
 
 
 def _end(event, context):
-    # After Ctrl-C everything ends by itself, and a second signal would hit nodes that are about to.
+    # After Ctrl-C everything ends by itself; a second signal would hit nodes that are ending.
     return [] if context.is_shutdown else [Shutdown(reason='the emulated gyro has ended')]
-
-
-def _model():
-    return _share('config', 'xv3500.yaml')
 
 
 def _share(*parts):

@@ -24,7 +24,9 @@ def generate_test_description():
     from launch.actions import SetEnvironmentVariable
     skip_where_not_installed()
     domain = SetEnvironmentVariable('ROS_DOMAIN_ID', str(DOMAIN))
-    nodes = include('gyro.launch.py', {'port': '/nonexistent/gyro', 'namespace': 'robot'})
+    nodes = include('gyro.launch.py', {
+        'port': '/nonexistent/gyro', 'namespace': 'robot', 'frame_id': 'gyro_link', 'respawn': 'true',
+        'odom_topic': '/base/odom', 'cmd_vel_topic': '/base/cmd_vel'})
     return LaunchDescription([domain, include('demo.launch.py', {}), nodes, launch_testing.actions.ReadyToTest()])
 
 
@@ -80,9 +82,15 @@ class TestGraph(unittest.TestCase):
         from rcl_interfaces.srv import GetParameters
         client = self.node.create_client(GetParameters, '/robot/driver_node/get_parameters')
         assert self.spin_until(client.service_is_ready), 'no driver'
-        answer = client.call_async(GetParameters.Request(names=['port']))
+        answer = client.call_async(GetParameters.Request(names=['port', 'frame_id', 'use_sim_time']))
         assert self.spin_until(answer.done), 'no answer'
-        assert answer.result().values[0].string_value == '/nonexistent/gyro'
+        port, frame, simulated = answer.result().values
+        assert (port.string_value, frame.string_value) == ('/nonexistent/gyro', 'gyro_link')
+        assert simulated.bool_value is False
+
+    def test_the_topics_of_a_shared_base_are_heard(self):
+        for topic in ('/base/odom', '/base/cmd_vel'):
+            assert self.spin_until(lambda: self.node.count_subscribers(topic)), topic  # noqa: B023, at once
 
     def test_the_heading_follows_the_raw_output(self):
         from rclpy.qos import qos_profile_sensor_data
@@ -97,10 +105,10 @@ class TestGraph(unittest.TestCase):
 
     def headings(self, topic):
         """Return the list that the headings go to."""
+        from geometry_msgs.msg import PoseWithCovarianceStamped
         from rclpy.qos import qos_profile_sensor_data
-        from std_msgs.msg import Float64
         headings = []
-        self.node.create_subscription(Float64, topic, headings.append, qos_profile_sensor_data)
+        self.node.create_subscription(PoseWithCovarianceStamped, topic, headings.append, qos_profile_sensor_data)
         return headings
 
     def sample(self, message):
