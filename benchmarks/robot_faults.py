@@ -196,14 +196,14 @@ class Stage:
     def _heading(self):
         """Return what the heading of the node is off by since the start, and what it claims, deg."""
         heard, truth = list(self._heard), dict(self.robot.headings)
-        error, turned, last, begin = math.nan, 0.0, None, None
+        error, claimed, turned, last, begin = math.nan, math.nan, 0.0, None, None
         for _, stamp, yaw, variance in heard:
             turned += math.remainder(yaw - last, math.tau) if last is not None else 0.0
             last = yaw
-            if stamp in truth:
+            if stamp in truth and variance < 1e5:  # else it is not known yet
                 begin = begin or (turned, truth[stamp], variance)
                 error, claimed = turned - begin[0] - truth[stamp] + begin[1], variance - begin[2]
-        return math.degrees(error), math.degrees(math.sqrt(max(claimed, 0.0))) if begin else math.nan
+        return math.degrees(error), math.degrees(math.sqrt(max(claimed, 0.0)))
 
     def others(self):
         """Return a second commander."""

@@ -1,0 +1,255 @@
+"""
+A pipeline and the small robot, joined as the node joins them, with a clock that the test steps.
+
+No rclpy and no waiting: a run of 24 s takes a fraction of a second. What a call of `Rig.step` does
+is what the compensation node does in the interval of one sample.
+
+"""
+
+import math
+
+from robot import INTERVAL, Robot
+
+from gyro_calibration.ros.calibration_session import PROFILE
+from gyro_calibration.ros.parameters import record
+from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
+from gyro_calibration.ros.wheels import Velocity
+
+BEGIN = 1_700_000_000.0  # s since 1970
+MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-4}\n'
+
+
+class StepClock:
+    """
+    The clocks of a node, stepped by a test.
+
+    Attributes
+    ----------
+    now : steady clock, s
+    set_by : what somebody set the clock of the host by, s
+    ros : time of a simulation, s; None where there is none
+
+    """
+
+    def __init__(self, ros=None):
+        self.now, self.set_by, self.ros = 1000.0, 0.0, ros
+
+    def steady(self):
+        """Return the steady clock, s."""
+        return self.now
+
+    def date(self):
+        """Return the clock of the host, s since 1970."""
+        return BEGIN - 1000.0 + self.now + self.set_by
+
+    def simulated(self):
+        """Return the time of a simulation, s."""
+        return self.ros
+
+
+class Rig:
+    """
+    A pipeline, a robot that obeys its commands, and what comes out.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Where model and calibration are kept.
+    model : str
+        Text of the model file; '' for none.
+    robot : Robot, or None for one with the defaults
+    ros : float or None
+        Begin of a simulation, s, whose time the stamps follow.
+    calibration_file : pathlib.Path, or None for one in the folder
+    **parameters
+        Of the node; ``calibration_drive=True`` stands for ``calibration.drive``.
+
+    Attributes
+    ----------
+    pipeline, clock, robot
+    commands : list of (time, rate), s of the steady clock and rad/s
+    outputs : list of what `Pipeline.sample` returned, without None
+    truth : dict of the true heading, rad, by stamp, ns
+    publishers : list of names; who publishes the samples
+    receivers : int
+        Other nodes that receive cmd_vel.
+    ros_speed : float
+        Seconds of the simulation in one second; 0 while it stands.
+    other : float or None
+        What somebody else commands at 20 Hz, rad/s.
+    fed : float
+        Stamp of the last sample of `feed`, s.
+
+    """
+
+    def __init__(self, folder, model=MODEL, robot=None, ros=None, calibration_file=None,
+                 **parameters):
+        self.clock, self.robot = StepClock(ros), robot or Robot()
+        self.commands, self.outputs, self.truth = [], [], {}
+        self.publishers, self.receivers, self.ros_speed, self.other = ['/driver_node'], 1, 1.0, None
+        self.fed, self._steps, self._stamp, self._echoes = BEGIN, 0, 0, []
+        if model:
+            (folder / 'model.yaml').write_text(model)
+            parameters = {'model_file': str(folder / 'model.yaml'), **parameters}
+        names = {each.attribute: each.name for each in PARAMETERS}
+        self._given = {names[attribute]: value for attribute, value in parameters.items()}
+        self.calibration_file = calibration_file or folder / 'calibration.yaml'
+        self.pipeline = Pipeline(record(PARAMETERS, self._given), self.calibration_file, self.clock,
+                                 self._send)
+        self.session, self.journal = self.pipeline.session, self.pipeline.journal
+
+    def _send(self, rate):
+        self.commands.append((self.clock.now, rate))
+        self._echoes.append(rate)
+        if self.receivers:
+            self.robot.command(rate)
+
+    def set(self, **parameters):
+        """Set parameters while it runs."""
+        names = {each.attribute: each.name for each in PARAMETERS}
+        self._given.update({names[attribute]: value for attribute, value in parameters.items()})
+        self.pipeline.set(record(PARAMETERS, self._given))
+
+    def stamp(self, reading):
+        """Return the stamp of a reading, ns."""
+        if self.clock.ros is not None:
+            if not self.robot.stamps_stand:
+                self._stamp = round(1e9 * self.clock.ros)
+            return self._stamp
+        return round(1e9 * (reading.stamp - 1000.0 + BEGIN + self.clock.set_by))
+
+    def step(self):
+        """Let everything go on by the interval of the samples."""
+        self._steps += 1
+        self.clock.now += INTERVAL
+        if self.clock.ros:
+            self.clock.ros += INTERVAL * self.ros_speed
+        for _ in range(len(self._echoes)):
+            self.pipeline.command(Velocity(angular=(0.0, 0.0, self._echoes.pop(0))))
+        if self.other is not None and self._steps % 5 == 0:
+            self.robot.command(self.other)
+            self.pipeline.command(Velocity(angular=(0.0, 0.0, self.other)))
+        reading = self.robot.step()
+        stamp = self.stamp(reading)
+        self.odometry(stamp, reading)
+        if reading.output is not None:
+            self.sample(stamp, reading.output, reading.heading)
+        self.guards()
+
+    def odometry(self, stamp, reading):
+        """Let the odometry arrive."""
+        heading = math.remainder(reading.heading, math.tau)
+        self.pipeline.odometry(stamp, heading, Velocity(angular=(0.0, 0.0, reading.rate)))
+
+    def sample(self, stamp, output, heading=math.nan):
+        """Let a sample arrive, and return what comes out."""
+        self.truth[stamp] = heading
+        found = self.pipeline.sample(stamp, output, receivers=self.receivers)
+        if found is not None:
+            self.outputs.append(found)
+        return found
+
+    def guards(self):
+        """Look as the timers of the node do: every 20 ms during a drive, else every 0.2 s."""
+        if self._steps % 20 == 0:
+            self.pipeline.publishers(self.publishers)
+        if self._steps % (2 if self.session.drives else 20) == 0:
+            self.pipeline.watch(self.receivers)
+        if self._steps % 100 == 0:
+            self.pipeline.learn()
+
+    def go(self, seconds=60.0, until=lambda: False):
+        """Step for a time, or until a condition holds; return whether it did."""
+        for _ in range(round(seconds / INTERVAL)):
+            if until():
+                return True
+            self.step()
+        return until()
+
+    def feed(self, outputs, interval=INTERVAL, temperature=None, force=None, moving=None):
+        """
+        Play outputs of a gyro, rad/s, without the robot.
+
+        Parameters
+        ----------
+        outputs : sequence of float
+        interval : float
+            Between samples, s.
+        temperature : sequence of float, float or None
+            With each sample, degC.
+        force : float or None
+            Specific force along the input axis, m/s².
+        moving : float or None
+            Rate that odometry shows, rad/s.
+
+        Returns
+        -------
+        list of what came out for each sample
+
+        """
+        found = []
+        for number, output in enumerate(outputs):
+            self._steps += 1
+            self.clock.now += interval
+            self.fed += interval
+            stamp = round(1e9 * self.fed)
+            if temperature is not None:
+                each = temperature if isinstance(temperature, float) else temperature[number]
+                self.pipeline.temperature(stamp, float(each))
+            if moving is not None:
+                self.pipeline.odometry(stamp, 0.0, Velocity(angular=(0.0, 0.0, moving)))
+            found.append(self.pipeline.sample(stamp, float(output), force, self.receivers))
+            self.outputs += [found[-1]] if found[-1] else []
+            self.guards()
+        return found
+
+    def skip(self, seconds, steady=None):
+        """Let the stamps of `feed` jump, and the steady clock by as much or by another time."""
+        self.fed += seconds
+        self.clock.now += seconds if steady is None else steady
+
+    def begin(self, kind=PROFILE):
+        """Call a calibration; return '' or why it was refused."""
+        drive = self.pipeline.values.calibration_drive and kind == PROFILE
+        obstacle = self.pipeline.obstacle() if drive else ''
+        return self.session.begin(kind, self.pipeline.values, self.clock.now, obstacle)
+
+    @property
+    def ended(self):
+        """Tell whether a run has ended, and only its answer is left."""
+        run = self.session.run
+        return run is None or run.reason is not None
+
+    def calibrate(self, kind=PROFILE, seconds=60.0):
+        """Calibrate while the robot goes on, and return success and message."""
+        if refusal := self.begin(kind):
+            return False, refusal
+        assert self.go(seconds, lambda: self.ended), 'no end of the run'
+        return self.session.conclude()
+
+    def drive_to(self, rate=0.7):
+        """Begin a calibration that drives the robot, and return when it turns faster than a rate."""
+        assert not self.begin()
+        assert self.go(10.0, lambda: abs(self.robot.rate) > rate)
+
+    def stopped_after(self, since, others=()):
+        """Return how long after a time the last command to turn was followed by a zero, s."""
+        sent = [(when, rate) for when, rate in self.commands if when >= since]
+        last = max([when for when, rate in sent if rate], default=since)
+        zeros = [when for when, rate in sent if not rate and when >= last]
+        return zeros[0] - since if zeros else math.inf
+
+    def error(self, begin=10, end=-1):
+        """Return what the heading is off by from one output to another, and its deviation, rad."""
+        first, last = self.outputs[begin], self.outputs[end]
+        truth = self.truth[last.stamp] - self.truth[first.stamp]
+        deviation = math.sqrt(max(last.heading_variance - first.heading_variance, 0.0))
+        return last.heading - first.heading - truth, deviation
+
+
+def rested(*arguments, seconds=3.0, **parameters):
+    """Return a rig whose robot has rested for a while."""
+    rig = Rig(*arguments, **parameters)
+    rig.go(seconds)
+    return rig
+

@@ -1,0 +1,573 @@
+"""Calibrations on a robot that obeys late: what they find, what ends them, and who is obeyed."""
+
+import math
+
+import numpy as np
+import pytest
+from rig import PROFILE, Rig, Robot, rested
+
+from gyro_calibration.log import DEGREE
+from gyro_calibration.model_file import read_model
+from gyro_calibration.motion import CALIBRATION, from_rates
+from gyro_calibration.ros.calibration_session import (
+    DISCOVERY,
+    ODOMETRY,
+    REST,
+    SILENCE,
+    TURNS,
+    Drive,
+)
+from gyro_calibration.ros.wheels import Velocity
+
+SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
+FULL = 45.0 * DEGREE
+#: A command that the base has reached it follows for 0.15 s more, then it slows with 0.2 s.
+STOPPING = FULL * (0.15 + 0.2)
+
+
+def stored(rig):
+    return read_model(rig.calibration_file).self_calibration
+
+
+# A run that drives the robot
+
+
+def test_a_run_finds_scale_and_bias_stores_and_uses_them(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    success, message = rig.calibrate()
+    assert success, message
+    kept = stored(rig)
+    assert kept.scale_factor_error == pytest.approx(SCALE, abs=5e-4)
+    assert kept.bias == pytest.approx(BIAS, abs=2e-4)
+    assert rig.pipeline.estimator.model.self_calibration == kept
+    assert 'the gyro lags by 0.3' in message and 'at rest after it' in message
+
+
+def test_the_commands_are_the_profile_and_end_with_one_zero(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    begin = rig.clock.now
+    assert rig.calibrate()[0]
+    rates = np.array([rate for _, rate in rig.commands])
+    times = np.array([when for when, _ in rig.commands]) - begin
+    assert (rates.max(), rates.min()) == pytest.approx((FULL, -FULL), abs=1e-6)
+    np.testing.assert_allclose(rates[:-1], CALIBRATION.rate_at(times[:-1] - 0.01), atol=0.06)
+    assert np.diff(times).max() < 1.5 * Drive.INTERVAL and rates[-1] == 0.0
+
+
+def test_the_heading_goes_on_with_the_old_calibration_and_does_not_jump_to_the_new_one(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    begin = len(rig.outputs)
+    assert rig.calibrate()[0]
+    rig.go(1.0)
+    headings = np.array([each.heading for each in rig.outputs[begin:]])
+    assert np.abs(np.diff(headings)).max() < 1.1 * (1 + SCALE) * FULL * 0.01
+    during = [each.rate for each in rig.outputs[begin:] if abs(each.rate) > 0.7]
+    assert max(during) == pytest.approx((1 + SCALE) * FULL, abs=0.01), 'not yet the new scale'
+
+
+def test_the_next_start_uses_the_stored_calibration_and_the_heading_is_right(tmp_path):
+    assert rested(tmp_path, calibration_drive=True).calibrate()[0]
+    again = rested(tmp_path)
+    assert again.pipeline.estimator.model.self_calibration == stored(again)
+    begin = len(again.outputs) - 1
+    again.robot.command(FULL)
+    again.go(8.0)
+    error, deviation = again.error(begin)
+    assert abs(error) < 4.0 * deviation and deviation < 0.5 * DEGREE
+
+
+def test_a_calibration_behind_another_model_is_not_used_and_the_reason_is_given(tmp_path):
+    (tmp_path / 'calibration.yaml').write_text(
+        'effects: {bias: {bias: 0.1}}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
+    rig = Rig(tmp_path)
+    assert rig.feed([0.5])[0].rate == 0.5
+    assert 'belongs to another model' in rig.pipeline.store.hint
+
+
+def test_a_calibration_that_cannot_be_stored_is_used_and_the_answer_warns(tmp_path):
+    (tmp_path / 'file').write_text('')
+    rig = rested(tmp_path, calibration_file=tmp_path / 'file' / 'calibration.yaml',
+                 calibration_drive=True)
+    success, message = rig.calibrate()
+    assert success and 'NOT STORED' in message
+    assert rig.pipeline.estimator.model.self_calibration
+
+
+# What ends a drive
+
+
+def faults():
+    """Return, by name, what happens to a rig in mid-run, and words of the reason."""
+    return {
+        'unplugged': (lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample came for'),
+        'stamps stand': (lambda rig: setattr(rig.robot, 'stamps_stand', True), 'no sample came'),
+        'soft stop': (lambda rig: setattr(rig, 'other', 0.0), 'another node sent a command'),
+        'teleop': (lambda rig: setattr(rig, 'other', 0.3), 'another node sent a command'),
+        'nobody obeys': (lambda rig: setattr(rig, 'receivers', 0), 'no other node receives'),
+        'two publishers': (lambda rig: rig.publishers.append('/other'), '2 publishers send'),
+        'forbidden': (lambda rig: rig.set(calibration_drive=False), 'calibration.drive was set'),
+        'cancelled': (lambda rig: rig.session.cancel(), 'cancelled'),
+    }
+
+
+@pytest.mark.parametrize('fault', faults())
+@pytest.mark.parametrize('ros', [None, 1000.0], ids=['host time', 'simulated'])
+def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault, ros):
+    rig = rested(tmp_path, calibration_drive=True, ros=ros)
+    rig.drive_to()
+    act, reason = faults()[fault]
+    begin, heading = rig.clock.now, rig.robot.heading
+    act(rig)
+    assert rig.go(2.0, lambda: rig.ended)
+    success, message = rig.session.conclude()
+    assert not success and reason in message, message
+    assert rig.stopped_after(begin) < 0.5
+    rig.go(2.0)
+    assert rig.commands[-1][1] == 0.0 and not rig.session.drives
+    if fault not in ('teleop', 'nobody obeys'):
+        assert rig.robot.rate == pytest.approx(0.0, abs=1e-4)
+        assert abs(rig.robot.heading - heading) < FULL * 0.5 + STOPPING
+    assert not rig.calibration_file.exists()
+
+
+@pytest.mark.parametrize('unplugged', [False, True], ids=['samples come', 'unplugged'])
+def test_ros_time_that_stops_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, unplugged):
+    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
+    rig.drive_to()
+    begin, rig.ros_speed, rig.robot.unplugged = rig.clock.now, 0.0, unplugged
+    assert rig.go(2.0, lambda: rig.ended)
+    _, message = rig.session.conclude()
+    assert 'ROS time stands still' in message and rig.stopped_after(begin) < 0.5
+
+
+@pytest.mark.parametrize('speed', [0.25, 4.0])
+def test_a_simulation_at_another_speed_is_driven_as_long_as_its_time_goes_on(tmp_path, speed):
+    """The profile follows the stamps; here 10 ms of the steady clock are one sample."""
+    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
+    rig.ros_speed = speed
+    rig.begin()
+    rig.go(3.0 / speed)
+    assert rig.session.run.reason is None
+    assert rig.session.run.elapsed == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_clock_of_the_host_that_is_set_by_an_hour_in_mid_run_ends_nothing(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.clock.set_by = -3600.0
+    rig.go(60.0, lambda: rig.ended)
+    success, message = rig.session.conclude()
+    assert success, message
+
+
+def test_own_commands_that_come_back_are_not_those_of_another_node(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True, wheels='both')
+    success, message = rig.calibrate()
+    assert success, message
+
+
+def test_own_commands_that_come_back_late_and_with_gaps_are_not_those_of_another_node(tmp_path):
+    """As over best effort: some never come, the others 0.4 s later and in their order."""
+    rig = rested(tmp_path, calibration_drive=True)
+    late, taken = [], rig.pipeline.command
+    generator = np.random.default_rng(1)
+
+    def delayed(velocity):
+        if generator.random() > 0.3:
+            late.append((rig.clock.now + 0.4, velocity))
+        while late and late[0][0] <= rig.clock.now:
+            taken(late.pop(0)[1])
+    rig.pipeline.command = delayed
+    success, message = rig.calibrate()
+    assert success, message
+
+
+@pytest.mark.parametrize('rate', [0.0, 0.3])
+def test_one_foreign_command_is_enough(tmp_path, rate):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.pipeline.command(Velocity(angular=(0.0, 0.0, rate)))
+    assert rig.ended and rig.commands[-1] == (rig.clock.now, 0.0)
+
+
+def test_a_foreign_command_that_drives_ahead_is_foreign(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.pipeline.command(Velocity(linear=(0.2, 0.0, 0.0), angular=(0.0, 0.0, rig.commands[-1][1])))
+    assert rig.ended
+
+
+def test_a_drive_that_is_taken_over_sends_one_zero_and_nothing_after_it(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.other = 0.3
+    rig.go(1.0)
+    sent = len(rig.commands)
+    rig.session.conclude()
+    rig.go(2.0)
+    assert len(rig.commands) == sent and rig.robot.rate == pytest.approx(0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize('interval, burst', [(0.01, 2), (0.1, 1), (0.01, 20), (0.2, 1)],
+                         ids=['100 Hz', '10 Hz', 'bursts', '5 Hz'])
+def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(tmp_path, interval, burst):
+    rig = Rig(tmp_path, model='', calibration_drive=True)
+    rig.feed(np.zeros(round(2.0 / interval)), interval)
+    assert not rig.begin()
+
+    def wait(seconds):
+        for _ in range(round(seconds / Drive.INTERVAL)):
+            rig.clock.now += Drive.INTERVAL
+            rig.pipeline.watch(1)
+
+    for _ in range(round(3.0 / interval / burst)):
+        wait(interval * burst)
+        for _ in range(burst):
+            rig.fed += interval
+            rig.sample(round(1e9 * rig.fed), 0.0)
+    assert min(rate for _, rate in rig.commands[-20:]) > 0.5
+    begin = rig.clock.now
+    wait(1.5)
+    assert rig.ended and 'while the robot was driven' in rig.session.run.reason
+    assert rig.stopped_after(begin) <= max(0.25, 4.0 * interval) + 2.1 * Drive.INTERVAL
+
+
+def test_a_pause_of_the_node_ends_no_drive_whose_samples_wait_behind_the_timers(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.clock.now += 0.4
+    rig.pipeline.watch(1)
+    rig.step()
+    rig.pipeline.watch(1)
+    assert not rig.ended
+
+
+# What a drive does not begin over
+
+
+@pytest.mark.parametrize('prepare, reason', [
+    (lambda rig: setattr(rig, 'other', 0.3), 'odom or cmd_vel shows that the robot moves'),
+    (lambda rig: setattr(rig, 'other', 0.0), 'another node sends commands on cmd_vel'),
+    (lambda rig: setattr(rig.robot, 'unplugged', True), 'no sample comes'),
+    (lambda rig: rig.publishers.append('/b'), '2 publishers'),
+], ids=['teleop', 'a soft stop', 'unplugged', 'two publishers'])
+def test_a_drive_begins_only_when_the_robot_rests_and_is_free(tmp_path, prepare, reason):
+    rig = rested(tmp_path, calibration_drive=True)
+    prepare(rig)
+    rig.go(2.0)
+    refusal = rig.begin()
+    assert reason in refusal and not rig.session.run
+    rig.go(1.0)
+    assert not rig.commands
+
+
+@pytest.mark.parametrize('ros', [0.0, 1000.0], ids=['absent', 'paused'])
+def test_a_drive_does_not_begin_while_ros_time_stands(tmp_path, ros):
+    rig = Rig(tmp_path, calibration_drive=True, ros=ros)
+    rig.go(3.0)
+    rig.ros_speed = 0.0
+    rig.go(2.0)
+    assert 'ROS time stands still' in rig.begin() and not rig.commands
+
+
+def test_a_turn_that_only_the_gyro_shows_keeps_a_drive_from_beginning(tmp_path):
+    rig = Rig(tmp_path, calibration_drive=True)
+    rig.feed(np.full(300, 0.3))
+    assert 'the gyro shows a turn at 17' in rig.begin()
+
+
+def test_a_large_bias_keeps_a_drive_from_beginning_until_it_is_calibrated(tmp_path):
+    rig = rested(tmp_path, robot=Robot(bias=3.0 * DEGREE), calibration_drive=True)
+    assert 'call calibrate_bias first' in rig.begin()
+    assert rig.calibrate(REST)[0]
+    rig.go(1.0)
+    success, message = rig.calibrate()
+    assert success, message
+
+
+def test_a_drive_waits_for_somebody_who_receives_its_commands(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.receivers = 0
+    assert not rig.begin()
+    rig.go(0.5 * DISCOVERY)
+    assert rig.session.run.elapsed == 0.0 and not rig.ended
+    rig.receivers = 1
+    assert rig.go(40.0, lambda: rig.ended)
+    assert rig.session.conclude()[0]
+
+
+def test_a_drive_that_nobody_receives_ends_after_5_s(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.receivers = 0
+    begin = rig.clock.now
+    success, message = rig.calibrate()
+    assert not success and 'no other node receives cmd_vel' in message
+    assert rig.clock.now - begin == pytest.approx(DISCOVERY, abs=0.1)
+
+
+# After a drive
+
+
+def test_a_robot_that_turns_on_after_the_stop_is_reported(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.robot.deaf = True
+    rig.session.cancel()
+    rig.session.conclude()
+    rig.go(1.4)
+    assert not rig.session.warning, 'it may still be slowing down'
+    rig.go(1.0)
+    assert 'command time-out of its base' in rig.session.warning
+    rig.robot.deaf = False
+    rig.robot.command(0.0)
+    rig.go(5.0)
+    assert not rig.begin() and not rig.session.warning, 'a new run has a new chance'
+
+
+def test_a_robot_that_stops_late_but_stops_is_not_reported(tmp_path):
+    rig = rested(tmp_path, robot=Robot(lag=0.3), calibration_drive=True)
+    rig.drive_to()
+    rig.session.cancel()
+    rig.session.conclude()
+    rig.go(5.0)
+    assert not rig.session.warning
+
+
+def test_a_base_with_a_time_out_stops_by_itself_where_the_node_is_killed(tmp_path):
+    """Without one, nothing stops it: no command comes from a process that is gone."""
+    turned = []
+    for timeout in (0.5, math.inf):
+        rig = rested(tmp_path, robot=Robot(timeout=timeout), calibration_drive=True)
+        rig.drive_to()
+        heading = rig.robot.heading
+        for _ in range(500):  # the node is gone
+            rig.robot.step()
+        turned.append(rig.robot.heading - heading)
+    assert turned[0] < FULL * 0.5 + 2.0 * STOPPING and turned[1] > 4.9 * FULL
+
+
+# Load
+
+
+def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    watch, held = rig.pipeline.watch, []
+
+    def late(receivers):
+        """Hold the timers up for 0.2 s, 30 times, while samples come."""
+        slot = int(rig.clock.now / 0.2)
+        if slot % 3 and len(held) < 2000:
+            held.append(slot)
+            return
+        watch(receivers)
+    rig.pipeline.watch = late
+    success, message = rig.calibrate()
+    assert not success and 'this computer was busy: commands were up to 0.' in message
+    assert '(the run shows: ' in message
+
+
+def test_a_slip_without_load_is_named_as_one(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.begin()
+    rig.go(5.0)
+    step = rig.robot.step
+
+    def slipping():
+        reading = step()
+        return type(reading)(reading.stamp, BIAS, reading.heading, reading.rate)
+    rig.robot.step = slipping
+    rig.go(0.3)
+    rig.robot.step = step
+    rig.go(30.0, lambda: rig.ended)
+    success, message = rig.session.conclude()
+    assert not success and 'busy' not in message and 'a slip or a bump' in message
+
+
+# Services beside each other
+
+
+def test_a_second_calibration_is_refused_and_leaves_the_first_alone(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.begin()
+    rig.go(3.0)
+    assert 'is in progress' in rig.begin(REST) and 'is in progress' in rig.begin()
+    assert rig.go(40.0, lambda: rig.ended) and rig.session.conclude()[0]
+
+
+def test_cancel_keeps_the_calibration_in_use_and_there_is_nothing_left_to_cancel(tmp_path):
+    rig = rested(tmp_path)
+    rig.begin()
+    rig.go(5.0)
+    assert rig.session.cancel() == (True, 'cancelled; the previous calibration is in use')
+    assert rig.session.conclude() == (False, 'cancelled')
+    assert rig.session.cancel() == (False, 'no calibration is in progress')
+    assert not rig.calibration_file.exists()
+
+
+def test_a_cancel_that_comes_with_the_last_sample_does_not_promise_the_old_calibration(tmp_path):
+    rig = rested(tmp_path)
+    rig.begin(REST)
+    assert rig.go(20.0, lambda: rig.ended)
+    success, message = rig.session.cancel()
+    assert not success and 'has just ended' in message
+    assert rig.session.conclude()[0]
+
+
+@pytest.mark.parametrize('kind', [PROFILE, REST, ODOMETRY, TURNS])
+def test_a_run_without_samples_ends_after_5_s(tmp_path, kind):
+    rig = rested(tmp_path, calibration_reference=kind if kind != REST else 'profile')
+    rig.robot.unplugged = True
+    begin = rig.clock.now
+    success, message = rig.calibrate(kind)
+    assert not success and 'no sample came for 5 s' in message
+    assert rig.clock.now - begin == pytest.approx(SILENCE, abs=0.6)
+
+
+def test_a_jump_of_the_stamps_ends_a_run_and_the_reason_names_it(tmp_path):
+    rig = Rig(tmp_path)
+    rig.feed(np.zeros(300))
+    rig.begin(REST)
+    rig.feed(np.zeros(300))
+    rig.skip(3.0)
+    rig.feed([0.0])
+    success, message = rig.session.conclude()
+    assert not success and 'no samples for 3.0' in message and 'run again' in message
+
+
+def test_an_error_in_the_fit_changes_nothing_and_the_next_run_works(tmp_path, monkeypatch):
+    rig = rested(tmp_path, calibration_drive=True)
+    with monkeypatch.context() as patched:
+        patched.setattr('gyro_calibration.ros.calibration_session.calibrated',
+                        lambda *_: 1 / 0)
+        success, message = rig.calibrate()
+    assert not success and 'nothing was changed' in message and 'ZeroDivisionError' in message
+    assert rig.calibrate()[0]
+
+
+def test_a_bad_profile_is_refused_in_one_sentence_that_names_the_file(tmp_path):
+    profile = tmp_path / 'profile.csv'
+    profile.write_text('time_s,speed\n0,1\n1,2\n')
+    refusal = rested(tmp_path, calibration_profile_file=str(profile)).begin()
+    assert 'time_s and one of heading_deg' in refusal and str(profile) in refusal
+
+
+def test_without_a_readable_model_nothing_is_calibrated(tmp_path):
+    rig = rested(tmp_path, model='effects: {bias: {bias: .nan}}')
+    assert 'effects.bias.bias is nan' in rig.begin(REST)
+
+
+# Runs that must not be believed
+
+
+@pytest.mark.parametrize('change, reason', [
+    (lambda rates: np.zeros_like(rates), 'same value'),
+    (lambda rates: BIAS + 1e-4 * np.random.default_rng(1).standard_normal(rates.size),
+     'did the robot move'),
+    (lambda rates: -rates, 'invert'),
+    (lambda rates: np.where(np.arange(rates.size) // 30 == 11, 0.0, rates), 'a slip or a bump'),
+    (lambda rates: rates + np.where(np.arange(rates.size) > 2200, 2.0 * DEGREE, 0.0),
+     'after the run'),
+], ids=['dead', 'not moved', 'wrong sign', 'slip', 'drives on'])
+def test_a_run_that_cannot_be_believed_is_refused_and_changes_nothing(tmp_path, change, reason):
+    rig = Rig(tmp_path, model='')
+    rates = (1 + SCALE) * CALIBRATION.rate_at(np.arange(0.0, 24.3, 0.01)) + BIAS
+    rig.begin()
+    rig.feed(change(rates))
+    assert rig.ended
+    success, message = rig.session.conclude()
+    assert not success and reason in message and not rig.calibration_file.exists()
+
+
+# Other references
+
+
+def test_a_profile_of_measured_headings_serves_as_well(tmp_path):
+    motion = from_rates(np.array([0.0, 1.0, 1.5, 4.0, 4.5, 5.5, 6.0, 9.0, 9.5, 10.0]),
+                        np.array([0, 0, 0.6, 0.6, 0, 0, -0.7, -0.7, 0, 0]))
+    times = np.arange(0.0, 10.001, 0.05)
+    profile = tmp_path / 'profile.csv'
+    profile.write_text('time_s,heading_deg\n' + ''.join(
+        f'{t},{h / DEGREE}\n' for t, h in zip(times, motion.heading_at(times))))
+    rig = Rig(tmp_path, model='', calibration_profile_file=str(profile))
+    rig.begin()
+    rig.feed((1 + SCALE) * motion.rate_at(np.arange(0.0, 14.3, 0.01)) + BIAS)
+    success, message = rig.session.conclude()
+    assert success, message
+    assert stored(rig).scale_factor_error == pytest.approx(SCALE, abs=1e-5)
+
+
+def test_odometry_is_a_reference(tmp_path):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY)
+    rig.begin(ODOMETRY)
+    for rate, seconds in ((0.6, 4.0), (0.0, 3.0), (-0.6, 4.0), (0.0, 13.5)):
+        rig.robot.command(rate)
+        rig.go(seconds)
+    assert rig.ended
+    success, message = rig.session.conclude()
+    assert success and 'at rest after it' in message, message
+    kept = stored(rig)
+    assert kept.method == 'odometry' and kept.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
+    assert kept.standard_deviations[0] > 0.0099 * (1 + SCALE), 'no run is better than its odometry'
+
+
+def test_odometry_may_be_finished_early(tmp_path):
+    rig = rested(tmp_path, calibration_reference=ODOMETRY, calibration_duration=600.0)
+    rig.begin(ODOMETRY)
+    for rate, seconds in ((0.6, 4.0), (0.0, 3.0), (-0.6, 4.0), (0.0, 3.0)):
+        rig.robot.command(rate)
+        rig.go(seconds)
+    assert rig.session.finish() == (True, 'leave the robot at rest for 4.0 s more')
+    rig.go(1.0)
+    assert rig.session.finish() == (True, 'leave the robot at rest for 3.0 s more')
+    assert rig.go(5.0, lambda: rig.ended) and rig.session.conclude()[0]
+
+
+def test_whole_turns_on_a_mark_are_a_reference(tmp_path):
+    rig = rested(tmp_path, calibration_reference=TURNS, calibration_turns=2)
+    assert rig.session.finish() == (False,
+                                    'no calibration by turns or by odometry is in progress')
+    rig.begin(TURNS)
+    assert 'no sample has come since' in rig.session.finish()[1]
+    rig.go(3.0)
+    rig.robot.command(0.6)
+    rig.go(2.0 * math.tau / 0.6)
+    rig.robot.command(0.0)
+    rig.go(4.0)
+    assert rig.robot.heading == pytest.approx(2.0 * math.tau, abs=0.02), 'two turns'
+    assert rig.session.finish()[0]
+    assert rig.go(5.0, lambda: rig.ended)
+    success, message = rig.session.conclude()
+    assert success and '2 whole turns' in message, message
+    kept = stored(rig)
+    assert kept.method == 'turns' and kept.scale_factor_error == pytest.approx(SCALE, abs=2e-3)
+
+
+def test_calibrate_bias_keeps_the_scale_factor_error(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    assert rig.calibrate()[0]
+    before = stored(rig)
+    rig.robot.bias = 0.02
+    success, message = rig.calibrate(REST)
+    assert success and 'more than the model explains: it changed the bias by' in message, message
+    assert stored(rig).bias == pytest.approx(0.02, abs=4e-4)
+    assert stored(rig).scale_factor_error == before.scale_factor_error
+    assert stored(rig).standard_deviations[0] == pytest.approx(before.standard_deviations[0])
+
+
+def test_calibrate_bias_refuses_a_gyro_that_is_moved(tmp_path):
+    rig = rested(tmp_path)
+    rig.begin(REST)
+    rig.go(5.0)
+    rig.robot.command(0.1)
+    rig.go(1.0)
+    rig.robot.command(0.0)
+    rig.go(20.0, lambda: rig.ended)
+    success, message = rig.session.conclude()
+    assert not success and 'was moved' in message
+
+
+def test_without_permission_a_calibration_commands_nothing(tmp_path):
+    rig = rested(tmp_path)
+    rig.begin()
+    rig.go(10.0)
+    assert not rig.commands and not rig.session.drives
