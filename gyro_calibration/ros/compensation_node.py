@@ -279,8 +279,10 @@ class CompensationNode(Node):
         success, text = answer
         response.success, response.message = success, text if success else f'refused: {text}'
         self._pipeline.journal.event = response.message
-        log = self.get_logger()
-        (log.info if success else log.warning)(response.message)
+        if success:  # in two lines: rclpy refuses another severity from the same line
+            self.get_logger().info(response.message)
+        else:
+            self.get_logger().warning(response.message)
         return response
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
