@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,10 @@ from gyro_calibration.effects import Channels
 from gyro_calibration.history import clip
 from gyro_calibration.log import CACHED, Array, Number
 from gyro_calibration.model import GyroModel
+
+
+#: A rate of this size, rad/s, comes of a model whose values are too large to be computed with.
+_LARGEST = 1e300
 
 
 @dataclass(frozen=True)
@@ -22,8 +27,10 @@ class Compensated:
     modelled : rate after the model and before the self-calibration, rad/s; what a self-calibration is made from
     rate : rad/s
     temperature : that was used, degC
-    temperature_clipped : the temperature is outside the calibrated range, and its nearest end was used
-    beyond_range : the output is outside the calibrated range of rates
+    temperature_clipped : the temperature is outside the calibrated range, or not plausible, and the nearest end was used
+    beyond_range : the output is outside the calibrated range of rates, or not plausible, or no rate explains it. Up to
+        `GyroModel.rate_limit` the correction is extrapolated; beyond that, and from where the response no longer grows with the rate, the
+        last correction is held, so that the rate is finite whatever the output
 
     """
 
@@ -53,12 +60,22 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
 
 def _compensated(model: GyroModel, output: Number, given: Number, surroundings: Channels | None = None) -> Compensated:
-    low, high = model.temperature_range
-    used = clip(given, low, high)
-    modelled = model.rate_in(Channels(output, output, used) if surroundings is None else surroundings.moving(output, output))
+    low, high = model.used_temperatures
+    used, limit, many = clip(given, low, high), model.rate_limit, isinstance(output, np.ndarray)
     slowest, fastest = model.rate_range
+    beyond = (output < max(slowest, -limit)) | (output > min(fastest, limit))
+    seen = clip(output, -limit, limit) if (beyond.any() if many else beyond) else output
+    with np.errstate(all='ignore') if many else nullcontext():
+        modelled, unexplained = model.rate_in(
+            Channels(seen, seen, used) if surroundings is None else surroundings.moving(seen, seen))
+        if not -_LARGEST < (modelled.sum() if many else modelled) < _LARGEST:
+            # the model itself cannot be computed there: nothing is corrected
+            computed = abs(modelled) < _LARGEST
+            modelled, unexplained = np.where(computed, modelled, seen) if many else seen, unexplained | ~computed if many else True
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
-    return Compensated(modelled, rate, used, used != given, (output < slowest) | (output > fastest))
+    if seen is not output:
+        modelled, rate = modelled + (output - seen), rate + (output - seen)
+    return Compensated(modelled, rate, used, used != given, beyond if unexplained is False else beyond | unexplained)
 
 
 def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
@@ -71,7 +88,7 @@ def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
         modelled[block], clipped[block], beyond[block] = part.modelled, part.temperature_clipped, part.beyond_range
         if rate is not modelled:
             rate[block] = part.rate
-    used = clip(given, *model.temperature_range) if clipped.any() else given
+    used = clip(given, *model.used_temperatures) if clipped.any() else given
     return Compensated(modelled, rate, used, clipped, beyond)
 
 

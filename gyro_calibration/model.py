@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,8 +13,19 @@ import numpy as np
 
 from gyro_calibration.effects import Channels, Effect, Number
 from gyro_calibration.history import History
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.noise import Noise
+
+
+#: Largest plausible output, rad/s, where no valid range of rates is stated; and where one is: so many times its farther end, but at least
+#: what robots reach, for a model may have been fitted at rest.
+_FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
+#: Plausible temperatures, degC, where no valid range is stated.
+_TEMPERATURES = (-100.0, 200.0)
+#: The response is inverted where the output grows by at least so much with the rate, 1.
+_FLATTEST = 0.1
+#: The last step of the repetition, as a part of 1 rad/s and of the rate, that is taken for a solution; the error is far smaller.
+_SETTLED = 1e-10
 
 
 @dataclass(frozen=True)
@@ -147,7 +159,63 @@ class GyroModel:
             return 1.0
         step = 1e-5  # rad/s; small beside what bends an effect, and large beside the rounding of its error
         below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output)) for change in (-step, step))
-        return np.maximum(1.0 + (above - below) / (2.0 * step), 0.1)
+        return np.maximum(1.0 + (above - below) / (2.0 * step), _FLATTEST)
+
+    @cached_property
+    def rate_limit(self) -> float:
+        """Return the largest plausible output, rad/s; a sample beyond it is not one of this gyro."""
+        farther = max(map(abs, self.rate_range))
+        return max(_MARGIN * farther, _REACHED) if farther < math.inf else _FASTEST
+
+    @cached_property
+    def temperature_limits(self) -> tuple[float, float]:
+        """Return the plausible temperatures, degC: the usual ones, and the valid range with its own width on both sides."""
+        low, high = self.used_temperatures
+        return min(2.0 * low - high, _TEMPERATURES[0]), max(2.0 * high - low, _TEMPERATURES[1])
+
+    @cached_property
+    def used_temperatures(self) -> tuple[float, float]:
+        """Return the temperatures beyond which the nearest end is used, degC: the valid range, or the plausible temperatures."""
+        low, high = ((value if math.isfinite(value) else usual) for value, usual in zip(self.temperature_range, _TEMPERATURES))
+        return low, max(low, high)
+
+    @cached_property
+    def rate_domain(self) -> tuple[float, float]:
+        """
+        Return the rates between which the response is inverted, rad/s.
+
+        From the valid rate nearest to zero they reach as far as the output grows with the rate at all temperatures that are used, and to no
+        rate whose output would not be plausible.
+
+        """
+        low, high = self.rate_range
+        centre = min(max(0.0, low), high)
+        down, up = (self._monotone(centre, side) for side in (-1.0, 1.0))
+        return centre - down, centre + up
+
+    def _monotone(self, centre: float, side: float) -> float:
+        """Return how far from a rate to one side the output grows with the rate, rad/s."""
+        _, sought = self._parted_by_rate
+        low, high = self.used_temperatures
+        distances = self.rate_limit / _FLATTEST * np.geomspace(1e-6, 1.0, 160)
+
+        def grows(begin: Array, end: Array) -> Mask:
+            ends = [[rate + _sum(sought, Channels(rate, rate, temperature)) for rate in (centre + side * begin, centre + side * end)]
+                    for temperature in (low, high)]
+            return np.all([side * (after - before) >= _FLATTEST * (end - begin) for before, after in ends], axis=0)
+
+        with np.errstate(all='ignore'):
+            steps = np.concatenate([[0.0], distances])
+            good = grows(steps[:-1], steps[1:]) & grows((1.0 - 1e-6) * distances, distances)
+            if good.all():
+                return float(distances[-1])
+            first = int(np.argmin(good))
+            # the bend lies between two of these steps
+            near, far = (np.array([steps[first + place]]) for place in (0, 1))
+            for _ in range(50):
+                middle = 0.5 * (near + far)
+                near, far = (middle, far) if grows((1.0 - 1e-6) * middle, middle).all() else (near, middle)
+        return float(near[0])
 
     def looks_at(self, channel: str) -> bool:
         """Tell whether an effect uses the channel."""
@@ -165,7 +233,7 @@ class GyroModel:
 
     def history(self) -> History:
         """Return a history that begins now, of the temperatures that the model uses."""
-        return History(self.reference_temperature, *self.temperature_range)
+        return History(self.reference_temperature, *self.used_temperatures)
 
     def output(self, rate: Number, temperature: Number) -> Number:
         """Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``; without noise."""
@@ -175,17 +243,24 @@ class GyroModel:
         """Return the output, rad/s, at the rate of the channels and in their surroundings; without noise."""
         rate, (known, sought) = channels.rate, self._parted_by_output
         given = rate + _sum(known, channels)
-        return _solve(lambda output: given + _sum(sought, channels.moving(rate, output)), rate, bool(sought))
+        return _repeated(lambda output: given + _sum(sought, channels.moving(rate, output)), rate)[0] if sought else given
 
     def rate(self, output: Number, temperature: Number) -> Number:
         """Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``; what cannot be undone stays."""
-        return self.rate_in(Channels(output, output, temperature))
+        return self.rate_in(Channels(output, output, temperature))[0]
 
-    def rate_in(self, channels: Channels) -> Number:
-        """Return the rate, rad/s, at the output of the channels and in their surroundings, of which the rate does not matter."""
+    def rate_in(self, channels: Channels) -> tuple[Number, Number]:
+        """
+        Return the rate, rad/s, at the output of the channels and in their surroundings, of which the rate does not matter.
+
+        Also whether no rate of the `rate_domain` has this output; the correction at the end of the domain is held there.
+
+        """
         output, (known, sought) = channels.output, self._parted_by_rate
         given = output - _sum(known, channels)
-        return _solve(lambda rate: given - _sum(sought, channels.moving(rate, output)), output, bool(sought))
+        if not sought:
+            return given, False
+        return _inverse(lambda rate: _sum(sought, channels.moving(rate, output)), given, output, self.rate_domain)
 
     def distorted(self, stage: str, signal: Array, time: Array) -> Array:
         """Return the signal of a whole log after the effects that change it at a stage, 'rate' or 'output'."""
@@ -224,28 +299,66 @@ def _sum(terms: Sequence[Term], channels: Channels) -> Number:
     return sum(term.error(channels) for term in terms)
 
 
-def _solve(g: Callable[[Number], Number], start: Number, implicit: bool) -> Number:
+def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf, high: float = math.inf) -> tuple[Number, Number]:
     """
-    Solve x = g(x) for a slope of g well below one.
+    Solve x = g(x) for a slope of g well below one; return x, and the last step.
 
     The plain repetition wins a factor of the slope a pass; along the secant each pass wins more than the one before, and a slope that is
     constant is solved at once. The number of passes is fixed, so that a sample and a whole log take the same steps; of a single sample
-    those are left out that would change nothing.
+    those are left out that would change nothing, and those that leave the bounds end there.
 
     """
     a, b = start, g(start)
-    if not implicit:
-        return b
-    g_a = b
+    many, g_a, step = isinstance(b, np.ndarray), b, b - a
     for _ in range(6):
         g_b = g(b)
-        if not isinstance(b, np.ndarray) and g_b == b:
-            break
-        step = b - a
+        if not many and g_b == b:
+            return b, 0.0
         slope = (g_b - g_a) / (step + (step == 0.0))
-        slope = slope * (abs(slope) < 0.9)
+        slope = slope * (slope < 0.9)
         a, g_a, b = b, g_b, b + (g_b - b) / (1.0 - slope)
-    return b
+        if not many:
+            b = min(max(b, low), high)
+        step = b - a
+    return b, step
+
+
+def _inverse(added: Callable[[Number], Number], given: Number, start: Number, domain: tuple[float, float]) -> tuple[Number, Number]:
+    """
+    Solve ``rate + added(rate) = given`` for a rate of a domain in which the left side grows with the rate.
+
+    Parameters
+    ----------
+    added : rate -> what is added to it, rad/s
+    given : rad/s, a number or shape (n,)
+    start : where to begin, rad/s, alike
+    domain : lowest and highest rate, rad/s
+
+    Returns
+    -------
+    the rate, and whether there is none in the domain: what is added at its nearer end is taken there
+
+    """
+    low, high = domain
+    many = isinstance(given, np.ndarray)
+    with np.errstate(all='ignore') if many else nullcontext():
+        # a single sample may step out of the domain and back, but not so far that nothing can be computed
+        rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
+        solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
+    if solved.all() if many else solved:
+        return rate, False
+    with np.errstate(all='ignore'):
+        at_low, at_high = added(low), added(high)
+        below, above = given < low + at_low, given > high + at_high
+        if not np.all(solved | below | above):
+            begin, end = low + 0.0 * given, high + 0.0 * given
+            for _ in range(80):
+                middle = 0.5 * (begin + end)
+                higher = middle + added(middle) < given
+                begin, end = np.where(higher, middle, begin), np.where(higher, end, middle)
+            rate = np.where(solved, rate, begin)
+        rate = np.where(below, given - at_low, np.where(above, given - at_high, rate))
+    return (rate, below | above) if many else (float(rate), bool(below or above))
 
 
 def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None) -> GyroModel:
