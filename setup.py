@@ -1,5 +1,6 @@
 """The package for pip and for colcon; name, version and the like are read from package.xml."""
 
+import sys
 from glob import glob
 from xml.etree import ElementTree
 
@@ -8,39 +9,58 @@ from setuptools import find_packages, setup
 manifest = ElementTree.parse('package.xml').getroot()
 name = manifest.findtext('name')
 
-# The wheels of ROS 2 Jazzy, for machines without an installed ROS 2. Every one is pinned: a single newer one breaks the others.
-jazzy = {
-    'ros-rclpy[fastrtps]': '7.1.6',
-    'ros-sensor-msgs': '5.3.6',
-    'ros-geometry-msgs': '5.3.6',
-    'ros-nav-msgs': '5.3.6',
-    'ros-std-msgs': '5.3.6',
-    'ros-std-srvs': '5.3.6',
-    'ros-diagnostic-msgs': '5.3.6',
-    'ros-rosgraph-msgs': '2.0.3',
-    'ros-lifecycle-msgs': '2.0.3',
-}
-ros = [f'{wheel}=={version}; sys_platform == "linux" and platform_machine == "x86_64"' for wheel, version in jazzy.items()]
+
+def wheels(rclpy, common_interfaces, rcl_interfaces, condition='python_version >= "3.10"'):
+    """Return ROS 2 from wheels; all are pinned, since a single newer one breaks the others."""
+    packages = dict.fromkeys(['sensor', 'geometry', 'nav', 'std', 'diagnostic'], common_interfaces)
+    packages |= dict.fromkeys(['rosgraph', 'lifecycle'], rcl_interfaces)
+    pins = {'rclpy[fastrtps]': rclpy, 'std-srvs': common_interfaces}
+    pins |= {f'{package}-msgs': version for package, version in packages.items()}
+    machine = 'sys_platform == "linux" and platform_machine == "x86_64"'
+    return [f'ros-{package}=={version}; {machine} and {condition}'
+            for package, version in pins.items()]
+
+
+JAZZY = '7.1.6', '5.3.6', '2.0.3'  # for Python 3.10 to 3.13
+KILTED = '9.1.2', '5.5.1', '2.3.0'  # for Python 3.10 to 3.14
+ros = wheels(*JAZZY, 'python_version < "3.14"') + wheels(*KILTED, 'python_version >= "3.14"')
+
 plot = ['matplotlib']
-# launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings for the tests; hypothesis makes up inputs
-# and finds the shortest that fails; atheris makes them up guided by coverage, and has wheels for Linux on x86-64 alone
+# hypothesis makes up inputs and finds the shortest that fails; atheris makes them up guided by
+# coverage, and has wheels for Linux on x86-64 alone
 fuzz = ['hypothesis', 'atheris; sys_platform == "linux" and platform_machine == "x86_64"']
-test = plot + fuzz + ['pytest<8.4', 'rosbags', 'ruff', 'mypy', 'setuptools', 'wheel', 'colcon-ros', 'colcon-bash',
-                      'colcon-package-information']
+# what ament_flake8 and ament_pep257 run
+lint = ['ruff', 'mypy', 'pydocstyle', 'flake8', 'flake8-blind-except', 'flake8-builtins',
+        'flake8-class-newline', 'flake8-comprehensions', 'flake8-deprecated', 'flake8-docstrings',
+        'flake8-import-order', 'flake8-quotes']
+build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-information']
+# launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings
+test = ['pytest<8.4', 'rosbags', *plot, *fuzz, *lint, *build]
+
+# Executables belong into lib/<package>, where `ros2 run` and launch look; only the command line
+# has to be on the PATH. setup.cfg says so to colcon and to bloom. pip does not read that: it puts
+# all of them into bin, so that lib needs something that runs them.
+if 'bdist_wheel' in sys.argv:
+    launchers = (f'lib/{name}', sorted(glob(f'lib/{name}/*')))
+else:
+    launchers = ('bin', [f'bin/{name}'])
 
 setup(
     name=name,
     version=manifest.findtext('version'),
     description=manifest.findtext('description'),
+    url=manifest.findtext("url[@type='website']"),
     license=manifest.findtext('license'),
+    author=manifest.findtext('author'),
+    author_email=manifest.find('author').get('email'),
     maintainer=manifest.findtext('maintainer'),
     maintainer_email=manifest.find('maintainer').get('email'),
     packages=find_packages(include=[name, f'{name}.*']),
     package_data={f'{name}.diagnosis': ['report.html']},
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     # mcap writes recordings, and brings lz4 and zstandard, which compressed ones are read by
-    install_requires=['numpy', 'scipy', 'pyserial', 'PyYAML', 'tqdm', 'mcap>=1.6'],
-    extras_require={'ros': ros, 'plot': plot, 'test': test},
+    install_requires=['numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm', 'mcap>=1.6'],
+    extras_require={'ros': ros, 'ros-kilted': wheels(*KILTED), 'plot': plot, 'test': test},
     zip_safe=False,
     entry_points={
         'console_scripts': [
@@ -55,7 +75,6 @@ setup(
         (f'share/{name}/config', sorted(glob('config/*.*'))),
         (f'share/{name}/config/sros2', sorted(glob('config/sros2/*'))),
         (f'share/{name}/launch', sorted(glob('launch/*.launch.py'))),
-        # `ros2 run` and launch look for executables here; see the comment in them
-        (f'lib/{name}', sorted(glob(f'lib/{name}/*'))),
+        launchers,
     ],
 )

@@ -17,4 +17,4 @@ Reading order: `log`, `messages`, `storage`, `recording`, `stamps`, `effects`, `
 
 """
 
-__version__ = '0.1.0'
+__version__ = '0.2.0'

@@ -216,7 +216,9 @@ def run_demo(out: Path, seed: int) -> Demonstration:
 
 def _share(*parts: str) -> Path:
     """Return a file of the package's share folder, or of its sources where it runs from them."""
-    for root in (Path(sys.prefix) / 'share' / 'gyro_calibration', Path(__file__).parents[1]):
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    roots = [Path(prefix, 'share', 'gyro_calibration') for prefix in prefixes if prefix]
+    for root in (*roots, Path(__file__).parents[1]):
         if root.joinpath(*parts).exists():
             return root.joinpath(*parts)
     raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')

@@ -63,13 +63,14 @@ def _prepare_environment():
 _prepare_environment()  # before any test module imports rclpy
 
 
-_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_serial_port'
+_TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_serial_port'
 
 
 def pytest_collection_modifyitems(items):
     """Mark the tests that have to keep time: those with ROS nodes, and some modules with ports or bounds on time."""
     for item in items:
-        if 'ros_domain' in item.fixturenames or item.path.stem in _TIMED:
+        # the item of a launch test has no fixtures
+        if 'ros_domain' in getattr(item, 'fixturenames', ()) or Path(item.location[0]).stem in _TIMED:
             item.add_marker('timed')
 
 

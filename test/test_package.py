@@ -8,14 +8,17 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import conftest
 import pytest
 
 import gyro_calibration
 
 ROOT = Path(__file__).parents[1]
-PARTS = ['package.xml', 'setup.py', 'LICENSE', 'gyro_calibration', 'config', 'launch', 'lib', 'resource']
+PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
+         'gyro_calibration', 'config', 'launch', 'bin', 'lib', 'resource']
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
 COLCON = shutil.which('colcon', path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
 needs_colcon = pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
@@ -71,6 +74,14 @@ def test_the_manifest_names_exactly_what_is_imported():
     assert {element.text for element in manifest.iter('exec_depend')} == imported() - {'mcap'}
 
 
+def test_pytest_takes_a_launch_test_that_has_no_fixtures():
+    """As launch_testing makes it, where a ROS 2 is installed."""
+    markers = []
+    item = SimpleNamespace(location=('test/test_launch.py', 0, ''), add_marker=markers.append)
+    conftest.pytest_collection_modifyitems([item])
+    assert markers == ['timed']
+
+
 def test_every_launcher_is_the_same_and_can_be_executed():
     launchers = list((ROOT / 'lib/gyro_calibration').iterdir())
     assert {file.name for file in launchers} == EXECUTABLES
@@ -91,10 +102,31 @@ def test_colcon_sees_a_ros_package(source, tmp_path):
 def test_colcon_installs_data_and_executables(source, tmp_path, options):
     bases = ['--build-base', tmp_path / 'build', '--install-base', tmp_path / 'install']
     run(COLCON, '--log-base', tmp_path / 'log', 'build', *bases, *options, folder=source)
-    prefix = tmp_path / 'install/gyro_calibration'
+    check_prefix(tmp_path / 'install/gyro_calibration')
+    setup = f'. {tmp_path}/install/local_setup.sh'
+    assert 'self-calibrate' in run('sh', '-c', f'{setup} && gyro_calibration --help', folder='/')
+    where = f'{sys.executable} -c "import gyro_calibration as it; print(it.__file__)"'
+    installed = Path(run('sh', '-c', f'{setup} && {where}', folder='/').strip()).resolve()
+    assert installed.is_relative_to(source if options else tmp_path)
+
+
+def check_prefix(prefix):
+    """Check what an installed ROS 2 needs: executables for `ros2 run`, few of them on the PATH."""
     assert not {file for file in expected_data() if not (prefix / file).is_file()}
-    setup = f'. {tmp_path}/install/local_setup.sh && {prefix}/lib/gyro_calibration/gyro_calibration --help'
-    assert 'self-calibrate' in run('sh', '-c', setup, folder=tmp_path)
+    assert {file.name for file in (prefix / 'bin').iterdir()} == {'gyro_calibration'}
+    programs = list((prefix / 'lib/gyro_calibration').iterdir())
+    assert {file.name for file in programs} == EXECUTABLES
+    assert all(os.access(file, os.X_OK) and 'python' in file.read_text() for file in programs)
+
+
+def test_bloom_puts_nothing_on_the_path_but_the_command_line(source, tmp_path):
+    """With the arguments of bloom's template for Debian packages (ament_python/rules.em)."""
+    pytest.importorskip('setuptools', reason='setuptools is not installed')
+    copy = shutil.copytree(source, tmp_path / 'source')
+    options = ['--root', tmp_path / 'root', '--prefix', '/opt/ros/jazzy',
+               '--install-lib', '$base/lib/python3/site-packages']
+    run(sys.executable, 'setup.py', '--quiet', 'install', *options, folder=copy)
+    check_prefix(tmp_path / 'root/opt/ros/jazzy')
 
 
 def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
