@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gyro_calibration.files import LARGEST, replacing
 
-Array = NDArray[np.floating[Any]]
+Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 #: Goes through some items, and may show how far it has come.
 Progress = Callable[[Iterable[Any]], Iterable[Any]]

@@ -9,14 +9,13 @@ gives the interval. Samples are lost where the stamps stay late after a long ste
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyro_calibration.log import Array, DataRefused
 
-Integers = NDArray[np.integer[Any]]
+Integers = NDArray[np.integer]
 
 #: Samples that come within this part of the usual interval were waiting; from such a share of them on, stamps are taken to come in bursts.
 _WAITING, _BURSTS = 0.5, 0.02
