@@ -1,0 +1,188 @@
+"""The likelihood over a grid of noise sizes: it is the restricted likelihood, its intervals hold,
+and gaps are long spans."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gyro_calibration.noise_grid import (
+    BandedNoise,
+    SharedNoise,
+    Tridiagonal,
+    heading_noise,
+    noise_grid,
+    wander,
+)
+
+DEGREE = math.pi / 180.0
+SCALE, BIAS = 1.01, 0.3 * DEGREE
+
+
+def headings(generator, count=240, walk=0.2 * DEGREE, reference=0.5 * DEGREE, motion=0.03):
+    """Return times, rates, and headings of a gyro's integral and of a reference with noise."""
+    time = np.arange(count + 1.0)
+    rate = (
+        20.0
+        * DEGREE
+        * np.sin(2.0 * math.pi * time / 37.0)
+        * (np.sin(2.0 * math.pi * time / 131.0) > -0.3)
+    )
+    true = np.cumsum(rate)
+    turned = SCALE * true + BIAS * time + np.cumsum(generator.standard_normal(count + 1)) * walk
+    return (
+        time,
+        rate,
+        turned,
+        true + (reference + motion * np.abs(rate)) * generator.standard_normal(count + 1),
+    )
+
+
+def fitted(time, rate, turned, seen, **options):
+    """Return the fit of scale and bias to increments."""
+    cosines, wanders = wander(time)
+    columns = np.column_stack([np.diff(seen), np.diff(time)])
+    return noise_grid(
+        np.diff(turned),
+        columns,
+        heading_noise(time, rate, **options),
+        cosines,
+        wanders,
+        noisy_column=0,
+        wandering=1,
+    )
+
+
+def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
+    generator = np.random.default_rng(1)
+    n, q = 40, 3
+    columns, shared, observed = (
+        generator.standard_normal((n, 2)),
+        generator.standard_normal((n, q)),
+        generator.standard_normal(n),
+    )
+    parts = [
+        BandedNoise('a', np.full(n, 2.0), np.full(n, -0.9), (0.5, 0.5)),
+        BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5)),
+    ]
+    variance = np.array([1.0, 0.5, 0.1])
+    found = noise_grid(observed, columns, parts, shared, [_shared('c', variance, 2.0)])
+    dense = 0.25 * (
+        2.0 * np.eye(n) - 0.9 * np.eye(n, k=1) - 0.9 * np.eye(n, k=-1)
+    ) + 2.25 * np.diag(np.linspace(1.0, 2.0, n))
+    dense += shared @ np.diag(4.0 * variance) @ shared.T
+    inverse = np.linalg.inv(dense)
+    information = columns.T @ inverse @ columns
+    values = np.linalg.solve(information, columns.T @ inverse @ observed)
+    left = observed - columns @ values
+    wanted = -0.5 * (
+        np.linalg.slogdet(dense)[1] + np.linalg.slogdet(information)[1] + left @ inverse @ left
+    )
+    assert found.log_likelihood == pytest.approx(wanted, rel=1e-9)
+    np.testing.assert_allclose(found.values, values, rtol=1e-8)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-8)
+    np.testing.assert_allclose(found.influence.sum(axis=0), 0.0, atol=1e-8)
+
+
+def _shared(name, variance, size):
+    return SharedNoise(name, variance, (size, size))
+
+
+def test_whitened_noise_is_independent():
+    diagonal, neighbours = np.linspace(2.0, 3.0, 30), np.full(30, -0.8)
+    matrix = Tridiagonal(diagonal, neighbours)
+    dense = np.diag(diagonal) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
+    whitened = matrix.whiten(np.eye(30))
+    np.testing.assert_allclose(whitened @ dense @ whitened.T, np.eye(30), atol=1e-12)
+    np.testing.assert_allclose(matrix.solve(dense), np.eye(30), atol=1e-12)
+    assert matrix.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1])
+
+
+def test_the_sizes_of_the_noise_are_found():
+    found = fitted(
+        *headings(
+            np.random.default_rng(2), 2000, walk=0.5 * DEGREE, reference=0.2 * DEGREE, motion=0.1
+        )
+    )
+    for name, size in (
+        ('angle_random_walk', 0.5 * DEGREE),
+        ('reference', 0.2 * DEGREE),
+        ('motion', 0.1),
+    ):
+        estimate, low, high = found.sizes[name]
+        assert 0.6 * size < estimate < 1.6 * size and 0.99 * low <= estimate <= 1.01 * high, (
+            name,
+            found.sizes[name],
+        )
+
+
+def test_noise_of_the_reference_does_not_make_the_scale_smaller():
+    """Where a third of the variance of its increments is noise, plain least squares is off."""
+    errors = []
+    for seed in range(10):
+        time, _, turned, _ = headings(np.random.default_rng(seed), walk=0.02 * DEGREE)
+        generator = np.random.default_rng([seed, 1])
+        true = (turned - BIAS * time) / SCALE
+        seen = true + 7.0 * DEGREE * generator.standard_normal(len(true))
+        found = fitted(
+            time,
+            np.zeros_like(time),
+            turned,
+            seen,
+            unit=5.0 * DEGREE,
+            angle_random_walk=(0.02 * DEGREE,) * 2,
+        )
+        errors.append(found.values[0] - SCALE)
+        plain = np.polyfit(np.diff(seen), np.diff(turned), 1)[0]
+        assert plain < 0.85 * SCALE
+    assert abs(np.mean(errors)) < 0.01
+
+
+def test_a_gap_of_the_reference_is_a_long_span():
+    time, rate, turned, seen = headings(np.random.default_rng(3))
+    kept = (time < 60.0) | (time > 150.0)
+    whole, parts = (
+        fitted(time, rate, turned, seen),
+        fitted(time[kept], rate[kept], turned[kept], seen[kept]),
+    )
+    assert parts.values[0] == pytest.approx(SCALE, abs=4.0 * parts.deviations[0])
+    assert parts.values[1] == pytest.approx(BIAS, abs=4.0 * parts.deviations[1])
+    assert parts.deviations[0] > whole.deviations[0]
+
+
+def test_a_value_that_nothing_shows_keeps_its_prior():
+    time, rate, turned, seen = headings(np.random.default_rng(4))
+    columns = np.column_stack([np.zeros(len(time) - 1), np.diff(time)])
+    found = noise_grid(
+        np.diff(turned - SCALE * seen),
+        columns,
+        heading_noise(time, rate),
+        prior_mean=np.array([1.0, 0.0]),
+        prior_deviation=np.array([0.02, math.inf]),
+    )
+    assert found.values[0] == pytest.approx(1.0) and found.deviations[0] == pytest.approx(0.02)
+    assert found.values[1] == pytest.approx(BIAS, abs=4.0 * found.deviations[1])
+
+
+def test_too_few_observations_are_refused():
+    with pytest.raises(ValueError, match='2 observations do not determine 2 values'):
+        noise_grid(np.zeros(2), np.eye(2), [BandedNoise('a', np.ones(2), None, (1.0, 1.0))])
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize(
+    'noise', [(0.02, 0.5, 0.03), (0.2, 0.5, 0.03), (0.5, 0.1, 0.0), (0.05, 0.02, 0.005)], ids=str
+)
+def test_intervals_hold_the_truth(noise):
+    walk, reference, motion = noise
+    held = np.zeros(2)
+    for seed in range(200):
+        time, rate, turned, seen = headings(
+            np.random.default_rng(seed),
+            walk=walk * DEGREE,
+            reference=reference * DEGREE,
+            motion=motion,
+        )
+        found = fitted(time, rate, turned, seen)
+        held += np.abs(found.values - (SCALE, BIAS)) < 1.96 * found.deviations
+    assert held[0] / 200 > 0.91 and held[1] / 200 > 0.91
