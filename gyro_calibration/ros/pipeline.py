@@ -23,7 +23,6 @@ from gyro_calibration.driver.host_clock import Stamps as HostClock
 from gyro_calibration.heading import Threshold
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import BLIND, REST, STANDING_TIME, CalibrationSession
@@ -94,10 +93,6 @@ _TOGETHER = 0.05
 
 
 NSEC_PER_SEC = 10 ** 9
-
-
-def rate_limit(model: GyroModel) -> float:
-    return 100.0
 
 
 class Output(NamedTuple):
@@ -193,7 +188,8 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host = RosTime(), HostClock()
         self.conflict = ''
-        self._limit = rate_limit(store.model)
+        self._limit = store.model.rate_limit
+        self._coldest, self._hottest = store.model.temperature_limits
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -247,8 +243,12 @@ class Pipeline:
 
     def temperature(self, stamp: int, value: float) -> None:
         """Take a temperature, degC."""
-        if math.isfinite(value):
+        if self._coldest <= value <= self._hottest:
             self.estimator.hear_temperature(self._time(stamp), value)
+        else:
+            self.journal.counts['refused_samples'] += 1
+            self.journal.event = (f'a temperature of {value:g} degC came, and this gyro reports '
+                                  f'{self._coldest:g} to {self._hottest:g}: it is not used')
 
     def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Take a heading, rad, and a velocity by the wheels."""
