@@ -212,7 +212,7 @@ class Rig:
         """Call a calibration; return '' or why it was refused."""
         drive = self.pipeline.values.calibration_drive and kind == PROFILE
         obstacle = self.pipeline.obstacle() if drive else ''
-        return self.session.begin(kind, self.pipeline.values, self.clock.now, obstacle)
+        return self.session.begin(kind, self.pipeline.values, obstacle)
 
     @property
     def ended(self):

@@ -185,16 +185,19 @@ class Drive:
     INTERVAL = 0.02
     """Time between commands, s."""
 
-    def __init__(self, run: Run, begun: float, blind: Callable[[], float]):
+    def __init__(self, run: Run, clock: Clock, blind: Callable[[], float]):
         """Begin to wait for somebody who receives the commands; `blind` in s, see `BLIND`."""
         assert run.motion is not None
-        self._run, self._motion, self._blind, self._begun = run, run.motion, blind, begun
+        self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
+        self._begun, self._simulated = clock.steady(), clock.simulated()
         self._heard, self._suspected, self._due = False, False, math.inf
         self._earliest = math.inf
         self.command_lateness = self.sample_lateness = 0.0
 
-    def see_sample(self, time: float, now: float) -> None:
+    def see_sample(self, time: float) -> None:
         """Measure how much later than the earliest one a sample came."""
+        self._simulated = self._clock.simulated()
+        now = self._clock.steady() if self._simulated is None else self._simulated
         self._earliest = min(self._earliest, now - time)
         self.sample_lateness = max(self.sample_lateness, now - time - self._earliest)
 
@@ -203,8 +206,9 @@ class Drive:
         self._heard = self._heard or receivers > 0
         return not self._heard
 
-    def command(self, now: float, receivers: int, ros_time_stands: bool) -> tuple[float, str]:
+    def command(self, receivers: int, ros_time_stands: bool) -> tuple[float, str]:
         """Return the rate to command, rad/s, and why the run must end; '' where it goes on."""
+        now = self._clock.steady()
         if self.waits(receivers):
             return 0.0, self._not_received if now - self._begun > DISCOVERY else ''
         if not receivers:
@@ -223,7 +227,9 @@ class Drive:
                          'the gyro and its driver') if suspected else ''
         if not self._run.times:
             return 0.0, ''
-        return float(self._motion.rate_at(np.array(self._run.elapsed + silence))), ''
+        time, last = self._clock.simulated(), self._simulated
+        since = silence if time is None or last is None else max(time - last, 0.0)
+        return float(self._motion.rate_at(np.array(self._run.elapsed + since))), ''
 
     _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '
                      'to its topic, or change cmd_vel_stamped')
@@ -282,7 +288,7 @@ class CalibrationSession:
 
     # The begin
 
-    def begin(self, kind: str, values: SimpleNamespace, now: float, obstacle: str = '') -> str:
+    def begin(self, kind: str, values: SimpleNamespace, obstacle: str = '') -> str:
         """
         Begin a run.
 
@@ -290,7 +296,6 @@ class CalibrationSession:
         ----------
         kind : PROFILE, ODOMETRY, TURNS or REST
         values : the parameters of the node
-        now : s of the steady clock
         obstacle : why the robot must not be driven now; ''
 
         Returns
@@ -314,16 +319,17 @@ class CalibrationSession:
         elif kind != ODOMETRY:
             duration = REST_DURATION if kind == REST else math.inf
         drives = motion is not None and values.calibration_drive
-        if drives and (obstacle := obstacle or self._commanded(now)):
+        if drives and (obstacle := obstacle or self._commanded()):
             return obstacle
         self._rules, self._suspected, self.warning = rules(values), False, ''
+        now = self._clock.steady()
         self.run = run = Run(kind, duration, self._rules.after(kind), now, motion)
-        self._drive = Drive(run, now, self._blind) if drives else None
+        self._drive = Drive(run, self._clock, self._blind) if drives else None
         self._monitor.restart()
         return ''
 
-    def _commanded(self, now: float) -> str:
-        if now - self._others < 1.0:
+    def _commanded(self) -> str:
+        if self._clock.steady() - self._others < 1.0:
             return ('another node sends commands on cmd_vel: stop it, or take the robot from it, '
                     'and run again')
         return ''
@@ -334,14 +340,14 @@ class CalibrationSession:
 
     # What comes in
 
-    def add(self, time: float, output: float, now: float, receivers: int) -> None:
+    def add(self, time: float, output: float, receivers: int) -> None:
         """Take a sample; `receivers` is the number of other nodes that receive the commands."""
         run = self.run
         if run is None or run.reason is not None:
             return
-        run.received = now
+        run.received = self._clock.steady()
         if self._drive:
-            self._drive.see_sample(time, now)
+            self._drive.see_sample(time)
             if self._drive.waits(receivers):
                 return
         estimator = self._estimator
@@ -350,17 +356,17 @@ class CalibrationSession:
         if (reason := run.over) is not None:
             self.end(reason)
 
-    def add_odometry(self, time: float, heading: float, rate: float, now: float) -> None:
+    def add_odometry(self, time: float, heading: float, rate: float) -> None:
         """Take a heading, rad, and a rate, rad/s, of the odometry."""
         if self.run:
             self.run.odometry.append((time, heading, rate))
-        late = now - self._stopped
+        late = self._clock.steady() - self._stopped
         if STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
                             'time-out of its base, and look at who else commands it')
 
-    def add_command(self, velocity: Velocity, now: float) -> None:
+    def add_command(self, velocity: Velocity) -> None:
         """
         Take a command from cmd_vel, where those of this node come back too.
 
@@ -373,15 +379,15 @@ class CalibrationSession:
                 for _ in range(place + 1):
                     self._sent.popleft()
                 return
-        self._others = now
+        self._others = self._clock.steady()
         if self._drive:
             self.end('another node sent a command on cmd_vel while the robot was driven; it has '
                      'the robot now: stop it and run again')
 
     # Guards
 
-    def watch(self, values: SimpleNamespace, now: float, receivers: int,
-              ros_time_stands: bool = False, conflict: str = '') -> None:
+    def watch(self, values: SimpleNamespace, receivers: int, ros_time_stands: bool = False,
+              conflict: str = '') -> None:
         """
         Send the next command of a run that drives the robot, or end a run that must not go on.
 
@@ -390,7 +396,6 @@ class CalibrationSession:
         Parameters
         ----------
         values : the parameters of the node
-        now : s of the steady clock
         receivers : number of other nodes that receive the commands
         ros_time_stands : ROS time has stood still for longer than `BLIND`
         conflict : why the samples cannot be used at all; ''
@@ -400,7 +405,7 @@ class CalibrationSession:
         if run is None or run.reason is not None:
             return
         if self._drive:
-            rate, reason = self._drive.command(now, receivers, ros_time_stands)
+            rate, reason = self._drive.command(receivers, ros_time_stands)
             if not values.calibration_drive:
                 reason = ('calibration.drive was set to false while the robot was driven: set it '
                           'to true and run again')
@@ -410,7 +415,7 @@ class CalibrationSession:
                 self._command(rate)
         elif conflict:
             self.end(conflict)
-        suspected, self._suspected = self._suspected, now - run.received > SILENCE
+        suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
             self.end(f'no sample came for {SILENCE:g} s: look at the gyro and its driver')
 

@@ -249,7 +249,7 @@ class CompensationNode(Node):
         """Collect a run, fit it and use it; or change nothing and say why."""
         session = self._pipeline.session
         obstacle = self._obstacle() if self._values.calibration_drive else ''
-        if refusal := session.begin(kind, self._values, steady(), obstacle):
+        if refusal := session.begin(kind, self._values, obstacle):
             return self._refused(refusal)
         self._answered = Future()
         timer = call_every(self, Drive.INTERVAL, self._drive) if session.drives else None

@@ -255,13 +255,13 @@ class Pipeline:
         now, rate = self._clock.steady(), velocity.angular[2]
         self.wheels.add(ODOMETRY, velocity, now)
         if math.isfinite(heading) and math.isfinite(rate):
-            self.session.add_odometry(self._time(stamp), heading, rate, now)
+            self.session.add_odometry(self._time(stamp), heading, rate)
 
     def command(self, velocity: Velocity) -> None:
         """Take a command from cmd_vel, those of this node included."""
         now = self._clock.steady()
         self.wheels.add(COMMAND, velocity, now)
-        self.session.add_command(velocity, now)
+        self.session.add_command(velocity)
 
     def sample(self, stamp: int, output: float, specific_force: float | None = None,
                receivers: int = 0) -> Output | None:
@@ -338,12 +338,13 @@ class Pipeline:
                                  estimator.known_for(self._clock.date()),
                                  run is not None and run.kind == REST)
         if self.session.run:
-            self.session.add(time, output, now, receivers)
-        known = self._noise_is_known and self._interval < math.inf
+            self.session.add(time, output, receivers)
+        known = self._noise_is_known
+        spread = 0.0 if known and self._interval < math.inf else self.values.assumed_bias ** 2
         found = Output(
             stamp + self._delay, tracker.heading,
             tracker.variance if known else UNMEASURED_VARIANCE, estimator.rate,
-            tracker.rate_variance + (0.0 if known else self.values.assumed_bias ** 2))
+            tracker.rate_variance + spread)
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
             self.estimator.rebuild(*self._before(), self._clock.date())
@@ -374,7 +375,7 @@ class Pipeline:
             self.estimator.rewind(*self._before())
             self.journal.event = conflict
         self.conflict = conflict
-        self.session.watch(self.values, self._clock.steady(), 0, conflict=conflict)
+        self.session.watch(self.values, 0, conflict=conflict)
 
     def _before(self) -> tuple[float, float]:
         """Return the last heading that is known to be good, and its variance of now."""
@@ -426,7 +427,7 @@ class Pipeline:
     def watch(self, receivers: int) -> None:
         """Look whether time and samples go on; to be called several times a second."""
         standing = self.ros_time.look(self._clock) > BLIND
-        self.session.watch(self.values, self._clock.steady(), receivers, standing, self.conflict)
+        self.session.watch(self.values, receivers, standing, self.conflict)
 
     def learn(self, ending: bool = False) -> None:
         """Let the bias table learn from rests; to be called once a second, and at the end."""
