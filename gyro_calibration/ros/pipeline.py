@@ -195,6 +195,7 @@ class Pipeline:
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
+        self._several, self._sequence, self._switches = '', 0, 0
         self._good = 0.0, 0.0, 0.0
         self._recent: deque[tuple[float, float]] = deque()
 
@@ -264,7 +265,7 @@ class Pipeline:
         self.session.add_command(velocity)
 
     def sample(self, stamp: int, output: float, specific_force: float | None = None,
-               receivers: int = 0) -> Output | None:
+               receivers: int = 0, sequence: int | None = None) -> Output | None:
         """
         Take a sample.
 
@@ -274,6 +275,7 @@ class Pipeline:
         output : rad/s
         specific_force : along the input axis, m/s², where it came
         receivers : number of other nodes that receive cmd_vel
+        sequence : of the message, which its publisher counts, where the middleware tells it
 
         Returns
         -------
@@ -285,6 +287,9 @@ class Pipeline:
         if stamp < self._newest:
             self._see_jump(now)
         self._newest = stamp
+        if self._several and (sequence is None or sequence <= self._sequence):
+            self._see_switch(sequence)
+        self._sequence = sequence or 0
         if self.conflict or not self._is_possible(output):
             counts['refused_samples'] += 1
             return None
@@ -384,15 +389,31 @@ class Pipeline:
         return heading, variance + (fastest * max(self._last - time, 0.0)) ** 2
 
     def publishers(self, names: Sequence[str]) -> None:
-        """Take the nodes that publish the samples; more than one cannot be told apart."""
-        if len(names) > 1:
-            self._refuse_all(
-                f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), '
-                'whose samples cannot be told apart: give each gyro a topic of its own')
+        """Take the nodes that publish the samples, a few times a second."""
+        self._several = '' if len(names) < 2 else (
+            f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), whose '
+            'samples cannot be told apart: give each gyro a topic of its own')
+        if not self._several:
+            self._switches = 0
+        if self._switches > 1:
+            self._refuse_all(self._several)
         elif not self._jumps or self._clock.steady() - self._jumps[-1] > _INTERLEAVED:
             self.conflict = ''
+        if not self.conflict and not self._switches:
             tracker = self.estimator.tracker
             self._good = tracker.heading, tracker.variance, self._last
+
+    def _see_switch(self, sequence: int | None) -> None:
+        """
+        Count a sample of another publisher than that of the one before it.
+
+        One is that of a driver which was started again, and whose dead predecessor the middleware
+        still lists. Without sequence numbers each publisher counts as one that sends.
+
+        """
+        self._switches += 1 if sequence is not None else 2
+        if self._switches > 1:
+            self._refuse_all(self._several)
 
     def obstacle(self) -> str:
         """Return why the robot must not be driven now; '' where nothing stands against it."""

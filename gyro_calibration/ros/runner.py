@@ -15,7 +15,6 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from xml.etree import ElementTree
 
 import rclpy
@@ -73,7 +72,7 @@ def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_Q
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
 
-def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[[Any], None],
+def subscribe_to(node: Node, kind: type, topic: str, callback: Callable[..., None],
                  qos: QoSProfile = SENSOR_QOS) -> Subscription:
     """Return a subscription whose quality of service parameters may override."""
     return node.create_subscription(
