@@ -16,6 +16,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+from gyro_calibration.log import SHORTEST
 from gyro_calibration.noise import Noise
 
 #: Length of the shortest blocks whose means are compared, s; of the others, each twice as long; and how many lengths there are.
@@ -27,6 +28,8 @@ _MEMORY, _BLOCKS = 2.0, 5
 _OF_POINTS, _OF_MEANS = 0.4, 0.5
 #: A step over a gap that is so many times the usual one has not been met in these seconds: the robot began to turn, or stopped.
 _UNMET = 5.0
+#: No rate, rad/s, and no time without samples, s, is larger than that; the variance after a gap stays a number.
+FASTEST, LONGEST = 1e4, 1e9
 #: Intervals that are remembered; so many must be known to tell a gap.
 _REMEMBERED, _NEEDED = 256, 16
 #: An interval that is so many times the usual one is a gap; one below such a part of it belongs to a burst, or follows a late sample.
@@ -105,11 +108,11 @@ class Intervals:
         """Look at the intervals that are remembered: the middle one is the usual, unless the stamps come in bursts."""
         self._until = max(len(self._seen) // 4, _NEEDED)
         steps = sorted(self._seen)
-        middle = self._even = self.usual = steps[len(steps) // 2]
+        middle = self._even = self.usual = max(steps[len(steps) // 2], SHORTEST)
         if sum(steps) > _TOGETHER * middle * len(steps) or sum(step < _SHORT * middle for step in steps) > _BURSTS * len(steps):
             # the longest may be gaps
             self._even = steps[-1 - len(steps) // 100]
-            self.usual = max(sum(min(step, self._even) for step in steps) / len(steps), 1e-9)
+            self.usual = max(sum(min(step, self._even) for step in steps) / len(steps), SHORTEST)
         self._limit = self._even + (_GAP - 1.0) * self.usual
 
 
@@ -219,8 +222,8 @@ class Gaps:
 
     def _learn(self) -> None:
         """Take in a block."""
-        mean: float | None = self._total / self._count
-        if self._steps:
+        mean: float | None = min(max(self._total / self._count, -FASTEST), FASTEST)
+        if self._steps and self._squares < FASTEST ** 2:
             weight = self._duration / (_MEMORY + self._duration)
             self._stepped += weight * (self._squares / self._steps - self._stepped)
             self._curved += weight * (max(0.5 * (self._squares - self._products) / self._steps, 0.0) - self._curved)
@@ -231,8 +234,8 @@ class Gaps:
         self._begin_block()
 
     def _gap(self, lost: int, interval: float, step: float) -> Gap:
-        usual = self.intervals.usual
-        surplus = lost * usual
+        usual, step, interval = self.intervals.usual, min(abs(step), FASTEST), min(interval, LONGEST)
+        surplus = min(lost * usual, interval)
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._surplus * surplus)
         # a step that has not been met may have come at any time within the gap

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from gyro_calibration.compensation import quadratic_form
+from gyro_calibration.files import LARGEST
 from gyro_calibration.gaps import Gaps
 from gyro_calibration.log import CACHED, DEGREE, Array
 from gyro_calibration.noise import Noise
@@ -44,13 +44,16 @@ class ThresholdFilter:
     def __init__(self, settings: Threshold):
         """Begin with an empty window."""
         self.settings = settings
-        self._window: deque[tuple[float, float]] = deque()
-        self._sum = 0.0
-        self._squares = 0.0
+        # The window in two parts, oldest samples last in the first one, each sample with the sums from it to the border between them. So
+        # nothing is ever subtracted, and what has left the window leaves nothing behind in its sums.
+        self._older: list[tuple[float, float, float]] = []
+        self._newer: list[tuple[float, float]] = []
+        self._sum = self._squares = 0.0
 
     def clear(self) -> None:
         """Forget the window, as after a gap."""
-        self._window.clear()
+        self._older.clear()
+        self._newer.clear()
         self._sum = self._squares = 0.0
 
     def filter(self, time: float, rate: float) -> float:
@@ -60,21 +63,37 @@ class ThresholdFilter:
         return 0.0 if self._stands(time, rate) else rate
 
     def _stands(self, time: float, rate: float) -> bool:
-        window = self._window
-        window.append((time, rate))
+        rate, begin = min(max(rate, -LARGEST), LARGEST), time - self.settings.window
+        self._newer.append((time, rate))
         self._sum += rate
         self._squares += rate * rate
-        while window[0][0] <= time - self.settings.window and len(window) > 1:
-            old = window.popleft()[1]
-            self._sum -= old
-            self._squares -= old * old
-        mean = self._sum / len(window)
-        return abs(mean) < self.settings.rate and not self._shakes(self._squares / len(window) - mean * mean)
+        while self._first <= begin and len(self._older) + len(self._newer) > 1:
+            if not self._older:
+                self._border()
+            self._older.pop()
+        count = len(self._older) + len(self._newer)
+        _, total, squares = self._older[-1] if self._older else (0.0, 0.0, 0.0)
+        mean = (total + self._sum) / count
+        if not abs(mean) < self.settings.rate:
+            return False
+        # it shakes where the window varies by more than noise would
+        explained = 9.0 * self.settings.angle_random_walk ** 2 * count
+        return not 0.0 < explained < ((squares + self._squares) / count - mean * mean) * (time - self._first)
 
-    def _shakes(self, variance: float) -> bool:
-        """Tell whether the window varies by more than noise would."""
-        explained, lasts = self.settings.angle_random_walk ** 2 * len(self._window), self._window[-1][0] - self._window[0][0]
-        return 0.0 < 9.0 * explained < variance * lasts
+    @property
+    def _first(self) -> float:
+        """Return the time of the oldest sample, s."""
+        return self._older[-1][0] if self._older else self._newer[0][0]
+
+    def _border(self) -> None:
+        """Bring all samples to the older part."""
+        total = squares = 0.0
+        for time, rate in reversed(self._newer):
+            total += rate
+            squares += rate * rate
+            self._older.append((time, total, squares))
+        self._newer.clear()
+        self._sum = self._squares = 0.0
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
@@ -97,10 +116,12 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
         return rate
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
-    sums, squares = (np.concatenate([[0.0], np.cumsum(values)]) for values in (rate, rate * rate))
-    count = end - begin
-    mean = (sums[end] - sums[begin]) / count
-    variance = (squares[end] - squares[begin]) / count - mean * mean
+    # each window is summed by itself: of a running sum, one large value would ruin all that come later
+    rate, count = np.clip(rate, -LARGEST, LARGEST), end - begin
+    windows = np.stack([begin, end], axis=1).ravel()
+    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2] for values in (rate, rate * rate))
+    mean = sums / count
+    variance = squares / count - mean * mean
     explained = 9.0 * settings.angle_random_walk ** 2 * count
     shakes = (explained > 0.0) & (explained < variance * (time - time[begin]))
     return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)

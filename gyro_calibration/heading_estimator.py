@@ -38,6 +38,8 @@ _STILL = 0.5
 _HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
 #: A calibration that turns out to be older or younger by so much is carried anew, s.
 _OLDER = 3600.0
+#: Plausible stamps, s, and specific forces, m/s², are not beyond.
+_LATEST, _STRONGEST = 1e12, 1e5
 #: A calibration without a date is so old, s.
 _YEAR = 365.25 * 86400.0
 
@@ -81,6 +83,8 @@ class HeadingEstimator:
     corrected : the same before the tracker saw it
     last : what the compensation made of the last sample
     beginnings : how often the tracker began anew
+    refused : samples that were not used, as no such gyro reports them; they are lost like those that never came
+    refused_temperatures : alike; the temperature before goes on
 
     """
 
@@ -104,6 +108,7 @@ class HeadingEstimator:
         self.rate = self.corrected = 0.0
         self.last, self.beginnings = Compensated(0.0, 0.0, 0.0, False, False), 0
         self._time, self._elapsed, self._turned_before = -math.inf, 0.0, 0.0
+        self._refused, self.refused_temperatures = 0, 0
         self._stretch: _Stretch | None = None
         self._pending: deque[_Stretch] = deque(maxlen=8)
         self.model, self.table = model, table
@@ -263,8 +268,17 @@ class HeadingEstimator:
     # Samples
 
     def hear_temperature(self, time: float, temperature: float) -> None:
-        """Take a temperature, degC, with its stamp, s."""
-        self.temperature, self._heard_temperature = temperature, time
+        """Take a temperature, degC, with its stamp, s; one that is not plausible is refused."""
+        coldest, hottest = self.model.temperature_limits
+        if coldest <= temperature <= hottest and abs(time) <= _LATEST:
+            self.temperature, self._heard_temperature = temperature, time
+        else:
+            self.refused_temperatures += 1
+
+    @property
+    def refused(self) -> int:
+        """Return how many samples were not used."""
+        return self._refused + self.tracker.refused
 
     @property
     def temperature_is_lost(self) -> bool:
@@ -290,9 +304,12 @@ class HeadingEstimator:
 
         Returns
         -------
-        '', or why the integration began anew with this sample
+        '', or why the integration began anew with this sample; where the sample is refused, only `refused` grows
 
         """
+        if not self._plausible(time, output, force):
+            self._refused += 1
+            return ''
         last, self._time = self._time, time
         heard, goes_on = not self._anchored and self._known_temperature is not None, self._this_run and last > -math.inf
         if self._other_age or heard and not goes_on:
@@ -312,6 +329,11 @@ class HeadingEstimator:
         self.rate = self.tracker.rate
         self._gather(time, bool(said))
         return said
+
+    def _plausible(self, time: float, output: float, force: float | None) -> bool:
+        """Tell whether such a gyro may report that; no nan is plausible."""
+        limit = self.used.rate_limit
+        return -limit <= output <= limit and -_LATEST <= time <= _LATEST and (force is None or -_STRONGEST <= force <= _STRONGEST)
 
     def _look_at(self, time: float, output: float, rate: float, around: Channels | None, distance: float) -> None:
         """Keep the sensitivity while it hardly changes, for it is half of the work: at rest, and for a moment at nearly the same rate."""

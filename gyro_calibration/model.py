@@ -16,7 +16,6 @@ from gyro_calibration.history import History
 from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.noise import Noise
 
-
 #: Largest plausible output, rad/s, where no valid range of rates is stated; and where one is: so many times its farther end, but at least
 #: what robots reach, for a model may have been fitted at rest.
 _FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gyro_calibration.drift import HEADING, WALK, Drift, Turn, begin, smoothed
-from gyro_calibration.gaps import Gaps, Intervals
+from gyro_calibration.gaps import FASTEST, LONGEST, Gaps, Intervals
 from gyro_calibration.heading import Threshold, ThresholdFilter, integrate
-from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.log import DEGREE, SHORTEST, Array, Mask
 from gyro_calibration.noise import Noise
 from gyro_calibration.rest import BLOCK, LAGS, WINDOW, Block, Energy, sigmas
 
@@ -109,6 +109,8 @@ class HeadingTracker:
     resting : whether the robot rests
     deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
     intervals : of the samples, and how many are lost
+    refused : samples that were not used, as no robot turns so fast; they are lost like those that never came
+    rebuilt : how often the state was not finite and was built anew
     steps : the way so far, where it is kept
 
     """
@@ -132,6 +134,7 @@ class HeadingTracker:
         self._doubt: _Doubt | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
+        self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
         self._biased: Array | None = None
         self._seen_off, self._bias_seen = 0.0, (0.0, 0.0)
@@ -142,7 +145,8 @@ class HeadingTracker:
         self.set(settings)
 
     def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float, age: float | None) -> None:
-        self._claimed, self._drift = noise, begin(noise, covariance, heading, variance, age if len(covariance) else None)
+        self._claimed, self._calibrated = noise, (covariance, age)
+        self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
         self._nothing, self._part = self._none(), self._none()
         self._open = self._nothing
 
@@ -232,6 +236,9 @@ class HeadingTracker:
         '', or why the integration began anew with this sample
 
         """
+        if not -FASTEST < rate < FASTEST:
+            self.refused += 1
+            return ''
         self._still = still
         filtered = self._filter.filter(time, rate)
         last, self._last = self._last, (time, rate, filtered, sensitivity)
@@ -254,7 +261,10 @@ class HeadingTracker:
         elif self._part.duration >= _STEP:
             self._settle()
         self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
-        return ''
+        if not -math.inf < self.heading + self.rate < math.inf:
+            self._rebuild()
+        said, self._mended = self._mended, ''
+        return said
 
     def _off(self, sensitivity: Array) -> float:
         """Return what rests have taught that a rate is off by, rad/s; many samples in a row have the same sensitivity."""
@@ -443,7 +453,8 @@ class HeadingTracker:
 
         """
         self._settle()
-        self._reached += interval
+        assert self._last is not None
+        interval, self._reached = min(max(interval, -LONGEST), LONGEST), self._last[0]
         self._block, self._driven = Block(), False
         self._energy.clear()
         self._filter.clear()
@@ -488,6 +499,8 @@ class HeadingTracker:
 
     def _take(self) -> None:
         """Take on what the state has come to, and how loud the gyro is; the heading does not jump."""
+        if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
+            self._rebuild()
         loud = self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0
         if (noise := replace(self._claimed, angle_random_walk=loud * self._claimed.angle_random_walk)) != self._drift.noise:
             self._drift = replace(self._drift, noise=noise)
@@ -497,6 +510,25 @@ class HeadingTracker:
         self._known = None
         estimate = float(self._drift.mean[HEADING]) + (0.0 if self.resting else self._corrected(self._open + self._part))
         self._pending = estimate - self.heading
+        self._good = self.heading, self.variance
+
+    def _rebuild(self) -> None:
+        """Begin anew where the state is not finite, with the last heading that was; it may be off by a full turn since."""
+        heading, variance = self._good
+        covariance, age = self._calibrated
+        self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2, age)
+        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._doubt = heading, 0.0, 0.0, 0.0, None, None
+        if self._last is not None:
+            self._last = (*self._last[:3], np.zeros(len(covariance)))
+        self._energy, self._block, self._driven = Energy(*self._tested), Block(), False
+        intervals, self._gaps = self.intervals, Gaps(self._claimed)
+        self.intervals = self._gaps.intervals = intervals
+        self._filter.clear()
+        self._move(WINDOW)
+        self._known, self._pending = None, 0.0
+        self.rebuilt += 1
+        self._mended = 'the state was not finite and was built anew; the heading may be off by a full turn'
+        self._take()
 
     def _corrected(self, part: Turn) -> float:
         """Return what the rates of a part came to, less what rests have taught, rad."""
@@ -524,7 +556,7 @@ class HeadingTracker:
     @property
     def rate_variance(self) -> float:
         """Return the variance of the last rate, (rad/s)²: of its noise, and of what is known of bias and scale."""
-        interval = min(self._interval, self.intervals.usual)
+        interval = max(min(self._interval, self.intervals.usual), SHORTEST)
         return self.bias[1] ** 2 + self._drift.noise.rate_variance(WINDOW if self.resting else interval)
 
     @property
