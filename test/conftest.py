@@ -66,12 +66,24 @@ _prepare_environment()  # before any test module imports rclpy
 _TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_serial_port'
 
 
-def pytest_collection_modifyitems(items):
-    """Mark the tests that have to keep time: those with ROS nodes, and some modules with ports or bounds on time."""
+def pytest_collection_modifyitems(config, items):
+    """
+    Mark the tests with ROS nodes and all that have to keep time; leave out what takes long.
+
+    Long evidence runs where it is asked for, ``-m evidence``.
+
+    """
     for item in items:
         # the item of a launch test has no fixtures
-        if 'ros_domain' in getattr(item, 'fixturenames', ()) or Path(item.location[0]).stem in _TIMED:
+        if 'ros_domain' in getattr(item, 'fixturenames', ()):
+            item.add_marker('ros')
             item.add_marker('timed')
+        elif Path(item.location[0]).stem in _TIMED:
+            item.add_marker('timed')
+    if 'evidence' not in config.getoption('markexpr'):
+        long = [item for item in items if item.get_closest_marker('evidence')]
+        config.hook.pytest_deselected(items=long)
+        items[:] = [item for item in items if item not in long]
 
 
 def pytest_unconfigure(config):

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import conftest
@@ -74,12 +73,21 @@ def test_the_manifest_names_exactly_what_is_imported():
     assert {element.text for element in manifest.iter('exec_depend')} == imported() - {'mcap'}
 
 
-def test_pytest_takes_a_launch_test_that_has_no_fixtures():
+def test_pytest_takes_a_launch_test_that_has_no_fixtures(pytestconfig):
     """As launch_testing makes it, where a ROS 2 is installed."""
-    markers = []
-    item = SimpleNamespace(location=('test/test_launch.py', 0, ''), add_marker=markers.append)
-    conftest.pytest_collection_modifyitems([item])
-    assert markers == ['timed']
+    class LaunchTestItem:
+        location = 'test/test_launch.py', 0, ''
+        markers = ()
+
+        def add_marker(self, name):
+            self.markers += name,
+
+        def get_closest_marker(self, name):
+            return name in self.markers
+
+    item = LaunchTestItem()
+    conftest.pytest_collection_modifyitems(pytestconfig, [item])
+    assert item.markers == ('timed',)
 
 
 def test_every_launcher_is_the_same_and_can_be_executed():
