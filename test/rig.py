@@ -15,7 +15,8 @@ from gyro_calibration.ros.parameters import record
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
 from gyro_calibration.ros.wheels import Velocity
 
-BEGIN = 1_700_000_000.0  # s since 1970
+BEGIN = 1_700_000_000  # s since 1970
+NSEC_PER_SEC = 10 ** 9
 MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 
 
@@ -77,8 +78,8 @@ class Rig:
         Seconds of the simulation in one second; 0 while it stands.
     other : float or None
         What somebody else commands at 20 Hz, rad/s.
-    fed : float
-        Stamp of the last sample of `feed`, s.
+    fed : int
+        Stamp of the last sample of `feed`, ns.
 
     """
 
@@ -87,7 +88,7 @@ class Rig:
         self.clock, self.robot = StepClock(ros), robot or Robot()
         self.commands, self.outputs, self.truth = [], [], {}
         self.publishers, self.receivers, self.ros_speed, self.other = ['/driver_node'], 1, 1.0, None
-        self.fed, self._steps, self._stamp, self._echoes = BEGIN, 0, 0, []
+        self.fed, self._steps, self._stamp, self._echoes = BEGIN * NSEC_PER_SEC, 0, 0, []
         if model:
             (folder / 'model.yaml').write_text(model)
             parameters = {'model_file': str(folder / 'model.yaml'), **parameters}
@@ -116,7 +117,7 @@ class Rig:
             if not self.robot.stamps_stand:
                 self._stamp = round(1e9 * self.clock.ros)
             return self._stamp
-        return round(1e9 * (reading.stamp - 1000.0 + BEGIN + self.clock.set_by))
+        return BEGIN * NSEC_PER_SEC + round(1e9 * (reading.stamp - 1000.0 + self.clock.set_by))
 
     def step(self):
         """Let everything go on by the interval of the samples."""
@@ -191,8 +192,8 @@ class Rig:
         for number, output in enumerate(outputs):
             self._steps += 1
             self.clock.now += interval
-            self.fed += interval
-            stamp = round(1e9 * self.fed)
+            self.fed += round(1e9 * interval)
+            stamp = self.fed
             if temperature is not None:
                 each = temperature if isinstance(temperature, float) else temperature[number]
                 self.pipeline.temperature(stamp, float(each))
@@ -205,7 +206,7 @@ class Rig:
 
     def skip(self, seconds, steady=None):
         """Let the stamps of `feed` jump, and the steady clock by as much or by another time."""
-        self.fed += seconds
+        self.fed += round(1e9 * seconds)
         self.clock.now += seconds if steady is None else steady
 
     def begin(self, kind=PROFILE):

@@ -223,8 +223,8 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(tmp_pat
     for _ in range(round(3.0 / interval / burst)):
         wait(interval * burst)
         for _ in range(burst):
-            rig.fed += interval
-            rig.sample(round(1e9 * rig.fed), 0.0)
+            rig.fed += round(1e9 * interval)
+            rig.sample(rig.fed, 0.0)
     assert min(rate for _, rate in rig.commands[-20:]) > 0.5
     begin = rig.clock.now
     wait(1.5)

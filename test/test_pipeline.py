@@ -1,0 +1,588 @@
+"""What comes of samples, temperatures, wheels and clocks: rates, headings, variances, reports."""
+
+import math
+import re
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rig import INTERVAL, Rig, Robot, rested
+
+from gyro_calibration.heading import integrate
+from gyro_calibration.history import channels_of
+from gyro_calibration.log import DEGREE, Log
+from gyro_calibration.log_compensation import LogCompensation
+from gyro_calibration.model_file import read_model
+from gyro_calibration.noise import Noise
+from gyro_calibration.ros import UNMEASURED_VARIANCE
+from gyro_calibration.ros.calibration_session import REST
+from gyro_calibration.simulation import respond
+
+NOISE, BIAS, SLOW = 5e-4, 0.012, 0.04  # rad/√s, rad/s, s between samples
+KNOWN = ('effects: {bias: {bias: 0.01}}\n'
+         'noise: {angle_random_walk: 5.0e-4, bias_instability: 1.0e-5}\n')
+CERTAIN = KNOWN + 'covariance: [[1.0e-8]]\norigin: {date: "2023-11-14T22:00:00+00:00"}\n'
+
+
+def noisy(seconds, rate=0.0, bias=BIAS, seed=0, scale=1.0):
+    """Return what a gyro with the noise of the model reports while it turns at a rate."""
+    deviation = scale * math.sqrt(Noise(NOISE).rate_variance(SLOW))
+    return rate + bias + deviation * np.random.default_rng(seed).standard_normal(
+        round(seconds / SLOW))
+
+
+def headings(found):
+    return np.array([each.heading for each in found])
+
+
+# Integration
+
+
+def test_raw_rates_are_integrated_by_the_trapezoid_rule_on_the_stamps(tmp_path):
+    rig = Rig(tmp_path, model='', stationary_threshold=0.0)
+    rates = 0.5 * np.sin(np.arange(300) * 0.02)
+    found = rig.feed(rates)
+    expected = np.concatenate([[0], np.cumsum((rates[1:] + rates[:-1]) * INTERVAL / 2)])
+    np.testing.assert_allclose(headings(found), expected, atol=1e-7)
+    np.testing.assert_allclose([each.rate for each in found], rates, atol=1e-12)
+
+
+def test_the_heading_is_not_wrapped(tmp_path):
+    found = Rig(tmp_path, model='').feed(np.full(500, 4.0))
+    assert found[-1].heading == pytest.approx(4.0 * 4.99, abs=1e-6)
+
+
+def test_a_short_gap_is_bridged_by_the_trapezoid_and_counted(tmp_path):
+    rig = Rig(tmp_path, model='')
+    heading = rig.feed(np.full(100, 0.5))[-1].heading
+    rig.skip(0.5 - INTERVAL)
+    assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.25, abs=1e-6)
+    assert rig.journal.counts['lost_samples'] == 49
+
+
+@pytest.mark.parametrize('jump, words', [(-5.0, 'jumps back by 4.990'),
+                                         (3.0, 'no samples for 3.010')])
+def test_after_a_jump_of_the_stamps_integration_begins_anew(tmp_path, jump, words):
+    rig = Rig(tmp_path, model='')
+    heading = rig.feed(np.full(50, 0.5))[-1].heading
+    rig.skip(jump, steady=abs(jump))
+    assert rig.feed([0.5])[0].heading == heading
+    assert words in rig.journal.event and rig.journal.counts['restarts'] == 1
+    assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
+
+
+def test_a_stamp_that_stands_is_not_integrated(tmp_path):
+    rig = Rig(tmp_path, model='')
+    heading = rig.feed(np.full(10, 0.5))[-1].heading
+    rig.skip(-INTERVAL)
+    assert rig.feed([0.5]) == [None] and 'stands still' in rig.journal.event
+    assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e155, -500.0, 101.0])
+def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
+    rig = Rig(tmp_path, model='')
+    begin = rig.feed(np.full(10, 0.5))[-1].heading
+    assert rig.feed([value]) == [None] and rig.journal.counts['refused_samples'] == 1
+    assert rig.feed([0.5])[0].heading == pytest.approx(begin + 0.5 * 2 * INTERVAL, abs=1e-6)
+
+
+def test_reset_makes_the_heading_zero_here(tmp_path):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(100, 0.5))
+    rig.pipeline.reset()
+    assert rig.feed([0.5])[0].heading == pytest.approx(0.5 * INTERVAL, abs=1e-7)
+
+
+# Variances
+
+
+def test_variances_grow_as_noise_and_assumptions_say(tmp_path):
+    model = 'effects: {bias: {bias: 0.01}}\nnoise: {angle_random_walk: 7.0e-4}'
+    found = Rig(tmp_path, model=model, stationary_method='none').feed(np.full(203, 0.5))
+    scale, bias, walk = 0.03 * 0.5, 0.5 * DEGREE, 7.0e-4
+    assert found[-1].rate_variance == pytest.approx(
+        walk ** 2 / INTERVAL + scale ** 2 + bias ** 2, rel=0.05)
+    grown = found[-1].heading_variance - found[2].heading_variance
+    assert grown == pytest.approx(walk ** 2 * 2.0 + (2.0 * scale) ** 2 + (2.0 * bias) ** 2,
+                                  rel=0.05)
+
+
+def test_without_known_noise_an_assumed_variance_is_published_never_zero(tmp_path):
+    found = Rig(tmp_path, model='').feed(np.full(20, 0.5))
+    assert all(each.rate_variance >= (0.5 * DEGREE) ** 2 for each in found)
+    assert all(each.heading_variance == UNMEASURED_VARIANCE for each in found)
+
+
+@pytest.mark.parametrize('motion', [(0.0, 0.7), (0.5, -0.5), (0.2, 0.0)])
+def test_the_error_of_the_heading_is_within_what_is_claimed(tmp_path, motion):
+    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.02, bias=0.4 * DEGREE))
+    begin = len(rig.outputs) - 1
+    for rate in motion:
+        rig.robot.command(rate)
+        rig.go(5.0)
+    error, deviation = rig.error(begin)
+    assert abs(error) < 3.0 * deviation, (error, deviation)
+
+
+def test_over_a_gap_that_is_not_integrated_the_variance_holds_what_may_have_been_turned(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    before = rig.feed(noisy(20.0, 0.3), SLOW)[-1]
+    rig.skip(3600.0)
+    after = rig.feed(noisy(2.0, 0.3), SLOW)[-1]
+    assert after.heading_variance > before.heading_variance + (0.2 * 3600.0) ** 2
+
+
+# Rest
+
+
+def test_at_rest_the_heading_stands_and_in_turns_it_goes_on(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    found = []
+    for number, turn in enumerate((0.5, -0.3)):
+        rest = rig.feed(noisy(20.0, seed=2 * number), SLOW)
+        assert np.ptp(headings(rest[-100:])) == 0.0 and rest[-1].rate == 0.0
+        found += rest + rig.feed(noisy(4.0, turn, seed=2 * number + 1), SLOW)
+    found += rig.feed(noisy(15.0, seed=9), SLOW)
+    assert found[-1].heading - found[0].heading == pytest.approx(0.8, abs=0.02)
+    assert np.abs(np.diff(headings(found))).max() < 1.2 * 0.5 * SLOW
+    bias, deviation = rig.pipeline.estimator.tracker.bias
+    assert bias == pytest.approx(BIAS - 0.01, abs=4.0 * deviation)
+
+
+def test_the_threshold_filter_deletes_rates_at_rest_until_it_is_switched_off(tmp_path):
+    rig = Rig(tmp_path, model='')
+    assert rig.feed(np.full(50, 0.1 * DEGREE))[-1].heading == 0.0
+    assert rig.pipeline.estimator.tracker.deleted > 0.03 * DEGREE
+    rig.set(stationary_threshold=0.0)
+    assert rig.feed([0.1 * DEGREE] * 2)[-1].rate == pytest.approx(0.1 * DEGREE)
+
+
+def test_the_method_may_change_while_it_runs_and_the_heading_does_not_jump(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    before = rig.feed(noisy(20.0), SLOW)[-1].heading
+    rig.set(stationary_method='none')
+    after = rig.feed(noisy(0.4, seed=1), SLOW)
+    assert all(each.rate != 0.0 for each in after[2:])
+    assert after[-1].heading == pytest.approx(before, abs=0.01)
+
+
+@pytest.mark.parametrize('wheels', ['odom', 'both'])
+def test_wheels_decide_on_slow_turns(tmp_path, wheels):
+    rig, slow = Rig(tmp_path, model=KNOWN, wheels=wheels), 0.05 * DEGREE
+    begin = rig.feed(noisy(60.0), SLOW, moving=0.0)[-1].heading
+    end = rig.feed(noisy(60.0, slow, seed=1), SLOW, moving=slow)[-1].heading
+    assert end - begin == pytest.approx(60.0 * slow, rel=0.5)
+
+
+def test_wheels_that_are_not_asked_decide_nothing(tmp_path):
+    rates = noisy(30.0, 0.05 * DEGREE)
+    without = Rig(tmp_path, model=KNOWN).feed(rates, SLOW)
+    assert Rig(tmp_path, model=KNOWN).feed(rates, SLOW, moving=0.3) == without
+
+
+# Several publishers
+
+
+@pytest.mark.parametrize('shift', [-0.3, -0.005, 0.3])
+def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, shift):
+    """A second publisher whose samples differ in stamp; both look like one stream."""
+    rig = rested(tmp_path, stationary_method='none')
+    rig.robot.command(0.7)
+    for _ in range(500):
+        rig.step()
+        reading = max(rig.truth)
+        rig.sample(reading + round(1e9 * shift), 0.0)
+    assert 'jump back again and again' in rig.pipeline.conflict
+    turned = rig.outputs[-1].heading - rig.outputs[250].heading
+    assert abs(turned) < 0.7 * 0.5, 'half a second at most'
+
+
+def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on_with_a_variance_that_holds(
+        tmp_path):
+    rig = rested(tmp_path, stationary_method='none', robot=Robot(scale_factor_error=0.0, bias=0.0))
+    begin = len(rig.outputs) - 1
+    rig.publishers = ['/a/driver_node', '/b/driver_node']
+    rig.robot.command(0.7)
+    rig.go(5.0)
+    assert '2 publishers send on imu/data_raw (/a/driver_node, /b/driver_node)' in \
+        rig.pipeline.conflict
+    refused = rig.journal.counts['refused_samples']
+    assert refused > 450
+    rig.publishers = ['/a/driver_node']
+    rig.go(5.0)
+    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] < refused + 30
+    error, deviation = rig.error(begin)
+    assert abs(error) < 3.0 * deviation, (error, deviation)
+
+
+def test_one_jump_back_is_no_conflict(tmp_path):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(100, 0.5))
+    rig.skip(-5.0, steady=0.0)
+    rig.feed(np.full(300, 0.5))
+    assert not rig.pipeline.conflict
+
+
+# Temperature
+
+
+TEMPERATURE_MODEL = yaml.safe_dump({
+    'effects': {'rate_temperature_polynomial': {'orders': [0, 1], 't0w0': 0.0, 't1w0': 0.001}},
+    'valid': {'temperature': [20.0, 40.0], 'rate': [-1.0, 1.0]}})
+
+
+@pytest.mark.parametrize('temperature, used, counted', [
+    (25.0, 25.0, 0), (60.0, 40.0, 200), (None, 30.0, 0)], ids=['inside', 'outside', 'none'])
+def test_the_temperature_is_used_clipped_or_replaced(tmp_path, temperature, used, counted):
+    rig = Rig(tmp_path, model=TEMPERATURE_MODEL, stationary_threshold=0.0)
+    found = rig.feed(np.full(200, 0.5), temperature=temperature)
+    assert found[-1].rate == pytest.approx(0.5 - 0.001 * used, abs=1e-12)
+    assert rig.journal.counts['temperature_clipped'] == counted
+
+
+def test_a_rate_beyond_the_calibrated_range_is_counted(tmp_path):
+    rig = Rig(tmp_path, model=TEMPERATURE_MODEL)
+    rig.feed(np.full(10, 1.5), temperature=30.0)
+    assert rig.journal.counts['beyond_range'] + rig.journal.counts['refused_samples'] == 10
+
+
+def test_a_temperature_that_stops_is_held_and_the_bias_becomes_less_known(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN, stationary_method='none')
+    known = rig.feed(noisy(30.0), SLOW, temperature=25.0)[-1].rate_variance
+    assert not rig.pipeline.estimator.temperature_is_lost
+    grown = rig.feed(noisy(600.0), SLOW)[-1].rate_variance
+    assert grown > known + (5.0 * 0.03 * DEGREE) ** 2, '1 K a minute'
+    assert rig.pipeline.estimator.temperature_is_lost
+    assert rig.pipeline.estimator.temperature == 25.0
+
+
+def test_biases_of_two_temperatures_are_kept_for_the_next_start(tmp_path):
+    shift = 10.0 * 0.02 * DEGREE
+    (tmp_path / 'calibration_biases.yaml').write_text('format: something else\n')
+    rig = Rig(tmp_path, model=KNOWN)
+    known = rig.feed(noisy(30.0), SLOW, temperature=25.0)[-1].rate_variance
+    found = rig.feed(noisy(5.0, 0.5, BIAS + shift, 1), SLOW, temperature=35.0)
+    assert found[-1].rate_variance > 4.0 * known, 'another temperature'
+    turned = found[-1].heading
+    rest = rig.feed(noisy(40.0, bias=BIAS + shift, seed=2), SLOW, temperature=35.0)
+    assert rest[-1].heading == pytest.approx(turned, abs=0.05) and rest[-1].rate == 0.0
+    rig.pipeline.learn(ending=True)
+    kept = (tmp_path / 'calibration_biases.yaml.kept-1').read_text()
+    assert kept == 'format: something else\n', 'a file of somebody else is kept'
+    entries = yaml.safe_load((tmp_path / 'calibration_biases.yaml').read_text())['entries']
+    assert {round(entry['temperature']) for entry in entries} == {25, 35}
+    assert len(Rig(tmp_path, model=KNOWN).pipeline.estimator.table.entries) >= 2
+
+
+# Clocks
+
+
+def test_a_gyro_that_was_silent_for_10_s_may_have_been_without_power(tmp_path):
+    rig = Rig(tmp_path)
+    rig.feed(np.zeros(50))
+    rig.skip(9.0)
+    rig.feed([0.0])
+    assert rig.pipeline.estimator.beginnings == 1
+    rig.skip(12.0)
+    rig.feed([0.0])
+    assert rig.pipeline.estimator.beginnings == 2
+
+
+@pytest.mark.parametrize('stamps', [0.0, 2.0], ids=['all waited', 'the queue overflowed'])
+def test_samples_that_waited_while_the_node_was_busy_are_no_silence(tmp_path, stamps):
+    rig = Rig(tmp_path)
+    rig.feed(np.zeros(50))
+    rig.skip(stamps, steady=15.0)
+    rig.feed([0.0])
+    assert rig.pipeline.estimator.beginnings == 1
+
+
+def test_a_simulation_that_pauses_is_no_silence(tmp_path):
+    rig = rested(tmp_path, ros=1000.0)
+    rig.clock.now += 60.0
+    rig.go(1.0)
+    assert rig.pipeline.estimator.beginnings == 1
+
+
+@pytest.mark.parametrize('step', [3600.0, -3600.0, -0.5, 2e7])
+def test_a_clock_of_the_host_that_is_set_changes_neither_heading_nor_variance(tmp_path, step):
+    plain, stepped = (Rig(folder, stationary_method='none', robot=Robot(seed=3))
+                      for folder in (_folder(tmp_path, 'a'), _folder(tmp_path, 'b')))
+    for rig in (plain, stepped):
+        rig.robot.command(0.5)
+        rig.go(5.0)
+    stepped.clock.set_by = step
+    for rig in (plain, stepped):
+        rig.go(5.0)
+    a, b = plain.outputs[-1], stepped.outputs[-1]
+    assert b.heading == pytest.approx(a.heading, abs=1e-3)
+    assert b.heading_variance == pytest.approx(a.heading_variance, rel=0.01)
+    assert f'{step:+.1f} s' in stepped.journal.clock_steps
+    assert stepped.journal.counts['restarts'] == 0
+
+
+def _folder(path, name):
+    (path / name).mkdir()
+    return path / name
+
+
+@pytest.mark.parametrize('speed', [0.25, 1.0, 4.0, 20.0])
+def test_the_heading_follows_a_simulation_at_any_speed(tmp_path, speed):
+    rig = Rig(tmp_path, model='', ros=1000.0, stationary_threshold=0.0)
+    rig.ros_speed = speed
+    rates = 0.2
+    for _ in range(300):
+        rig.clock.now += INTERVAL
+        rig.clock.ros += INTERVAL * speed
+        rig.sample(round(1e9 * rig.clock.ros), rates)
+        rig.guards()
+    turned = rig.outputs[-1].heading - rig.outputs[0].heading
+    assert turned == pytest.approx(rates * 299 * INTERVAL * speed, abs=1e-6)
+
+
+def test_a_simulation_that_is_set_back_begins_the_integration_anew(tmp_path):
+    rig = rested(tmp_path, ros=1000.0)
+    rig.clock.ros -= 500.0
+    rig.go(1.0)
+    assert rig.journal.counts['restarts'] == 1 and not rig.pipeline.conflict
+
+
+# The monitor of noise and bias
+
+
+def monitored(tmp_path, outputs, **parameters):
+    rig = Rig(tmp_path, model=CERTAIN, **parameters)
+    rig.feed(outputs, SLOW)
+    return rig
+
+
+def test_a_gyro_that_fits_its_model_raises_no_alarm(tmp_path):
+    monitor = monitored(tmp_path, noisy(42.0, bias=0.01)).pipeline.monitor
+    assert monitor.examined >= 3 and not monitor.noise_alarm and not monitor.bias_alarm
+    assert monitor.last.noise_ratio == pytest.approx(1.0, abs=0.25)
+
+
+def test_three_times_the_noise_raises_an_alarm(tmp_path):
+    monitor = monitored(tmp_path, noisy(42.0, bias=0.01, scale=3.0)).pipeline.monitor
+    assert monitor.last.noise_ratio == pytest.approx(3.0, abs=0.7)
+    assert 'times what the model claims' in monitor.noise_alarm and not monitor.bias_alarm
+
+
+@pytest.mark.parametrize('moved, parameters', [
+    (0.15 * DEGREE, {}), (1.0 * DEGREE, {}), (0.15 * DEGREE, {'stationary_threshold': 0.0})],
+    ids=['below the threshold', 'above the threshold', 'without a threshold'])
+def test_a_bias_that_moved_raises_an_alarm(tmp_path, moved, parameters):
+    rig = monitored(tmp_path, noisy(42.0, bias=0.01 + moved), **parameters)
+    monitor = rig.pipeline.monitor
+    assert monitor.last.bias == pytest.approx(moved, abs=1e-3) and not monitor.noise_alarm
+    assert 'of what the model explains: calibrate' in monitor.bias_alarm
+
+
+def test_a_calibration_at_rest_ends_the_alarm(tmp_path):
+    rates = noisy(90.0, bias=0.01 + 0.2 * DEGREE, seed=1)
+    rig = monitored(tmp_path, rates[:1050])
+    assert rig.pipeline.monitor.bias_alarm
+    rig.begin(REST)
+    rig.feed(rates[1050:1450], SLOW)
+    success, message = rig.session.conclude()
+    assert success and 'more than the model explains: it changed the bias by' in message
+    rig.feed(rates[1450:], SLOW)
+    assert not rig.pipeline.monitor.bias_alarm
+
+
+# Effects with a past
+
+
+PLAIN = {'bias': {'bias': 0.002}, 'scale_factor_error': {'scale_factor_error': 0.02},
+         'bias_temperature': {'bias_temperature': 2e-4, 'reference_temperature': 25.0}}
+PAST = {'thermal_lag': {'thermal_lag': -8e-4, 'time_constant': 40.0},
+        'warm_up': {'warm_up': 0.004, 'time_constant': 80.0},
+        'bias_temperature_rate': {'bias_temperature_rate': 0.02},
+        'thermal_hysteresis': {'thermal_hysteresis': 5e-4},
+        'heading_sensitivity': {'sine': 1e-3, 'cosine': -5e-4}}
+
+
+def model(effects):
+    return yaml.safe_dump({'effects': effects, 'noise': {'angle_random_walk': 1e-5}})
+
+
+def test_effects_with_a_past_gain_in_a_drive_what_they_promise(tmp_path):
+    """The promise is made on the log of a drive of 250 s, heated and cooled."""
+    (tmp_path / 'model.yaml').write_text(model(PLAIN | PAST))
+    full = read_model(tmp_path / 'model.yaml')
+    seconds = np.arange(2500) * 0.1
+    rate = 0.3 * np.sin(seconds / 9.0) * (seconds > 20.0)
+    heated = 22.0 + 25.0 * np.clip((seconds - 30.0) / 80.0, 0.0, 1.0) - 10.0 * (seconds > 180.0)
+    truth = integrate(seconds, rate)
+    log = Log(output=rate, time=seconds, temperature=heated, reference_rate=rate,
+              reference_heading=truth)
+    output = respond(full, seconds, channels_of(log).moving(rate, rate), np.random.default_rng(4))
+    log = Log(output=output, time=seconds, temperature=heated, reference_rate=rate,
+              reference_heading=truth)
+    rms = {}
+    for name, effects in (('plain', PLAIN), ('full', PLAIN | PAST)):
+        rig = Rig(tmp_path, model=model(effects), stationary_method='none',
+                  calibration_file=tmp_path / 'none.yaml')
+        found = headings(rig.feed(output, 0.1, temperature=heated))
+        promised = integrate(seconds, LogCompensation(
+            read_model(tmp_path / 'model.yaml')).add(log)[0].rate)
+        error = found - found[0] - truth
+        np.testing.assert_allclose(found - found[0], promised, rtol=0.0, atol=0.01)
+        rms[name] = float(np.sqrt(np.mean(error ** 2)))
+    assert rms['plain'] > 0.3 and rms['full'] < 0.02 * rms['plain'], rms
+
+
+def test_a_time_offset_moves_the_published_stamps(tmp_path):
+    rig = Rig(tmp_path, model=model({'time_offset': {'time_offset': 0.02}}))
+    found = rig.feed(np.full(3, 0.5))
+    assert [rig.fed - each.stamp for each in found] == [40_000_000, 30_000_000, 20_000_000]
+
+
+def test_a_channel_that_no_message_brings_is_named(tmp_path):
+    rig = Rig(tmp_path, model=model({'supply_sensitivity': {'supply_sensitivity': 0.01}}))
+    assert rig.feed(np.full(3, 0.5))[-1].rate == 0.5
+    assert 'supply' in ' '.join(rig.pipeline.estimator.missing(rig.journal.channels))
+
+
+def test_over_a_jump_back_of_the_stamps_the_past_of_an_effect_goes_on(tmp_path):
+    lag = {'thermal_lag': {'thermal_lag': 1e-3, 'time_constant': 40.0}}
+    rig = Rig(tmp_path, model=model(lag), stationary_threshold=0.0)
+    ahead = rig.feed(np.full(20, 0.5), temperature=np.repeat([20.0, 30.0], 10))[-1].rate - 0.5
+    rig.skip(-5.0, steady=0.0)
+    after = rig.feed(np.full(2, 0.5), temperature=30.0)[-1].rate - 0.5
+    assert ahead == pytest.approx(0.01, rel=0.01) and after == pytest.approx(ahead, rel=0.01)
+
+
+# Files
+
+
+@pytest.mark.parametrize('text, words', [
+    (None, 'no such file'), ('', 'wanted names with values'),
+    ('effects: {bias: {bias:', 'cannot be read as YAML'),
+    ('version: 99\neffects: {}', 'install a newer'),
+    ('effects: {bias: {bias: .nan}}', 'effects.bias.bias is nan'), ('[1, 2]', 'the file is')])
+def test_with_a_bad_model_raw_rates_go_on_and_the_problem_names_the_file(tmp_path, text, words):
+    path = tmp_path / 'bad.yaml'
+    if text is not None:
+        path.write_text(text)
+    rig = Rig(tmp_path, model='', model_file=str(path), stationary_threshold=0.0)
+    assert rig.feed(np.full(10, 0.5))[-1].rate == 0.5
+    problem = rig.pipeline.store.problem
+    assert words in problem and str(path) in problem
+
+
+def test_two_pipelines_with_one_file_leave_it_whole_and_the_other_is_warned(tmp_path):
+    first, second = rested(tmp_path), rested(tmp_path)
+    for number in range(3):
+        for rig in (first, second):
+            rig.robot.bias = 0.005 * (number + 1)
+            success, message = rig.calibrate(REST)
+            assert success, message
+            assert read_model(tmp_path / 'calibration.yaml').self_calibration.method == 'rest'
+        first.go(2.0)
+    assert 'was written by somebody else' in first.pipeline.store.shared_hint
+    names = {path.name for path in tmp_path.iterdir()} - {'calibration_biases.yaml'}
+    assert names == {'calibration.yaml', 'model.yaml'}
+
+
+def test_two_pipelines_with_files_of_their_own_keep_what_is_theirs(tmp_path):
+    first = rested(tmp_path, calibration_file=tmp_path / 'a.yaml')
+    second = rested(tmp_path, calibration_file=tmp_path / 'b.yaml')
+    assert first.calibrate(REST)[0]
+    assert (tmp_path / 'a.yaml').exists() and not (tmp_path / 'b.yaml').exists()
+    second.go(2.0)
+    assert not first.pipeline.store.shared_hint and not second.pipeline.store.shared_hint
+
+
+# What is reported
+
+
+@pytest.fixture
+def reported():
+    """Return a function that gives level, message and values of the next report of a rig."""
+    module = pytest.importorskip('gyro_calibration.ros.compensation_report')
+    reports = {}
+
+    def report(rig):
+        known = reports.setdefault(id(rig), module.CompensationReport(rig.pipeline, rig.clock))
+        level, message, values = known.make()
+        return int.from_bytes(level, 'little'), message, values
+    return report
+
+
+OK, WARN, ERROR = range(3)
+
+
+@pytest.mark.parametrize('fault, level, words', [
+    (lambda rig: None, OK, 'heading goes on'),
+    (lambda rig: setattr(rig.robot, 'unplugged', True), ERROR, 'no samples on imu/data_raw for'),
+    (lambda rig: setattr(rig.robot, 'stamps_stand', True), ERROR, 'the stamp stands still'),
+    (lambda rig: rig.publishers.append('/other'), ERROR, '2 publishers send'),
+    (lambda rig: setattr(rig, 'ros_speed', 0.0), ERROR, 'ROS time stands still'),
+    (lambda rig: setattr(rig.robot, 'bias', 1e9), ERROR, 'rad/s came, and this gyro reports'),
+], ids=['none', 'unplugged', 'stamps', 'publishers', 'clock', 'absurd rates'])
+def test_the_diagnostics_name_what_is_wrong_within_two_seconds(tmp_path, reported, fault, level,
+                                                              words):
+    rig = rested(tmp_path, ros=1000.0)
+    reported(rig)
+    fault(rig)
+    rig.go(2.0)
+    found, message, _ = reported(rig)
+    assert (found, words in message) == (level, True), message
+
+
+def test_an_absent_clock_is_an_error_from_the_begin_on(tmp_path, reported):
+    rig = Rig(tmp_path, ros=0.0)
+    for _ in range(200):
+        rig.step()
+    level, message, _ = reported(rig)
+    assert level == ERROR and 'ROS time stands still' in message
+
+
+def test_a_robot_that_kept_turning_after_a_drive_is_a_warning(tmp_path, reported):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.drive_to()
+    rig.robot.deaf = True
+    rig.session.cancel()
+    rig.session.conclude()
+    rig.go(3.0)
+    level, message, _ = reported(rig)
+    assert level == WARN and 'set the command time-out of its base' in message
+
+
+def test_a_count_is_a_warning_only_while_it_grows(tmp_path, reported):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(200, 0.5))
+    rig.feed([math.nan])
+    reported(rig)
+    rig.feed(np.full(200, 0.5))
+    level, message, values = reported(rig)
+    assert level == OK, message
+    assert values['refused_samples'] == 1
+
+
+def test_the_values_tell_what_is_known(tmp_path, reported):
+    rig, seeds = Rig(tmp_path, model=KNOWN), count(1)
+    rig.feed(noisy(40.0), SLOW)
+    reported(rig)
+    rig.feed(noisy(5.0, seed=next(seeds)), SLOW)
+    _, _, values = reported(rig)
+    assert values['resting'] is True and values['wheels'] == 'unknown'
+    assert float(values['bias_deg_s']) == pytest.approx(0.002 / DEGREE, abs=0.02)
+    assert 'cannot be told from drift' in values['slow_turns']
+    assert float(values['slowest_noticed_turn_deg_s']) > 0.0
+    assert float(values['rate_hz']) == pytest.approx(25.0, rel=0.05)
+    assert math.isfinite(float(values['heading_standard_deviation_deg']))
+
+
+def test_every_value_has_a_key_in_snake_case_that_the_documents_name(tmp_path, reported):
+    rig = rested(tmp_path)
+    rig.calibrate(REST)
+    rig.feed(noisy(60.0), SLOW)
+    _, _, values = reported(rig)
+    page = (Path(__file__).parents[1] / 'docs' / 'on_a_robot.md').read_text()
+    assert [key for key in values if not re.fullmatch('[a-z0-9_]+', key)] == []
+    assert [key for key in values if f'`{key}`' not in page] == []
