@@ -148,13 +148,6 @@ class HeadingEstimator:
         self._turned_before += self.tracker.heading - heading
         self.tracker.rewind(heading, variance)
 
-    def rebuild(self, heading: float, variance: float, now: float) -> None:
-        """Begin anew, with nothing of the present state, at a heading, rad, with its variance."""
-        self._tracker, self._turned_before, self.rate = None, 0.0, 0.0
-        self._history = self.model.history()
-        self._begin(now)
-        self.tracker.rewind(heading, variance)
-
     @property
     def calibrated_now(self) -> bool:
         """Tell whether the calibration was made in this run."""

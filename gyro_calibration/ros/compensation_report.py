@@ -75,6 +75,7 @@ class CompensationReport:
         event = self._pipeline.journal.event
         texts = {
             'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
+            'refused_temperatures': event,
             'lost_samples': 'samples are lost: look at the cable, the baud rate and the load of '
                             'the computer; the heading goes on over the gaps, and its variance '
                             'allows for them',

@@ -111,8 +111,8 @@ class Output(NamedTuple):
     rate_variance: float
 
 
-COUNTED = ('samples', 'refused_samples', 'lost_samples', 'repeated_stamps', 'restarts', 'rebuilt',
-           'temperature_clipped', 'beyond_range')
+COUNTED = ('samples', 'refused_samples', 'refused_temperatures', 'lost_samples',
+           'repeated_stamps', 'restarts', 'rebuilt', 'temperature_clipped', 'beyond_range')
 
 
 @dataclass
@@ -188,8 +188,6 @@ class Pipeline:
         self.session = CalibrationSession(self.estimator, store, self.monitor, send, clock)
         self.ros_time, self._host = RosTime(), HostClock()
         self.conflict = ''
-        self._limit = store.model.rate_limit
-        self._coldest, self._hottest = store.model.temperature_limits
         self._noise_is_known = noise.angle_random_walk > 0.0 and not store.problem
         self._epoch: int | None = None
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
@@ -244,12 +242,11 @@ class Pipeline:
 
     def temperature(self, stamp: int, value: float) -> None:
         """Take a temperature, degC."""
-        if self._coldest <= value <= self._hottest:
-            self.estimator.hear_temperature(self._time(stamp), value)
-        else:
-            self.journal.counts['refused_samples'] += 1
-            self.journal.event = (f'a temperature of {value:g} degC came, and this gyro reports '
-                                  f'{self._coldest:g} to {self._hottest:g}: it is not used')
+        self.estimator.hear_temperature(self._time(stamp), value)
+        refused = self.estimator.refused_temperatures
+        if refused > self.journal.counts['refused_temperatures']:
+            self.journal.counts['refused_temperatures'] = refused
+            self.journal.event = f'a temperature of {value:g} degC is not plausible, and not used'
 
     def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Take a heading, rad, and a velocity by the wheels."""
@@ -282,7 +279,7 @@ class Pipeline:
         what is published, or None where the sample cannot be used
 
         """
-        counts, now, journal = self.journal.counts, self._clock.steady(), self.journal
+        counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
         if stamp < self._newest:
             self._see_jump(now)
@@ -290,7 +287,7 @@ class Pipeline:
         if self._several and (sequence is None or sequence <= self._sequence):
             self._see_switch(sequence)
         self._sequence = sequence or 0
-        if self.conflict or not self._is_possible(output):
+        if self.conflict:
             counts['refused_samples'] += 1
             return None
         time = self._time_of_sample(stamp)
@@ -302,16 +299,9 @@ class Pipeline:
             self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
         if self._was_silent(time, now):
             self.estimator.begin_run(self._clock.date())
-        self._last, journal.received = time, now
+        self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
         return self._use(stamp, time, output, specific_force, now, receivers)
-
-    def _is_possible(self, output: float) -> bool:
-        if abs(output) <= self._limit:
-            return True
-        self.journal.event = (f'a rate of {output:g} rad/s came, and this gyro reports at most '
-                              f'{self._limit:g}: the sample is not used')
-        return False
 
     def _see_jump(self, now: float) -> None:
         """Take the second jump back of the stamps within 1 s for those of several publishers."""
@@ -328,13 +318,18 @@ class Pipeline:
 
     def _use(self, stamp: int, time: float, output: float, force: float | None, now: float,
              receivers: int) -> Output | None:
-        estimator, counts = self.estimator, self.journal.counts
+        estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         moving = self.wheels.moving(now, self._sources) if self._sources else None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
-        tracker = estimator.tracker
+        if estimator.refused > refused:
+            counts['refused_samples'] += 1
+            self.journal.event = (f'a rate of {output:g} rad/s came, which is beyond what this '
+                                  'gyro reports: the sample is not used')
+            return None
+        self.journal.received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last.temperature_clipped)
         counts['beyond_range'] += int(estimator.last.beyond_range)
-        counts['lost_samples'] = tracker.intervals.lost
+        counts['lost_samples'], counts['rebuilt'] = tracker.intervals.lost, tracker.rebuilt
         if restarted:
             self._note_restart(restarted)
         if self.monitor.works and self.monitor.add(time, output, estimator.corrected):
@@ -352,9 +347,6 @@ class Pipeline:
             tracker.rate_variance + spread)
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
-            self.estimator.rebuild(*self._before(), self._clock.date())
-            counts['rebuilt'] += 1
-            self._note_restart('the state of the heading was not finite')
             return None
         self._recent.append((time, estimator.corrected))
         while time - self._recent[0][0] > _LOOKED_BACK:
