@@ -25,13 +25,13 @@ from geometry_msgs.msg import (
     TwistWithCovarianceStamped,
 )
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
@@ -43,6 +43,7 @@ from gyro_calibration.ros.diagnostics import OK, Diagnostics, Report, status_arr
 from gyro_calibration.ros.pipeline import NSEC_PER_SEC, PARAMETERS, Output, Pipeline
 from gyro_calibration.ros.runner import (
     LATCHED_QOS,
+    answer_later,
     call_every,
     declare,
     publish_on,
@@ -51,7 +52,6 @@ from gyro_calibration.ros.runner import (
 )
 from gyro_calibration.ros.wheels import Velocity
 
-Answer = tuple[bool, str]
 #: What a middleware says that does not number messages.
 _UNNUMBERED = (1 << 64) - 1
 #: Between two looks at who is there and whether time goes on, s.
@@ -96,7 +96,8 @@ class CompensationNode(Node):
         if problem := self._pipeline.store.problem:
             self.get_logger().error(problem)
         self._receivers = 0
-        self._answered: Future | None = None
+        self._waiting: tuple[Trigger.Response, Future] | None = None
+        self._timer: Timer | None = None
         self._assumed_variance = values.assumed_bias ** 2
         self._connect()
         self._report = CompensationReport(self._pipeline, clock)
@@ -170,7 +171,7 @@ class CompensationNode(Node):
                                       number)
         if found is not None:
             self._publish(message, found)
-        if self._answered is not None:
+        if self._waiting:
             self._answer_ended()
 
     # What goes out
@@ -241,72 +242,72 @@ class CompensationNode(Node):
     # Services
 
     def _offer_services(self) -> None:
-        # A run answers after 20 s; in a group where callbacks may overlap it delays nobody.
-        group = ReentrantCallbackGroup()
         for name, callback in (
                 ('calibrate', self._on_calibrate), ('calibrate_bias', self._on_calibrate_bias),
                 ('finish_calibration', self._on_finish), ('cancel_calibration', self._on_cancel),
                 ('reset_heading', self._on_reset)):
-            self.create_service(Trigger, f'~/{name}', callback, callback_group=group)
+            answer_later(self.create_service(Trigger, f'~/{name}', callback))
 
-    async def _on_calibrate(self, _: Trigger.Request,
-                            response: Trigger.Response) -> Trigger.Response:
-        return self._fill(response, await self._calibrate(self._values.calibration_reference))
+    def _on_calibrate(self, _: Trigger.Request,
+                      response: Trigger.Response) -> Trigger.Response | Future:
+        return self._calibrate(self._values.calibration_reference, response)
 
-    async def _on_calibrate_bias(self, _: Trigger.Request,
-                                 response: Trigger.Response) -> Trigger.Response:
-        return self._fill(response, await self._calibrate(REST))
+    def _on_calibrate_bias(self, _: Trigger.Request,
+                           response: Trigger.Response) -> Trigger.Response | Future:
+        return self._calibrate(REST, response)
 
-    async def _calibrate(self, kind: str) -> Answer:
-        """Collect a run, fit it and use it; or change nothing and say why."""
+    def _calibrate(self, kind: str, response: Trigger.Response) -> Trigger.Response | Future:
+        """Begin a run, which `_answer_ended` answers; or change nothing and say why."""
         session = self._pipeline.session
         obstacle = self._obstacle() if self._values.calibration_drive else ''
         if refusal := session.begin(kind, self._values, obstacle):
-            return self._refused(refusal)
-        self._answered = Future()
-        timer = call_every(self, Drive.INTERVAL, self._drive) if session.drives else None
+            return self._refuse(response, refusal)
+        if session.drives:
+            self._timer = call_every(self, Drive.INTERVAL, self._drive)
+        self._waiting = response, Future()
         self._show_status()
-        self._look_for_receivers()
-        await self._answered
-        self._answered = None
-        if timer:
-            self.destroy_timer(timer)
-        success, message = session.conclude()
-        self._show_status()
-        return (True, message) if success else self._refused(message)
+        return self._waiting[1]
 
     def _answer_ended(self) -> None:
-        """Let the service of a run that has ended go on to its answer."""
-        run = self._pipeline.session.run
-        if self._answered and run and run.reason is not None and not self._answered.done():
-            self._answered.set_result(None)
+        """Fit a run that has ended, use what it gives, and answer who asked for it."""
+        session = self._pipeline.session
+        if not self._waiting or session.run is None or session.run.reason is None:
+            return
+        if self._timer:
+            self.destroy_timer(self._timer)
+        (response, future), self._waiting, self._timer = self._waiting, None, None
+        success, message = session.conclude()
+        answer = self._fill if success else self._refuse
+        self._show_status()
+        future.set_result(answer(response, message))
 
-    def _refused(self, reason: str) -> Answer:
+    def _refuse(self, response: Trigger.Response, reason: str) -> Trigger.Response:
         journal = self._pipeline.journal
         journal.refused += 1
         journal.reasons.append(reason)
-        return False, reason
+        return self._fill(response, reason, False)
 
-    def _fill(self, response: Trigger.Response, answer: Answer) -> Trigger.Response:
-        success, text = answer
+    def _fill(self, response: Trigger.Response, text: str,
+              success: bool = True) -> Trigger.Response:
         response.success, response.message = success, text if success else f'refused: {text}'
         self._pipeline.journal.event = response.message
-        if success:  # in two lines: rclpy refuses another severity from the same line
+        if success:  # rclpy wants each severity on a line of its own
             self.get_logger().info(response.message)
         else:
             self.get_logger().warning(response.message)
         return response
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._fill(response, self._pipeline.session.finish())
+        success, text = self._pipeline.session.finish()
+        return self._fill(response, text, success)
 
     def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        answer = self._pipeline.session.cancel()
+        success, text = self._pipeline.session.cancel()
         self._answer_ended()
-        return self._fill(response, answer)
+        return self._fill(response, text, success)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._fill(response, (True, self._pipeline.reset()))
+        return self._fill(response, self._pipeline.reset())
 
     # Driving
 

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import rclpy
@@ -31,8 +32,10 @@ from rclpy.node import Node, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.task import Future
 from rclpy.timer import Timer
 
 from gyro_calibration.ros.parameters import Parameter, record
@@ -212,12 +215,34 @@ def _stop_on_signals() -> threading.Event:
     return stop
 
 
-def executor() -> Executor:
-    """
-    Return the executor that costs least and in which services may wait.
+#: A signal is seen after this time at the latest, s.
+_SIGNAL_SEEN = 0.2
 
-    The events executor takes half of the processor time, but awaits nothing before rclpy 7.1.11
-    (Jazzy) and 9.1.2 (Kilted).
+
+def answer_later(service: Service) -> None:
+    """
+    Let the callback of a service return a `Future` of its response, which is sent when it is done.
+
+    It does what an ``async`` callback does, in every executor, and holds up no other callback.
+
+    """
+    send = service.send_response
+
+    def send_when_done(response: Any, header: Any) -> None:
+        if isinstance(response, Future):
+            response.add_done_callback(lambda done: send(done.result(), header))
+        else:
+            send(response, header)
+
+    service.send_response = send_when_done  # type: ignore[method-assign]
+
+
+def _executor() -> Executor:
+    """
+    Return the events executor, which takes half of the processor time, where it is sound.
+
+    Before rclpy 7.1.11 (Jazzy) and 9.1.2 (Kilted) it cannot call what takes a message and its
+    number.
 
     """
     # lib/pythonX.Y/site-packages/rclpy/__init__.py stands beside share/rclpy/package.xml
@@ -232,13 +257,14 @@ def executor() -> Executor:
 
 def spin(node: Node, stop: threading.Event) -> None:
     """Serve the callbacks of a node until an event is set, then close it."""
-    serving = executor()
+    serving = _executor()
     serving.add_node(node)
     try:
-        # Every node has a timer, after which a signal is seen at the latest; a time-out here
-        # would be one more timer for each message.
+        # A node has a timer, after which a signal is seen. For this executor a time-out is one
+        # more timer with each message; the other one never returns without.
+        timeout = None if isinstance(serving, SingleThreadedExecutor) else _SIGNAL_SEEN
         while not stop.is_set():
-            serving.spin_once()
+            serving.spin_once(timeout_sec=timeout)
     except ExternalShutdownException:
         pass  # somebody else shut rclpy down: the same end
     finally:
