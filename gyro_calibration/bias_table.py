@@ -252,12 +252,14 @@ class BiasTable:
         """Return the bias, its variance, and the weight of the last entry in it."""
         if not entries:
             return 0.0, math.inf, 0.0
+        temperature, time = _bounded(temperature, time)
         seen = self._seen(entries, temperature, time)
         bias, variance = _mixture(seen.likely, seen.mean, 1.0 / seen.information)
         return bias + entries[0].bias, variance, float(seen.likely @ (seen.of_ones[:, -1] / seen.information))
 
     def difference(self, from_temperature: float, to_temperature: float, time: float) -> tuple[float, float]:
         """Return how much the bias changes with the temperature alone, rad/s, and the variance of that, (rad/s)²."""
+        (from_temperature, time), (to_temperature, _) = _bounded(from_temperature, time), _bounded(to_temperature, time)
         own = self._by_temperature(from_temperature, np.array([to_temperature]))[:, 0]
         if not self.entries:
             return 0.0, float(_MET @ own)
@@ -425,8 +427,13 @@ def _bin(entry: Entry) -> int:
 
 def _possible(entry: Entry) -> bool:
     """Tell whether this may be a bias of a gyro; nan never is."""
-    return (-273.15 <= entry.temperature <= 1e4 and abs(entry.bias) <= 1e4 and _LEAST <= entry.variance <= 1e8
-            and 0.0 <= entry.time <= 1e11 and 0 <= entry.run <= 1e9)
+    return ((entry.temperature, entry.time) == _bounded(entry.temperature, entry.time) and abs(entry.bias) <= 1e4
+            and _LEAST <= entry.variance <= 1e8 and 0 <= entry.run <= 1e9)
+
+
+def _bounded(temperature: float, time: float) -> tuple[float, float]:
+    """Return a temperature, degC, and a time, s since 1970, or the nearest ones that there may be."""
+    return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
 
 
 def _differs(kept: Entry | None, entry: Entry) -> bool:

@@ -12,7 +12,6 @@ from gyro_calibration.history import clip
 from gyro_calibration.log import CACHED, Array, Number
 from gyro_calibration.model import GyroModel
 
-
 #: A rate of this size, rad/s, comes of a model whose values are too large to be computed with.
 _LARGEST = 1e300
 

@@ -117,9 +117,8 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
     # each window is summed by itself: of a running sum, one large value would ruin all that come later
-    rate, count = np.clip(rate, -LARGEST, LARGEST), end - begin
-    windows = np.stack([begin, end], axis=1).ravel()
-    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2] for values in (rate, rate * rate))
+    bounded, count, windows = np.clip(rate, -LARGEST, LARGEST), end - begin, np.stack([begin, end], axis=1).ravel()
+    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2] for values in (bounded, bounded * bounded))
     mean = sums / count
     variance = squares / count - mean * mean
     explained = 9.0 * settings.angle_random_walk ** 2 * count

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyro_calibration.compensation import Compensated, compensate, rate_sensitivity
 from gyro_calibration.effects import Channels
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import QUANTITIES, Array, Log, Mask
+from gyro_calibration.log import DEGREE, QUANTITIES, Array, Log, Mask
 from gyro_calibration.model import GyroModel
 
 #: An effect of the heading that is found meanwhile is found over so long at once, s: over longer, more passes would be needed.
@@ -113,10 +113,26 @@ class LogCompensation:
         return replace(around, heading=heading)
 
 
-def compensate_log(model: GyroModel, log: Log) -> Array:
-    """Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is."""
+def plausible(model: GyroModel, log: Log) -> Mask:
+    """Return for which rows such a gyro may report this output at this temperature, shape (n,); no nan is plausible."""
     assert log.output is not None
-    known = np.isfinite(log.output)
+    found = np.abs(log.output) <= model.rate_limit
+    if log.temperature is not None:
+        coldest, hottest = model.temperature_limits
+        found &= (coldest <= log.temperature) & (log.temperature <= hottest)
+    return np.asarray(found)
+
+
+def none_plausible(model: GyroModel) -> str:
+    """Return what to say of a log without a plausible row."""
+    coldest, hottest = model.temperature_limits
+    return (f'no row has an output within {model.rate_limit / DEGREE:.0f} deg/s and a temperature from {coldest:.0f} to '
+            f'{hottest:.0f} degC, which is all that is plausible; see whether columns and units are right')
+
+
+def compensate_log(model: GyroModel, log: Log) -> Array:
+    """Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is, or is not `plausible`."""
+    known = plausible(model, log)
     rate = np.full(len(log), np.nan)
     rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate
     return rate

@@ -16,7 +16,7 @@ from gyro_calibration.compensation import Compensated, covariance, quadratic_for
 from gyro_calibration.gaps import Intervals
 from gyro_calibration.heading import BlockIntegrator, Threshold
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask, write_log_blocks
-from gyro_calibration.log_compensation import LogCompensation, rows_of
+from gyro_calibration.log_compensation import LogCompensation, none_plausible, plausible, rows_of
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.tracking import Settings, Track, track
@@ -59,6 +59,7 @@ class _Found:
 
     rows: int = 0
     rows_without_output: int = 0
+    refused_samples: int = 0
     temperature_clipped: int = 0
     beyond_range: int = 0
     temperature_known: bool = False
@@ -72,7 +73,9 @@ class _Found:
         log, columns = piece.log, piece.columns
         self.lost_samples, self.longest_gap_s = piece.intervals.lost, piece.intervals.longest
         self.rows += len(log)
-        self.rows_without_output += len(log) - len(columns['rate_rad_s'])
+        without = int(np.count_nonzero(~np.isfinite(np.asarray(log.output))))
+        self.rows_without_output += without
+        self.refused_samples += len(log) - len(columns['rate_rad_s']) - without
         self.temperature_clipped += int(columns['temperature_clipped'].sum())
         self.beyond_range += int(columns['beyond_range'].sum())
         self.temperature_known = log.temperature is not None
@@ -83,7 +86,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Piece:
-    """A block of a log, the rows in which the output is known, the new columns there, and the intervals of the samples so far."""
+    """A block of a log, the rows with a plausible output, the new columns there, and the intervals of the samples so far."""
 
     log: Log
     known: Mask
@@ -99,6 +102,8 @@ def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> 
         yield piece.log, {name: _at(piece.known, values) for name, values in piece.columns.items()}
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
+    if found.rows == found.rows_without_output + found.refused_samples:
+        raise DataRefused(f'{given.log}: {none_plausible(model)}')
 
 
 def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
@@ -107,7 +112,7 @@ def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
     variance: float | None = None
     for log in read_blocks(given):
         log = replace(log, output=output_of(given, log))
-        known = np.isfinite(np.asarray(log.output))
+        known = plausible(model, log)
         if variance is None:
             # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
             variance = 0.0 if log.time is None else model.noise.rate_variance(_interval(log.time, known))
@@ -123,7 +128,7 @@ def _followed(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
     """Give the whole log as one piece, followed from rest to rest."""
     log = read(given)
     log = replace(log, output=output_of(given, log))
-    known, supposed = np.isfinite(np.asarray(log.output)), assumed(model, Assumptions())
+    known, supposed = plausible(model, log), assumed(model, Assumptions())
     if log.time is None or known.sum() < 2:
         raise DataRefused(f'{given.log}: rests show in samples over time; give a log with time_s, or say --rate')
     rows, compensation = rows_of(log, known), LogCompensation(supposed)
@@ -203,9 +208,11 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
     lines += [words for quantity, (channel, words) in _WORDS.items() if quantity in found.unknown and model.looks_at(channel)]
     lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms if term.effect.undone]
     for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
+                        ('refused_samples', 'rows are not used: no such gyro reports that rate or temperature; they count as lost.'),
                         ('lost_samples', 'samples are lost; the heading goes on over the true intervals, and the deviation allows for it.'),
                         ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),
-                        ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated.')):
+                        ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated, or held where no rate '
+                         'explains the output.')):
         if data[name]:
             lines.append(f'{data[name]} {words}')
     return Answer('\n'.join(lines), data)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 # The matrices of a fit are small; threads that wait for each other make it ten times slower on a busy machine. NumPy reads it once.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -41,8 +43,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'gyro_calibration: {error}', file=sys.stderr)
         return WRONG_USE
     if answer is not None:
-        _show(json.dumps(answer.data, allow_nan=False) if given.json else answer.text)
+        _show(json.dumps(_numbers(answer.data), allow_nan=False) if given.json else answer.text)
     return DONE
+
+
+def _numbers(value: Any) -> Any:
+    """Return what JSON can hold: null for what is not finite."""
+    if isinstance(value, dict):
+        return {name: _numbers(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_numbers(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _refuse_empty(given: argparse.Namespace) -> None:

@@ -23,7 +23,7 @@ from gyro_calibration.cli.verb import (
 )
 from gyro_calibration.likelihood import Fit
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask
-from gyro_calibration.log_compensation import compensate_log
+from gyro_calibration.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import Motion, from_headings, from_rates, read_motion
@@ -86,7 +86,7 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
 def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = time_of(given, log), output_of(given, log)
     motion, begin = (read_motion(given.profile), time[0]) if given.profile else _reference(given, log, time)
-    time, known = time - begin, np.isfinite(output)
+    time, known = time - begin, _plausible(given, model, log)
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rates = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise, reference=_goodness(given), output=output[run])
@@ -97,12 +97,20 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = time_of(given, log), output_of(given, log)
-    known, rates = np.isfinite(output), compensate_log(with_self_calibration(model, None), log)
+    known, rates = _plausible(given, model, log), compensate_log(with_self_calibration(model, None), log)
     marking = MARKING if given.marking is None else given.marking * DEGREE
     found = calibrate_turns(time[known], rates[known], None if given.turns == NEAREST else given.turns,
                             noise=model.noise, marking=marking, output=output[known])
     data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rests), 'marking_rad': marking}
     return _answer(given, model, log, found.fit, known, 'turns', data, [_turned(found, marking)])
+
+
+def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
+    """Return which rows are used."""
+    found = plausible(model, log)
+    if not found.any() and np.isfinite(np.asarray(log.output)).any():
+        raise DataRefused(f'{given.log}: {none_plausible(model)}')
+    return found
 
 
 def _turned(found: Turns, marking: float) -> str:
@@ -125,8 +133,10 @@ def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, use
     if given.out:
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
     written = [f'Written to {given.out}.'] if given.out else []
-    return Answer('\n'.join([_first(calibration, int(used.sum())), *lines, *written]),
-                  {**calibration.figures(), 'samples': int(used.sum()), **data, 'out': given.out})
+    refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
+    said = [f'{refused} rows are not used: no such gyro reports that rate or temperature.'] if refused else []
+    return Answer('\n'.join([_first(calibration, int(used.sum())), *lines, *said, *written]),
+                  {**calibration.figures(), 'samples': int(used.sum()), 'refused_samples': refused, **data, 'out': given.out})
 
 
 def _first(calibration: SelfCalibration, samples: int) -> str:

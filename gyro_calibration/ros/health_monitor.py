@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
+from gyro_calibration.files import LARGEST
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.noise import Noise
@@ -198,9 +199,11 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
 
     Returns
     -------
-    what it showed; None where it is not steady, or has too few samples
+    what it showed; None where it is not steady, has too few samples, or values that no gyro means
 
     """
+    if max(np.abs(output).max(), np.abs(rate).max()) > LARGEST:
+        return None  # no gyro means that, and its square may be too large for a number
     interval = (time[-1] - time[0]) / (len(time) - 1)
     size = max(1, round(_BLOCK / interval))
     if len(time) < 20 * size or step == math.inf:

@@ -1,0 +1,328 @@
+"""
+No value poisons the state: all models of the catalogue, and all finite samples, temperatures and stamps.
+
+Hypothesis looks for values that break a claim. `make test` tries a fixed choice; GYRO_CALIBRATION_EXAMPLES multiplies their number, and
+lets them be chosen at random.
+
+"""
+
+import json
+import math
+import os
+
+import numpy as np
+import pytest
+
+from gyro_calibration.assumptions import Assumptions
+from gyro_calibration.bias_table import BiasTable
+from gyro_calibration.compensation import compensate
+from gyro_calibration.effects import CATALOGUE, Channels, rate_temperature_polynomial
+from gyro_calibration.heading import Threshold, ThresholdFilter, filter_rates
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import DEGREE, Log, write_log
+from gyro_calibration.log_compensation import LogCompensation, compensate_log
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.ros.health_monitor import Check
+from gyro_calibration.tracking import HeadingTracker, Settings
+
+hypothesis = pytest.importorskip('hypothesis', reason='hypothesis is not installed')
+st = hypothesis.strategies
+
+MORE = int(os.environ.get('GYRO_CALIBRATION_EXAMPLES', '1'))
+INTERVAL, NOW = 0.04, 1.7e9
+NOISE = Noise(7.3e-4, 8.7e-5)
+REST = simulate_noise(NOISE, 1500, INTERVAL, np.random.default_rng(0))  # a minute
+
+FINITE = st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.floats(-3.0, 3.0), st.sampled_from(
+    [0.0, 30.0, -30.0, 99.0, 500.0, -512.0, 1e16, -1e16, 1e155, 1e200, -1e308, 1.7e308]))
+DEGC = st.one_of(st.floats(-20.0, 60.0), FINITE, st.none())
+FORCE = st.one_of(st.none(), st.floats(-20.0, 20.0), FINITE)
+
+
+def tries(examples):
+    """Return the settings of a test that tries so many examples."""
+    return hypothesis.settings(
+        max_examples=examples * MORE, derandomize=MORE == 1, deadline=None, database=None,
+        suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture])
+
+
+def value(parameter, largest):
+    """Return values that a model file may hold for a parameter, most of them ordinary."""
+    if parameter.name.endswith('_scale') and largest < 1.0:
+        return st.floats(0.5, 3.0)
+    low, high = (min(max(bound, -largest), largest) for bound in parameter.bounds)
+    usual = st.floats(max(low, -0.05), min(high, 0.05)) if low <= 0.05 else st.just(low)
+    return st.one_of(usual, st.floats(low, high), st.sampled_from([low, high]))
+
+
+@st.composite
+def models(draw, largest=1e20, around=True):
+    """Return models with one effect of the catalogue or several, and values up to some size."""
+    polynomial = rate_temperature_polynomial(draw(st.integers(0, 4)), draw(st.integers(0, 3)))
+    effects = [polynomial, *(each for each in CATALOGUE.values() if around or each.looks_at <= {'rate', 'output', 'temperature'})]
+    chosen = draw(st.lists(st.sampled_from(effects), min_size=1, max_size=4, unique_by=lambda each: each.name))
+    terms = tuple(Term(each, tuple(draw(value(parameter, largest)) for parameter in each.parameters)) for each in chosen)
+    rates = draw(st.sampled_from([(-math.inf, math.inf), (-2.0, 2.0), (0.0, 0.0), (1.0, 2.0)]))
+    temperatures = draw(st.sampled_from([(-math.inf, math.inf), (10.0, 40.0)]))
+    calibration = draw(st.sampled_from([None, SelfCalibration(0.04, 0.002), SelfCalibration(-0.9, 3.0)]))
+    return GyroModel(terms, None, rates, temperatures, noise=NOISE, self_calibration=calibration)
+
+
+def every_effect_alone():
+    """Return models of each effect of the catalogue with each parameter at an end of its bounds, or at 1e20."""
+    for effect in [*CATALOGUE.values(), rate_temperature_polynomial(4, 3)]:
+        for end in (0, 1):
+            values = tuple(min(max(parameter.bounds[end], -1e20), 1e20) for parameter in effect.parameters)
+            yield pytest.param(GyroModel((Term(effect, values),), noise=NOISE), id=f'{effect.name} {end}')
+
+
+EXTREMES = [0.5, -1.5, 30.0, -30.0, 99.0, 500.0, 1e16, -1e155, 1e308, -1.7e308]
+
+
+@pytest.mark.parametrize('model', every_effect_alone())
+def test_every_effect_alone_gives_finite_rates(model):
+    for output in EXTREMES:
+        for temperature in (None, 25.0, -1e308, 1e308):
+            around = model.history().follow(0.0, temperature, 9.8, 5.0) if model.looks_around else None
+            done = compensate(model, output, temperature, around)
+            assert math.isfinite(done.rate) and math.isfinite(done.temperature) and (done.beyond_range or abs(output) < 100.0)
+
+
+@pytest.mark.parametrize(('cubic', 'output'), [(1e-5, 500.0), (1e-3, 30.0), (-1e-3, 30.0), (1e-3, 1e155), (-1e-5, 1e308)])
+def test_a_cubic_never_runs_away(cubic, output):
+    model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (cubic,)),))
+    one, many = compensate(model, output), compensate(model, np.array([output, 0.1]))
+    assert math.isfinite(one.rate) and one.rate == pytest.approx(many.rate[0], rel=1e-12)
+    explained = cubic > 0.0 and output < 100.0
+    assert one.beyond_range == many.beyond_range[0] == (not explained) and not many.beyond_range[1]
+    if explained:
+        assert one.rate + cubic * one.rate ** 3 == pytest.approx(output, rel=1e-12)
+
+
+@tries(150)
+@hypothesis.given(models(), st.lists(st.tuples(FINITE, st.one_of(st.floats(-20.0, 60.0), FINITE)), min_size=1, max_size=5))
+def test_every_output_gives_a_finite_rate(model, samples):
+    output, temperature = np.array(samples).T
+    time = np.arange(len(output)) * INTERVAL
+    around = model.history().follow(time, temperature, 0.0 * time + 9.8) if model.looks_around else None
+    done = compensate(model, output, temperature, around)
+    assert np.isfinite(done.rate).all() and np.isfinite(done.modelled).all() and np.isfinite(done.temperature).all()
+    assert np.broadcast_to(done.beyond_range, len(output))[np.abs(output) > model.rate_limit].all()
+    for one, degc in samples if not model.looks_around else ():
+        single = compensate(model, one, degc)
+        assert math.isfinite(single.rate) and math.isfinite(single.modelled)
+
+
+@tries(150)
+@hypothesis.given(models(0.1, around=False), st.lists(st.tuples(FINITE, st.floats(-20.0, 60.0)), min_size=1, max_size=5))
+def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inverted(model, samples):
+    output, temperature = np.array(samples).T
+    many = compensate(model, output, temperature)
+    for index, (one, degc) in enumerate(samples):
+        single = compensate(model, one, degc)
+        assert single.rate == pytest.approx(many.rate[index], rel=1e-9, abs=1e-9)
+        assert bool(single.beyond_range) == bool(many.beyond_range[index])
+        if not single.beyond_range:
+            modelled = Channels(single.modelled, one, single.temperature)
+            error = sum(term.error(modelled) for term in model.terms if not term.effect.undone)
+            assert single.modelled + error == pytest.approx(one, rel=1e-8, abs=1e-8)
+
+
+# streams
+
+def rest_for_a_minute(add, begin):
+    """Give a minute at rest, and return the time of its end."""
+    for index, rate in enumerate(REST.tolist()):
+        add(begin + INTERVAL * (index + 1), rate)
+    return begin + INTERVAL * len(REST)
+
+
+def estimator(model, **settings):
+    return HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(**settings), 10.0, NOW)
+
+
+def is_sound(live):
+    """Tell whether all that is published is a number."""
+    shown = live.heading, live.variance, live.rate, live.rate_variance, live.deleted, *live.bias
+    return all(map(math.isfinite, shown)) and live.variance >= 0.0
+
+
+SAMPLES = st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, DEGC, FORCE), max_size=30)
+
+
+@tries(60)
+@hypothesis.given(models(), SAMPLES, st.sampled_from([0.0, 0.1]))
+def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(model, samples, false_alarms):
+    live, time = estimator(model, false_alarms=false_alarms, threshold=Threshold(0.3 * DEGREE)), 0.0
+    for step, output, degc, force in samples:
+        time = time + step if math.isfinite(time + step) else step
+        if degc is not None:
+            live.hear_temperature(time, degc)
+        live.add(time, output, NOW, force)
+        assert is_sound(live.tracker) and math.isfinite(live.corrected)
+    live.learn(NOW, ending=True)
+    begin = time if abs(time) < 1e9 else 0.0
+    for index in range(100):
+        live.add(begin + INTERVAL * (index + 1), 0.0, NOW)
+    live.reset()
+    assert is_sound(live.tracker) and abs(live.tracker.heading) < 1e-12
+
+
+ABSURD = FINITE.filter(lambda rate: abs(rate) > 100.0)
+
+
+@tries(12)
+@hypothesis.given(st.lists(st.tuples(st.integers(0, 1499), ABSURD, DEGC, st.booleans()), max_size=40))
+def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(absurd):
+    model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (1e-3,)),), noise=NOISE,
+                      self_calibration=SelfCalibration(0.0, 0.0, ((1e-8, 0.0), (0.0, 1e-8))))
+    live, places = estimator(model), {place: rest for place, *rest in absurd}
+    rate = 0.5 * np.sin(np.arange(1500) * INTERVAL) + REST
+    for place, output in enumerate((rate + 1e-3 * rate ** 3).tolist()):
+        other, degc, temperature_alone = places.get(place, (output, 25.0, False))
+        live.hear_temperature(INTERVAL * place, 25.0 if degc is None else degc)
+        live.add(INTERVAL * place, output if temperature_alone else other, NOW)
+    assert live.refused == sum(not each[2] for each in places.values()) and live.tracker.rebuilt == 0
+    turned = 0.5 * (1.0 - math.cos(INTERVAL * 1499))
+    rest_for_a_minute(lambda time, output: live.add(time, output, NOW), INTERVAL * 1499)
+    assert abs(live.tracker.heading - turned) < 4.5 * math.sqrt(live.tracker.variance)
+
+
+@tries(12)
+@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE), max_size=40), st.sampled_from([0.0, 0.1]))
+def test_no_stream_leaves_a_tracker_with_something_that_is_no_number(samples, false_alarms):
+    tracker, time = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings(false_alarms, Threshold(0.3 * DEGREE))), 0.0
+    for step, rate in samples:
+        time = time + step if math.isfinite(time + step) else step
+        tracker.add(time, rate, np.array([0.0 if abs(rate) > 1e9 else -rate, -1.0]))
+        assert is_sound(tracker)
+    end = rest_for_a_minute(lambda at, rate: tracker.add(at, rate, np.array([0.0, -1.0])), 0.0)
+    assert is_sound(tracker)
+    tracker.reset()
+    assert tracker.heading == 0.0 and tracker.variance < 1e-3
+    rest_for_a_minute(lambda at, rate: tracker.add(at, rate, np.array([0.0, -1.0])), end)
+    assert abs(tracker.heading) <= 4.5 * math.sqrt(tracker.variance)
+
+
+@pytest.mark.parametrize('place', ['sensitivity', 'mean', 'covariance'])
+def test_a_state_that_is_not_finite_is_said_and_built_anew_with_the_last_heading(place):
+    tracker = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings())
+    for index in range(500):
+        tracker.add(INTERVAL * index, 0.3, np.array([-0.3, -1.0]))
+    heading, variance, said = tracker.heading, tracker.variance, []
+    if place == 'sensitivity':
+        said.append(tracker.add(INTERVAL * 500, 0.3, np.array([math.nan, -1.0])))
+    else:
+        getattr(tracker._drift, place)[1] = math.nan
+    said += [tracker.add(INTERVAL * (501 + index), 0.3, np.array([-0.3, -1.0])) for index in range(200)]
+    assert tracker.rebuilt == 1 and sum(map(bool, said)) == 1 and is_sound(tracker)
+    assert abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5 and tracker.variance > variance + 1.0
+
+
+@tries(80)
+@hypothesis.given(st.lists(st.tuples(st.floats(1e-3, 0.3), FINITE), min_size=1, max_size=60), st.sampled_from([0.0, 0.2]),
+                  st.sampled_from([0.0, 7.3e-4]))
+def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk):
+    settings = Threshold(0.3 * DEGREE, window, walk)
+    live, time = ThresholdFilter(settings), np.cumsum([step for step, _ in samples])
+    rate = np.array([0.1 * each if abs(each) < 3.0 else each for _, each in samples])
+    found = [live.filter(*sample) for sample in zip(time.tolist(), rate.tolist())]
+    for index, at in enumerate(time):
+        begin = min(int(np.searchsorted(time, at - window, side='right')), index)
+        fresh = ThresholdFilter(settings)
+        alone = [fresh.filter(*sample) for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
+        assert found[index] == alone[-1]
+    assert filter_rates(settings, time, rate).tolist() == found
+
+
+@tries(40)
+@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE), max_size=300))
+def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
+    check, time = Check(NOISE, 1e-3), 0.0
+    for step, output, rate in samples:
+        time = time + step if math.isfinite(time + step) else step
+        if check.add(time, output, rate):
+            check.examine(1e-8, 0.0)
+    check.restart()
+    complete = []
+    rest_for_a_minute(lambda at, rate: complete.append(check.examine(1e-8, 0.0)) if check.add(at, rate, rate) else None, 0.0)
+    assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio) and rest.noise_fits for rest in complete)
+
+
+@tries(60)
+@hypothesis.given(st.lists(st.tuples(DEGC.filter(lambda degc: degc is not None), FINITE, st.floats(0.0, 1.7e308), FINITE), max_size=12),
+                  FINITE, FINITE)
+def test_a_bias_table_stays_finite(rests, temperature, time):
+    table = BiasTable(GyroModel(noise=NOISE))
+    for degc, bias, variance, when in rests:
+        table.add(degc, bias, variance, when)
+    bias, variance = table.predict(temperature, time)
+    assert math.isfinite(bias) and (variance >= 0.0 if table.entries else variance == math.inf)
+    assert all(map(math.isfinite, table.difference(temperature, 25.0, time)))
+
+
+# verbs
+
+COLUMN = st.one_of(st.floats(-1e20, 1e20), st.floats(-3.0, 3.0), st.sampled_from([500.0, 1e16, -1e20, math.nan]))
+TURNING = np.concatenate([np.zeros(100), np.full(150, 0.7), np.zeros(100), np.full(150, -0.7), np.zeros(100)])
+MODELS = ['effects: {bias: {bias: 0.002}}\nnoise: {angle_random_walk: 7.3e-4}',
+          'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\nvalid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}']
+
+
+def absurd_log(changes):
+    """Return a log of a robot that turns both ways, with some values changed."""
+    time = np.arange(len(TURNING)) * INTERVAL
+    output, temperature = TURNING + REST[:len(time)], np.full(len(time), 25.0)
+    for place, rate, degc in changes:
+        output[place], temperature[place] = rate, degc
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * INTERVAL * (TURNING[1:] + TURNING[:-1]))])
+    return Log(output=output, time=time, temperature=temperature, reference_rate=TURNING, reference_heading=heading)
+
+
+CHANGES = st.lists(st.tuples(st.integers(0, len(TURNING) - 1), COLUMN, st.one_of(st.just(25.0), st.floats(-1e5, 1e5))), max_size=20)
+
+
+def no_constant(name):
+    raise AssertionError(f'{name} is no JSON')
+
+
+@pytest.mark.parametrize('verb', [('compensate', '--out'), ('compensate', '--rest', '--out'), ('compensate', '--hindsight', '--out'),
+                                  ('turn', ), ('self-calibrate', )], ids=' '.join)
+@pytest.mark.parametrize('text', MODELS, ids=['bias', 'cubic'])
+def test_the_verbs_answer_in_json_whatever_a_log_holds(run, tmp_path, verb, text):
+    (tmp_path / 'model.yaml').write_text(text)
+    out = [tmp_path / 'out.csv'] if '--out' in verb else []
+
+    @tries(6)
+    @hypothesis.given(CHANGES)
+    def holds(changes):
+        write_log(tmp_path / 'log.csv', absurd_log(changes))
+        code, said, problem = run(verb[0], tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json', *verb[1:], *out)
+        assert code in (0, 1), problem
+        if code == 0:
+            assert json.loads(said, parse_constant=no_constant)
+        else:
+            assert problem.count('\n') == 1 and problem.startswith('gyro_calibration: ')
+
+    holds()
+
+
+def test_a_log_with_a_lost_decimal_point_keeps_its_heading_and_counts_the_row(run, tmp_path):
+    (tmp_path / 'model.yaml').write_text(MODELS[1])
+    headings = []
+    for changes in ([], [(200, 700.0, 25.0), (300, 1e155 ** 0.1, 25.0), (400, 0.0, 9e4)]):
+        write_log(tmp_path / 'log.csv', absurd_log(changes))
+        code, said, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv', '--json')
+        answer = json.loads(said)
+        assert code == 0 and answer['refused_samples'] == len(changes) == answer['lost_samples']
+        headings.append((answer['heading_rad'], answer['heading_std_rad']))
+    (whole, sure), (gaps, less) = headings
+    assert abs(whole - gaps) < 3.0 * less and less > sure
+
+
+def test_a_log_is_compensated_without_its_absurd_rows():
+    model, log = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (-1e-3,)),)), absurd_log([(7, 1e20, 25.0), (8, 0.1, -1e5)])
+    rate = compensate_log(model, log)
+    assert np.flatnonzero(np.isnan(rate)).tolist() == [7, 8]
+    assert np.isfinite(LogCompensation(model).add(log)[0].rate).all(), 'asked for all the same, they stay finite'
