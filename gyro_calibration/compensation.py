@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,24 +52,36 @@ def compensate(model: GyroModel, output: Number, temperature: Number | None = No
 
     """
     given = model.reference_temperature if temperature is None else temperature
-    if isinstance(output, np.ndarray) and surroundings is None:
-        return _by_blocks(model, output, given)
-    return _compensated(model, output, given, surroundings)
+    if not isinstance(output, np.ndarray):
+        return _of_one(model, output, given, surroundings)
+    return _by_blocks(model, output, given) if surroundings is None else _compensated(model, output, given, surroundings)
 
 
-def _compensated(model: GyroModel, output: Number, given: Number, surroundings: Channels | None = None) -> Compensated:
-    low, high = model.used_temperatures
-    used, limit, many = clip(given, low, high), model.rate_limit, isinstance(output, np.ndarray)
+def _of_one(model: GyroModel, output: float, given: float, surroundings: Channels | None) -> Compensated:
+    """Compensate a sample that comes alone, with the same result as in a log."""
+    (low, high), (slowest, fastest), limit = model.used_temperatures, model.rate_range, model.rate_limit
+    used, seen = min(max(given, low), high), min(max(output, -limit), limit)
+    modelled, unexplained = model.rate_in(Channels.of(seen, seen, used) if surroundings is None else surroundings.moving(seen, seen))
+    if not -_LARGEST < modelled < _LARGEST:
+        modelled, unexplained = seen, True
+    rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
+    if seen != output:
+        modelled, rate, unexplained = modelled + (output - seen), rate + (output - seen), True
+    return Compensated(modelled, rate, used, used != given, unexplained or not slowest <= output <= fastest)
+
+
+def _compensated(model: GyroModel, output: Array, given: Number, surroundings: Channels | None = None) -> Compensated:
+    used, limit = clip(given, *model.used_temperatures), model.rate_limit
     slowest, fastest = model.rate_range
     beyond = (output < max(slowest, -limit)) | (output > min(fastest, limit))
-    seen = clip(output, -limit, limit) if (beyond.any() if many else beyond) else output
-    with np.errstate(all='ignore') if many else nullcontext():
+    seen = np.clip(output, -limit, limit) if beyond.any() else output
+    with np.errstate(all='ignore'):
         modelled, unexplained = model.rate_in(
             Channels(seen, seen, used) if surroundings is None else surroundings.moving(seen, seen))
-        if not -_LARGEST < (modelled.sum() if many else modelled) < _LARGEST:
+        if not -_LARGEST < modelled.sum() < _LARGEST:
             # the model itself cannot be computed there: nothing is corrected
             computed = abs(modelled) < _LARGEST
-            modelled, unexplained = np.where(computed, modelled, seen) if many else seen, unexplained | ~computed if many else True
+            modelled, unexplained = np.where(computed, modelled, seen), unexplained | ~computed
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)
@@ -109,7 +120,9 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
         rows = [0.0 if term.effect.undone else row / steepness for term in model.terms for row in term.sensitivity(channels)]
     if calibration is not None:
         rows += [rate, 1.0]
-    sensitivity = np.empty((len(rows), *np.shape(rate)))
+    if not isinstance(rate, np.ndarray):
+        return np.array(rows, dtype=float) * (-1.0 if calibration is None else -calibration.scale)
+    sensitivity = np.empty((len(rows), *rate.shape))
     for index, row in enumerate(rows):
         sensitivity[index] = row
     return sensitivity * (-1.0 if calibration is None else -calibration.scale)

@@ -312,14 +312,15 @@ class HeadingEstimator:
             self._hear_again(now, around)
         self.last = result = compensate(self.used, output, self.temperature, around)
         gone, distance = self._gone(time)
-        calibration = self.used.self_calibration
-        rate = float(result.rate) - gone * (1.0 if calibration is None else calibration.scale)
+        calibration, tracker = self.used.self_calibration, self.tracker
+        rate = float(result.rate)
+        if gone:
+            rate -= gone * (1.0 if calibration is None else calibration.scale)
         if abs(time - self._still_at) > _STILL:
             self._still, self._still_at = self._sensitive(output, 0.0, around, distance), time
         self._look_at(time, output, float(result.rate), around, distance)
-        said = self.tracker.add(time, rate, self._sensitivity, wheels, self._still)
-        self.corrected = rate
-        self.rate = self.tracker.rate
+        said = tracker.add(time, rate, self._sensitivity, wheels, self._still)
+        self.corrected, self.rate = rate, tracker.rate
         self._gather(time, bool(said))
         return said
 

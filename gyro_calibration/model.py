@@ -23,6 +23,8 @@ _FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
 _TEMPERATURES = (-100.0, 200.0)
 #: The response is inverted where the output grows by at least so much with the rate, 1.
 _FLATTEST = 0.1
+#: Numbers of Python overflow without a word, and to say so for each sample would take time.
+_AS_IT_IS = nullcontext()
 #: The last step of the repetition, as a part of 1 rad/s and of the rate, that is taken for a solution; the error is far smaller.
 _SETTLED = 1e-10
 
@@ -40,9 +42,14 @@ class Term:
 
     def error(self, channels: Channels) -> Number:
         """Return what the effect adds to the output, rad/s."""
-        return self.effect.error(channels, self.values)
+        return self.adding(channels)
 
-    @property
+    @cached_property
+    def adding(self) -> Callable[[Channels], Number]:
+        """Return the function of the channels that gives what the effect adds to the output, rad/s."""
+        return self.effect.adding(self.values)
+
+    @cached_property
     def fitted(self) -> tuple[int, ...]:
         """Return the places of the values that a fit finds: those of the parameters without a default."""
         return tuple(place for place, parameter in enumerate(self.effect.parameters) if parameter.default is None)
@@ -259,7 +266,14 @@ class GyroModel:
         given = output - _sum(known, channels)
         if not sought:
             return given, False
-        return _inverse(lambda rate: _sum(sought, channels.moving(rate, output)), given, output, self.rate_domain)
+        seen = channels.moving(output, output)
+
+        def added(rate: Number) -> Number:
+            # only here is it known, and to make new channels would take as long as to compute with them
+            seen.__dict__['rate'] = rate
+            return _sum(sought, seen)
+
+        return _inverse(added, given, output, self.rate_domain)
 
     def distorted(self, stage: str, signal: Array, time: Array) -> Array:
         """Return the signal of a whole log after the effects that change it at a stage, 'rate' or 'output'."""
@@ -295,7 +309,10 @@ def _parted(terms: Sequence[Term], channel: str) -> Parted:
 
 
 def _sum(terms: Sequence[Term], channels: Channels) -> Number:
-    return sum(term.error(channels) for term in terms)
+    total: Number = 0.0
+    for term in terms:
+        total = total + term.adding(channels)
+    return total
 
 
 def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf, high: float = math.inf) -> tuple[Number, Number]:
@@ -340,7 +357,7 @@ def _inverse(added: Callable[[Number], Number], given: Number, start: Number, do
     """
     low, high = domain
     many = isinstance(given, np.ndarray)
-    with np.errstate(all='ignore') if many else nullcontext():
+    with np.errstate(all='ignore') if many else _AS_IT_IS:
         # a single sample may step out of the domain and back, but not so far that nothing can be computed
         rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
         solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
