@@ -1,20 +1,33 @@
 """
-What stands between the true rate and the output of a gyro: the only place where an effect's formula stands.
+What stands between the true rate and the output of a gyro: the one place of each formula.
 
-Simulation, calibration, diagnosis and compensation meet here. Most effects add ``sum(columns(channels, *shapes) * values)`` to the
-output. Some are nothing that is added: they change the signal itself, such as a delay, or rounding.
+Simulation, calibration, diagnosis and compensation meet here. Most effects add
+``sum(columns(channels, *shapes) * values)`` to the output. Others change the signal itself, such
+as a delay, or rounding.
 
-Reading order, each imports only from those before it: `effect` (the records: channels, parameters, effects), `lag` (of first order),
-`steady` (of rate and temperature alone, as a rate table shows them), `polynomial` (of Ojeda, Chung and Borenstein), `thermal` (what
-temperatures of the past leave), `course` (of the time since power-on), `surroundings` (magnetic, mechanical, electrical), `signal` (what
-is done to the signal itself).
+Reading order, each imports only from those before it: `effect` (the records: channels, parameters,
+effects), `lag` (of first order), `steady` (of rate and temperature alone, as a rate table shows
+them), `polynomial` (of Ojeda, Chung and Borenstein), `thermal` (what temperatures of the past
+leave), `course` (of the time since power-on), `surroundings` (magnetic, mechanical, electrical),
+`signal` (what is done to the signal itself).
 
 """
 
 from gyro_calibration.effects.course import BIAS_STEP, INTERFERENCE_TONE, RATE_RAMP, WARM_UP
 from gyro_calibration.effects.effect import Channels, Effect, Parameter
-from gyro_calibration.effects.polynomial import polynomial_from_matrix, polynomial_to_matrix, rate_temperature_polynomial
-from gyro_calibration.effects.signal import BANDWIDTH, CLOCK_RATE, DEAD_ZONE, QUANTIZATION, SATURATION, TIME_OFFSET
+from gyro_calibration.effects.polynomial import (
+    polynomial_from_matrix,
+    polynomial_to_matrix,
+    rate_temperature_polynomial,
+)
+from gyro_calibration.effects.signal import (
+    BANDWIDTH,
+    CLOCK_RATE,
+    DEAD_ZONE,
+    QUANTIZATION,
+    SATURATION,
+    TIME_OFFSET,
+)
 from gyro_calibration.effects.steady import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -26,23 +39,31 @@ from gyro_calibration.effects.steady import (
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
 )
-from gyro_calibration.effects.surroundings import ACCELERATION_SENSITIVITY, HEADING_SENSITIVITY, SUPPLY_SENSITIVITY, VIBRATION_RECTIFICATION
+from gyro_calibration.effects.surroundings import (
+    ACCELERATION_SENSITIVITY,
+    HEADING_SENSITIVITY,
+    SUPPLY_SENSITIVITY,
+    VIBRATION_RECTIFICATION,
+)
 from gyro_calibration.effects.thermal import BIAS_TEMPERATURE_RATE, THERMAL_HYSTERESIS, THERMAL_LAG
 from gyro_calibration.log import Number
 
 #: Those of rate and temperature alone, which dwells of a rate table can show.
 STEADY = {effect.name: effect for effect in (
-    BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY, SINE_RESPONSE,
-    BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
+    BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY,
+    SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
 #: All that a model may hold, beside the polynomial.
 CATALOGUE = STEADY | {effect.name: effect for effect in (
-    BIAS_TEMPERATURE_RATE, THERMAL_LAG, THERMAL_HYSTERESIS, WARM_UP, RATE_RAMP, BIAS_STEP, HEADING_SENSITIVITY, ACCELERATION_SENSITIVITY,
-    VIBRATION_RECTIFICATION, SUPPLY_SENSITIVITY, INTERFERENCE_TONE, BANDWIDTH, TIME_OFFSET, CLOCK_RATE, DEAD_ZONE, SATURATION,
-    QUANTIZATION)}
+    BIAS_TEMPERATURE_RATE, THERMAL_LAG, THERMAL_HYSTERESIS, WARM_UP, RATE_RAMP, BIAS_STEP,
+    HEADING_SENSITIVITY, ACCELERATION_SENSITIVITY, VIBRATION_RECTIFICATION, SUPPLY_SENSITIVITY,
+    INTERFERENCE_TONE, BANDWIDTH, TIME_OFFSET, CLOCK_RATE, DEAD_ZONE, SATURATION, QUANTIZATION)}
 
 __all__ = [
-    'ACCELERATION_SENSITIVITY', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE', 'BIAS_TEMPERATURE_QUADRATIC', 'BIAS_TEMPERATURE_RATE',
-    'CATALOGUE', 'CLOCK_RATE', 'CUBIC_NONLINEARITY', 'DEAD_ZONE', 'HEADING_SENSITIVITY', 'INTERFERENCE_TONE', 'QUADRATIC_NONLINEARITY',
-    'QUANTIZATION', 'RATE_RAMP', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY', 'SCALE_FACTOR_ERROR', 'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE',
-    'STEADY', 'SUPPLY_SENSITIVITY', 'THERMAL_HYSTERESIS', 'THERMAL_LAG', 'TIME_OFFSET', 'VIBRATION_RECTIFICATION', 'WARM_UP', 'Channels',
-    'Effect', 'Number', 'Parameter', 'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']
+    'ACCELERATION_SENSITIVITY', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE',
+    'BIAS_TEMPERATURE_QUADRATIC', 'BIAS_TEMPERATURE_RATE', 'CATALOGUE', 'CLOCK_RATE',
+    'CUBIC_NONLINEARITY', 'DEAD_ZONE', 'HEADING_SENSITIVITY', 'INTERFERENCE_TONE',
+    'QUADRATIC_NONLINEARITY', 'QUANTIZATION', 'RATE_RAMP', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY',
+    'SCALE_FACTOR_ERROR', 'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STEADY',
+    'SUPPLY_SENSITIVITY', 'THERMAL_HYSTERESIS', 'THERMAL_LAG', 'TIME_OFFSET',
+    'VIBRATION_RECTIFICATION', 'WARM_UP', 'Channels', 'Effect', 'Number', 'Parameter',
+    'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']

@@ -17,13 +17,14 @@ def _warm_up(channels: Channels, time_constant: float) -> Sequence[Number]:
 
 WARM_UP = Effect(
     'warm_up', 'After power-on the bias settles exponentially.',
-    frozenset({'time'}), (Parameter('warm_up', 'rad/s'),), _warm_up, (Parameter('time_constant', 's', bounds=(1.0, 1e5)),),
-    'start cold, and start warm')
+    frozenset({'time'}), (Parameter('warm_up', 'rad/s'),), _warm_up,
+    (Parameter('time_constant', 's', bounds=(1.0, 1e5)),), 'start cold, and start warm')
 
 
 RATE_RAMP = Effect(
     'rate_ramp', 'The bias grows steadily with time.',
-    frozenset({'time'}), (Parameter('rate_ramp', 'rad/s²'),), lambda channels: (channels.time + 0.0 * channels.rate,),
+    frozenset({'time'}), (Parameter('rate_ramp', 'rad/s²'),),
+    lambda channels: (channels.time + 0.0 * channels.rate,),
     shown_by='let it run several times, heating in one and cooling in another')
 
 
@@ -33,8 +34,8 @@ def _bias_step(channels: Channels, step_time: float) -> Sequence[Number]:
 
 BIAS_STEP = Effect(
     'bias_step', 'At one moment the bias becomes another one.',
-    frozenset({'time'}), (Parameter('bias_step', 'rad/s'),), _bias_step, (Parameter('step_time', 's', bounds=(0.0, 1e9)),),
-    'run again: it happens once')
+    frozenset({'time'}), (Parameter('bias_step', 'rad/s'),), _bias_step,
+    (Parameter('step_time', 's', bounds=(0.0, 1e9)),), 'run again: it happens once')
 
 
 def _interference_tone(channels: Channels, frequency: float) -> Sequence[Number]:
@@ -43,6 +44,8 @@ def _interference_tone(channels: Channels, frequency: float) -> Sequence[Number]
 
 
 INTERFERENCE_TONE = Effect(
-    'interference_tone', 'Something periodic gets into the output, or folds down from above half the sample rate.',
-    frozenset({'time'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')), _interference_tone,
-    (Parameter('frequency', 'Hz', bounds=(1e-4, 1e5)),), 'sample at another rate: an alias moves, a tone stays')
+    'interference_tone',
+    'Something periodic gets into the output, or folds down from above half the sample rate.',
+    frozenset({'time'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
+    _interference_tone, (Parameter('frequency', 'Hz', bounds=(1e-4, 1e5)),),
+    'sample at another rate: an alias moves, a tone stays')

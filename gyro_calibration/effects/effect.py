@@ -15,8 +15,9 @@ class Channels:
     """
     What an effect may look at, of one instant (numbers) or of many (arrays of shape (n,)).
 
-    What needs more than one instant is made by `history`: the channels ``lagged`` and ``heating``. Without them nothing is known of the
-    past, and everything is taken to have been as it is for ever.
+    What needs more than one instant is made by `history`: the channels ``lagged`` and ``heating``.
+    Without them nothing is known of the past, and everything is taken to have been as it is for
+    ever.
 
     Attributes
     ----------
@@ -27,9 +28,11 @@ class Channels:
     specific_force : along the input axis, m/s²
     supply : V; None where it is not known
     heading : rad
-    lagged : (channel, time constant) -> the channel through a first-order lag; channels are 'temperature', 'specific_force', and
-        'vibration', the squared deviation of the specific force from its own mean over 1 s
-    heating : (filter time, threshold) -> 1 since the temperature rose, -1 since it fell, and 0 before either was known; s and K/s
+    lagged : (channel, time constant) -> the channel through a first-order lag; channels are
+        'temperature', 'specific_force', and 'vibration', the squared deviation of the specific
+        force from its own mean over 1 s
+    heating : (filter time, s, threshold, K/s) -> 1 since the temperature rose, -1 since it fell,
+        and 0 before either was known
 
     """
 
@@ -65,9 +68,10 @@ class Channels:
 @dataclass(frozen=True)
 class Parameter:
     """
-    A coefficient or a shape parameter: its name, unit, the value taken where none is given, and its bounds.
+    A coefficient or a shape: its name, unit, the value taken where none is given, and its bounds.
 
-    A shape with a default is a convention, such as a temperature to count from; one without is a property of the gyro, and is fitted.
+    A shape with a default is a convention, such as a temperature to count from; one without is a
+    property of the gyro, and is fitted.
 
     """
 
@@ -96,9 +100,12 @@ class Effect:
     columns : (channels, *shapes) -> one column a coefficient
     shapes : what the columns depend on, other than the channels
     shown_by : what to do so that data show it, apart from what looks like it
-    nested : (channels, shapes, coefficients) -> the sum of the columns times the coefficients, where there is a shorter way to it
-    distortion : (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing but changes the signal itself
-    stage : of the distortion: 'rate' before anything is added to the rate, or 'output' after the noise
+    nested : (channels, shapes, coefficients) -> the sum of the columns times the coefficients,
+        where there is a shorter way to it
+    distortion : (signal, time, *values) -> signal, of a whole log, for an effect that adds nothing
+        but changes the signal itself
+    stage : of the distortion: 'rate' before anything is added to the rate, or 'output' after the
+        noise
     moved : (time, *values) -> time, of an effect that is undone by moving the stamps
     undone : what of the effect compensation cannot undo, as a sentence; '' where it undoes all
 
@@ -123,11 +130,11 @@ class Effect:
         return self.shapes + self.coefficients
 
     def error(self, channels: Channels, values: Sequence[float]) -> Number:
-        """Return what the effect adds to the output, rad/s, with these values of its parameters."""
+        """Return what the effect adds to the output, rad/s, with these parameters."""
         return self.adding(values)(channels)
 
     def adding(self, values: Sequence[float]) -> Callable[[Channels], Number]:
-        """Return the function of the channels that gives what the effect adds to the output, rad/s, with these values."""
+        """Return a function of channels: what the effect adds to the output, rad/s."""
         shapes, coefficients = values[:len(self.shapes)], values[len(self.shapes):]
         nested, columns = self.nested, self.columns
         if nested is not None:
@@ -135,4 +142,5 @@ class Effect:
         if len(coefficients) == 1:
             value, = coefficients
             return lambda channels: value * columns(channels, *shapes)[0]
-        return lambda channels: sum(value * column for value, column in zip(coefficients, columns(channels, *shapes)))
+        return lambda channels: sum(
+            value * column for value, column in zip(coefficients, columns(channels, *shapes)))

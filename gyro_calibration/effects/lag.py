@@ -1,8 +1,9 @@
 """
-A lag of first order, ``time_constant * d(lagged)/dt = signal - lagged``, exact for a signal that is linear between its samples.
+A lag of first order, exact for a signal that is linear between its samples.
 
-It is followed by what the lagged signal is ahead of the signal. That decays by exp(-x) over an interval of x time constants, and a change
-of the signal by d over the interval takes ``d (1 - exp(-x)) / x`` away from it.
+It obeys ``time_constant * d(lagged)/dt = signal - lagged``. It is followed by what the lagged
+signal is ahead of the signal. That decays by exp(-x) over an interval of x time constants, and a
+change of the signal by d over the interval takes ``d (1 - exp(-x)) / x`` away from it.
 
 """
 
@@ -17,7 +18,8 @@ from gyro_calibration.log import Array, Number
 _SMALLEST = 1e-300  # intervals of no length leave the formulas a number
 
 
-def lag_ahead(interval: Number, change: Number, time_constant: float, ahead: float = 0.0) -> Number:
+def lag_ahead(interval: Number, change: Number, time_constant: float,
+              ahead: float = 0.0) -> Number:
     """
     Return what a lagged signal is ahead of the signal, of one instant or of many (shape (n,)).
 
@@ -39,14 +41,16 @@ def lag_ahead(interval: Number, change: Number, time_constant: float, ahead: flo
 
 def lagged_signal(signal: Array, time: Array, time_constant: float) -> Array:
     """Return a signal, shape (n,), through a lag that starts in its first value."""
-    return signal + lag_ahead(np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1]), time_constant)
+    interval, change = np.diff(time, prepend=time[:1]), np.diff(signal, prepend=signal[:1])
+    return signal + lag_ahead(interval, change, time_constant)
 
 
 def _recurrence(factors: Array, added: Array, before: float) -> Array:
     """
     Return y of ``y[k] = factors[k] * y[k - 1] + added[k]``, shape (n,).
 
-    Rows of sqrt(n) samples go on side by side, each from zero; then each gets what the row before it has come to.
+    Rows of sqrt(n) samples go on side by side, each from zero; then each gets what the row before
+    it has come to.
 
     """
     count = len(factors)

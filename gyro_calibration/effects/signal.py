@@ -1,4 +1,9 @@
-"""Effects on the signal itself. All but the dead zone are functions of the whole signal, and add no column."""
+"""
+Effects on the signal itself.
+
+All but the dead zone are functions of the whole signal, and add no column.
+
+"""
 
 from __future__ import annotations
 
@@ -17,7 +22,8 @@ _FAST_REVERSALS = 'reverse quickly: a delay leaves the size of the swing as it i
 
 
 def _at(when: Array, time: Array, signal: Array) -> Array:
-    """Return a signal at other times; beyond its ends it stays. Straight lines between samples would look like a delay in quick motion."""
+    """Return a signal at other times; beyond its ends it stays."""
+    # Straight lines between samples would look like a delay in quick motion.
     return np.asarray(CubicSpline(time, signal)(np.clip(when, time[0], time[-1])))
 
 
@@ -31,8 +37,8 @@ def _delayed(signal: Array, time: Array, offset: float) -> Array:
 
 TIME_OFFSET = Effect(
     'time_offset', 'The stamps of the samples are late by a constant time.',
-    frozenset(), (), nothing_added, (Parameter('time_offset', 's', bounds=(-1.0, 1.0)),), _FAST_REVERSALS,
-    distortion=_delayed, stage='rate', moved=_earlier,
+    frozenset(), (), nothing_added, (Parameter('time_offset', 's', bounds=(-1.0, 1.0)),),
+    _FAST_REVERSALS, distortion=_delayed, stage='rate', moved=_earlier,
     undone='It is undone by moving the stamps; what is late for a controller stays late.')
 
 
@@ -49,19 +55,22 @@ CLOCK_RATE = Effect(
     frozenset(), (), nothing_added, (Parameter('clock_rate', '1', bounds=(-0.1, 0.1)),),
     'record a long log with quick motion at both ends',
     distortion=_hastened, stage='rate', moved=_stretched,
-    undone='It is undone by stretching the stamps of a log; a robot stamps by its own clock, where nothing is to be undone.')
+    undone='It is undone by stretching the stamps of a log; a robot stamps by its own clock, '
+           'where nothing is to be undone.')
 
 
 def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
-    """Return the signal through a lag, which takes it for straight between points closer than the samples."""
-    finer = np.interp(np.arange(FINER * (len(time) - 1) + 1) / FINER, np.arange(len(time)), time)
+    """Return the signal through a lag that takes it for straight between `FINER` points."""
+    count = len(time)
+    finer = np.interp(np.arange(FINER * (count - 1) + 1) / FINER, np.arange(count), time)
     return lagged_signal(_at(finer, time, signal), finer, time_constant)[::FINER]
 
 
 BANDWIDTH = Effect(
     'bandwidth', 'The output follows the rate through a first-order lag.',
-    frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-5, 10.0)),), _FAST_REVERSALS,
-    distortion=_lagged, stage='rate', undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
+    frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-5, 10.0)),),
+    _FAST_REVERSALS, distortion=_lagged, stage='rate',
+    undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
 
 
 def _dead_zone(channels: Channels, dead_zone: float) -> Sequence[Number]:
@@ -81,8 +90,9 @@ def _clipped(signal: Array, _time: Array, limit: float) -> Array:
 
 SATURATION = Effect(
     'saturation', 'The output cannot go beyond a limit.',
-    frozenset(), (), nothing_added, (Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),), 'turn faster than the limit',
-    distortion=_clipped, stage='output', undone='At the limit, nothing is known of the rate but that it is beyond.')
+    frozenset(), (), nothing_added, (Parameter('saturation', 'rad/s', bounds=(1e-3, 1e3)),),
+    'turn faster than the limit', distortion=_clipped, stage='output',
+    undone='At the limit, nothing is known of the rate but that it is beyond.')
 
 
 def _rounded(signal: Array, _time: Array, step: float) -> Array:
@@ -91,5 +101,6 @@ def _rounded(signal: Array, _time: Array, step: float) -> Array:
 
 QUANTIZATION = Effect(
     'quantization', 'The output comes in steps.',
-    frozenset(), (), nothing_added, (Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),), 'look at the set of codes',
-    distortion=_rounded, stage='output', undone='What was rounded away is lost; noise above half a step keeps its mean.')
+    frozenset(), (), nothing_added, (Parameter('quantization', 'rad/s', bounds=(1e-12, 1.0)),),
+    'look at the set of codes', distortion=_rounded, stage='output',
+    undone='What was rounded away is lost; noise above half a step keeps its mean.')

@@ -36,20 +36,23 @@ def _sine_response(channels: Channels, k: float) -> Sequence[Number]:
 
 SCALE_FACTOR_ASYMMETRY = Effect(
     'scale_factor_asymmetry', 'The scale factor differs between the two senses of rotation.',
-    frozenset({'rate'}), (Parameter('scale_factor_asymmetry', '1'),), lambda channels: (abs(channels.rate),),
+    frozenset({'rate'}), (Parameter('scale_factor_asymmetry', '1'),),
+    lambda channels: (abs(channels.rate),),
     shown_by='turn both ways at many speeds, slow ones and rest too')
 
 
 QUADRATIC_NONLINEARITY = Effect(
     'quadratic_nonlinearity', 'The output has a part that grows with the square of the rate.',
-    frozenset({'rate'}), (Parameter('quadratic_nonlinearity', 's/rad'),), lambda channels: (channels.rate * channels.rate,),
+    frozenset({'rate'}), (Parameter('quadratic_nonlinearity', 's/rad'),),
+    lambda channels: (channels.rate * channels.rate,),
     shown_by='turn both ways at many speeds up to full scale')
 
 
 CUBIC_NONLINEARITY = Effect(
     'cubic_nonlinearity', 'The scale factor falls or grows with the square of the rate.',
     frozenset({'rate'}), (Parameter('cubic_nonlinearity', 's²/rad²'),),
-    lambda channels: (channels.rate * channels.rate * channels.rate,), shown_by='turn at many speeds up to full scale')
+    lambda channels: (channels.rate * channels.rate * channels.rate,),
+    shown_by='turn at many speeds up to full scale')
 
 
 SINE_RESPONSE = Effect(
@@ -68,18 +71,19 @@ def _bias_temperature(channels: Channels, reference: float) -> Sequence[Number]:
 
 BIAS_TEMPERATURE = Effect(
     'bias_temperature', 'The bias changes in proportion to the temperature.',
-    frozenset({'temperature'}), (Parameter('bias_temperature', 'rad/s/K'),), _bias_temperature, (_REFERENCE_TEMPERATURE,),
-    'rest at two temperatures, and better go up and down again')
+    frozenset({'temperature'}), (Parameter('bias_temperature', 'rad/s/K'),), _bias_temperature,
+    (_REFERENCE_TEMPERATURE,), 'rest at two temperatures, and better go up and down again')
 
 
 def _bias_temperature_quadratic(channels: Channels, reference: float) -> Sequence[Number]:
-    return ((channels.temperature - reference) * (channels.temperature - reference) + 0.0 * channels.rate,)
+    difference = channels.temperature - reference
+    return (difference * difference + 0.0 * channels.rate,)
 
 
 BIAS_TEMPERATURE_QUADRATIC = Effect(
     'bias_temperature_quadratic', 'The bias is curved over temperature.',
-    frozenset({'temperature'}), (Parameter('bias_temperature_quadratic', 'rad/s/K²'),), _bias_temperature_quadratic,
-    (_REFERENCE_TEMPERATURE,), 'rest at three temperatures or more')
+    frozenset({'temperature'}), (Parameter('bias_temperature_quadratic', 'rad/s/K²'),),
+    _bias_temperature_quadratic, (_REFERENCE_TEMPERATURE,), 'rest at three temperatures or more')
 
 
 def _scale_factor_temperature(channels: Channels, reference: float) -> Sequence[Number]:
@@ -88,5 +92,5 @@ def _scale_factor_temperature(channels: Channels, reference: float) -> Sequence[
 
 SCALE_FACTOR_TEMPERATURE = Effect(
     'scale_factor_temperature', 'The scale factor changes in proportion to the temperature.',
-    frozenset({'rate', 'temperature'}), (Parameter('scale_factor_temperature', '1/K'),), _scale_factor_temperature,
-    (_REFERENCE_TEMPERATURE,), 'turn at two temperatures')
+    frozenset({'rate', 'temperature'}), (Parameter('scale_factor_temperature', '1/K'),),
+    _scale_factor_temperature, (_REFERENCE_TEMPERATURE,), 'turn at two temperatures')

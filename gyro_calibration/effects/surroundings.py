@@ -11,34 +11,40 @@ from gyro_calibration.log import Number
 
 
 def _heading_sensitivity(channels: Channels) -> Sequence[Number]:
-    return np.sin(channels.heading) + 0.0 * channels.rate, np.cos(channels.heading) + 0.0 * channels.rate
+    nothing = 0.0 * channels.rate
+    return np.sin(channels.heading) + nothing, np.cos(channels.heading) + nothing
 
 
 HEADING_SENSITIVITY = Effect(
-    'heading_sensitivity', 'The bias depends on the heading, mostly by the magnetic field of the Earth.',
-    frozenset({'heading'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')), _heading_sensitivity,
-    shown_by='turn at several speeds, and rest at eight headings')
+    'heading_sensitivity',
+    'The bias depends on the heading, mostly by the magnetic field of the Earth.',
+    frozenset({'heading'}), (Parameter('sine', 'rad/s'), Parameter('cosine', 'rad/s')),
+    _heading_sensitivity, shown_by='turn at several speeds, and rest at eight headings')
 
 
 ACCELERATION_SENSITIVITY = Effect(
-    'acceleration_sensitivity', 'The bias changes in proportion to the specific force along the input axis.',
+    'acceleration_sensitivity',
+    'The bias changes in proportion to the specific force along the input axis.',
     frozenset({'specific_force'}), (Parameter('acceleration_sensitivity', '(rad/s)/(m/s²)'),),
     lambda channels: (channels.specific_force + 0.0 * channels.rate,),
     shown_by='rest in several poses within one power-on')
 
 
 def _vibration_rectification(channels: Channels, time_constant: float) -> Sequence[Number]:
-    return ((0.0 if channels.lagged is None else channels.lagged('vibration', time_constant)) + 0.0 * channels.rate,)
+    square = 0.0 if channels.lagged is None else channels.lagged('vibration', time_constant)
+    return (square + 0.0 * channels.rate,)
 
 
 VIBRATION_RECTIFICATION = Effect(
     'vibration_rectification', 'Vibration shifts the bias in proportion to its mean square.',
-    frozenset({'specific_force', 'lagged'}), (Parameter('vibration_rectification', '(rad/s)/(m/s²)²'),), _vibration_rectification,
+    frozenset({'specific_force', 'lagged'}),
+    (Parameter('vibration_rectification', '(rad/s)/(m/s²)²'),), _vibration_rectification,
     (Parameter('time_constant', 's', 1.0, (1e-3, 1e4)),), 'run the motor and stop it, at rest')
 
 
 def _supply_sensitivity(channels: Channels, reference: float) -> Sequence[Number]:
-    return ((0.0 if channels.supply is None else channels.supply - reference) + 0.0 * channels.rate,)
+    difference = 0.0 if channels.supply is None else channels.supply - reference
+    return (difference + 0.0 * channels.rate,)
 
 
 SUPPLY_SENSITIVITY = Effect(
