@@ -1,0 +1,65 @@
+"""What the project writes as MCAP is read by others: here by the library mcap."""
+
+import io
+
+import numpy as np
+import pytest
+
+from gyro_calibration.driver.mcap_writer import McapWriter
+from gyro_calibration.messages import DEFINITIONS, IMU, RATE_Z, TEMPERATURE, serialize
+from gyro_calibration.recording import read_recording
+
+NOTES = {'recorded by': 'a test', 'gyro': '12°'}
+TIMES = [10**18 + 10**7 * number for number in range(300)]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Write 300 samples in chunks of 100, each tenth with a temperature."""
+    writer = McapWriter()
+    pieces = [writer.begin('a test', 'about', NOTES)]
+    for number, time in enumerate(TIMES):
+        numbers = 37 * [0.0]
+        numbers[RATE_Z] = 0.001 * number
+        imu = serialize(time, 'gyro', numbers)
+        writer.add('/imu/data_raw', IMU, DEFINITIONS[IMU], time, imu)
+        if number % 10 == 0:
+            temperature = serialize(time, 'gyro', [20.0 + number, 0.0])
+            writer.add('/imu/temperature', TEMPERATURE, DEFINITIONS[TEMPERATURE], time, temperature)
+        if number % 100 == 99:
+            assert writer.pending > 0
+            pieces.append(writer.chunk())
+    assert writer.pending == 0 and writer.chunk() == b''
+    path = tmp_path / 'recording.mcap'
+    path.write_bytes(b''.join([*pieces, writer.end()]))
+    return path
+
+
+def test_the_library_mcap_finds_all_by_the_index(recording):
+    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    with open(recording, 'rb') as file:
+        reader = reading.SeekingReader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == 330 and summary.statistics.chunk_count == 3
+        assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (
+            TIMES[0], TIMES[-1])
+        assert reader.get_header().profile == 'ros2'
+        metadata, = reader.iter_metadata()
+        assert (metadata.name, metadata.metadata) == ('about', NOTES)
+        found = list(reader.iter_messages(['/imu/data_raw']))
+        assert [message.log_time for _, _, message in found] == TIMES
+        assert {(schema.name, schema.encoding) for schema, _, _ in found} == {(IMU, 'ros2msg')}
+
+
+def test_the_library_mcap_reads_all_from_the_beginning_to_the_end(recording):
+    reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
+    reader = reading.NonSeekingReader(io.BytesIO(recording.read_bytes()), validate_crcs=True)
+    times = [message.log_time for _, channel, message in reader.iter_messages()
+             if channel.topic == '/imu/temperature']
+    assert times == TIMES[::10]
+
+
+def test_the_project_reads_its_own(recording):
+    log = read_recording(recording)
+    assert len(log.output) == 300
+    np.testing.assert_allclose(log.output, 0.001 * np.arange(300))
