@@ -76,6 +76,8 @@ class Rig:
         Other nodes that receive cmd_vel.
     ros_speed : float
         Seconds of the simulation in one second; 0 while it stands.
+    speed : float
+        Seconds of the robot and of the simulation in one second of the steady clock.
     other : float or None
         What somebody else commands at 20 Hz, rad/s.
     fed : int
@@ -97,6 +99,7 @@ class Rig:
         self.calibration_file = calibration_file or folder / 'calibration.yaml'
         self.pipeline = Pipeline(record(PARAMETERS, self._given), self.calibration_file, self.clock,
                                  self._send)
+        self._timers, self.speed = {}, 1.0
         self.session, self.journal = self.pipeline.session, self.pipeline.journal
 
     def _send(self, rate):
@@ -122,7 +125,7 @@ class Rig:
     def step(self):
         """Let everything go on by the interval of the samples."""
         self._steps += 1
-        self.clock.now += INTERVAL
+        self.clock.now += INTERVAL / self.speed
         if self.clock.ros:
             self.clock.ros += INTERVAL * self.ros_speed
         for _ in range(len(self._echoes)):
@@ -152,12 +155,18 @@ class Rig:
 
     def guards(self):
         """Look as the timers of the node do: every 20 ms during a drive, else every 0.2 s."""
-        if self._steps % 20 == 0:
+        if self._is_due('look', 0.2):
             self.pipeline.publishers(self.publishers)
-        if self._steps % (2 if self.session.drives else 20) == 0:
+        if self._is_due('watch', 0.02 if self.session.drives else 0.2):
             self.pipeline.watch(self.receivers)
-        if self._steps % 100 == 0:
+        if self._is_due('learn', 1.0):
             self.pipeline.learn()
+
+    def _is_due(self, timer, period):
+        due = self.clock.now > self._timers.get(timer, -math.inf) + period - 1e-6
+        if due:
+            self._timers[timer] = self.clock.now
+        return due
 
     def go(self, seconds=60.0, until=lambda: False):
         """Step for a time, or until a condition holds; return whether it did."""

@@ -1,0 +1,200 @@
+"""
+A small robot and the compensation node as a process, on real DDS, under faults.
+
+What is decided is tested in test_calibration_drive.py with a clock that the test steps; here, that
+the node joins it to topics. Tests wait for events; a machine that holds samples up for a quarter of
+a second ends a drive as well, which the tests take for what it is.
+
+"""
+
+import math
+import signal
+
+import pytest
+from robot import Robot, RosRobot, SecondCommander, now
+
+try:
+    from diagnostic_msgs.msg import DiagnosticArray
+    from sensor_msgs.msg import Imu
+    from std_srvs.srv import Trigger
+except ImportError:
+    pass  # the fixture `ros` skips every test that needs them, and says why
+
+FULL_RATE = math.radians(40.0)
+MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 5.0e-4}\n'
+PROFILE = 'time_s,rate_dps\n0,0\n1,0\n1.5,45\n4.5,45\n5,0\n6,0\n6.5,-45\n9.5,-45\n10,0\n11,0\n'
+HELD_UP = 'no sample came', 'this computer was busy'
+
+
+class Stage:
+    """A robot, and what is known of the node under test."""
+
+    def __init__(self, ros, wait_until, start_node, folder):
+        self.ros, self.wait_until, self._start_node, self._folder = ros, wait_until, start_node, folder
+        self.samples, self.reports = ros.collect(Imu, 'imu/data'), []
+        ros.node.create_subscription(
+            DiagnosticArray, '/diagnostics',
+            lambda array: self.reports.append(array.status[0]), 10)
+        self.closing = []
+
+    def robot(self, **how):
+        """Start the robot."""
+        speed = how.pop('speed', None)
+        self.base = RosRobot(self.ros.node, Robot(noise=5e-3, **how), speed=speed)
+        self.closing.append(self.base.close)
+        return self.base
+
+    def node(self, **parameters):
+        """Start the node, and return when it has received samples of a robot at rest."""
+        (self._folder / 'model.yaml').write_text(MODEL)
+        (self._folder / 'profile.csv').write_text(PROFILE)
+        given = {'model_file': self._folder / 'model.yaml',
+                 'calibration_file': self._folder / 'calibration.yaml',
+                 'calibration.profile_file': self._folder / 'profile.csv',
+                 'calibration.drive': 'true', **parameters}
+        before = len(self.samples)
+        self.process = self._start_node('compensation_node', given)
+        self.wait_until(lambda: len(self.samples) > before + 150, 60.0, 'imu/data')
+        return self.process
+
+    def call(self, name='calibrate'):
+        """Call a service, and return the future of its answer."""
+        client = self.ros.node.create_client(Trigger, f'/compensation_node/{name}')
+        assert client.wait_for_service(30.0)
+        return client.call_async(Trigger.Request())
+
+    def drive(self):
+        """Calibrate until the robot turns at full rate, and return the answer to come."""
+        for _ in range(5):
+            answer = self.call()
+            self.wait_until(lambda: abs(self.base.robot.rate) > FULL_RATE or answer.done(), 60.0,  # noqa: B023, at once
+                            'full rate')
+            if not answer.done():
+                return answer
+            assert answer.result().message.startswith(tuple(
+                f'refused: {words}' for words in HELD_UP)), answer.result().message
+        raise AssertionError('the machine held up five drives')
+
+    def refused(self, answer, words, begin):
+        """Wait for the answer and for the zero, and check the reason."""
+        self.wait_until(answer.done, 30.0, 'the answer')
+        message = answer.result().message
+        assert not answer.result().success
+        assert any(each in message for each in (words, *HELD_UP)), message
+        self.wait_until(lambda: self.base.commands[-1][1] == 0.0, 10.0, 'a zero')
+        driven = [when for when, rate in self.base.commands if rate and when > begin]
+        return max(driven, default=begin) - begin
+
+    def says(self, words):
+        """Wait until the diagnostics hold the words at the level ERROR."""
+        self.wait_until(lambda: any(words in each.message and each.level == each.ERROR
+                                    for each in list(self.reports)), 30.0, words)
+
+
+@pytest.fixture
+def stage(ros, wait_until, start_node, tmp_path):
+    stage = Stage(ros, wait_until, start_node, tmp_path)
+    yield stage
+    for close in stage.closing:
+        close()
+
+
+def test_without_a_clock_of_the_simulation_nothing_drives(stage):
+    robot = stage.robot()
+    stage.node(use_sim_time='true')
+    answer = stage.call()
+    stage.wait_until(answer.done, what='the answer')
+    assert 'ROS time stands still' in answer.result().message
+    stage.says('ROS time stands still')
+    assert not any(rate for _, rate in robot.commands)
+
+
+def test_a_clock_that_stops_in_mid_run_stops_the_robot(stage):
+    robot = stage.robot(speed=1.0)
+    stage.node(use_sim_time='true')
+    answer = stage.drive()
+    begin, robot.clock_stands = now(), True
+    assert stage.refused(answer, 'ROS time stands still', begin) < 2.0
+
+
+def test_at_four_times_the_speed_with_both_wheels_no_guard_ends_a_run(stage):
+    """Its result is right; or a busy machine is named, on which 10 ms of the robot are too few."""
+    robot = stage.robot(speed=4.0)
+    stage.node(use_sim_time='true', wheels='both')
+    answer = stage.drive()
+    begin = now()
+    stage.wait_until(answer.done, 60.0, 'the answer')
+    result = answer.result()
+    assert 'scale factor error 3.' in result.message or HELD_UP[1] in result.message
+    assert robot.turned_since(begin) > math.radians(200.0), 'the rest of 315 deg'
+    stage.wait_until(lambda: robot.commands[-1][1] == 0.0 and abs(robot.robot.rate) < 0.01)
+
+
+def test_an_unplugged_gyro_stops_the_robot_and_the_diagnostics_name_it(stage):
+    robot = stage.robot()
+    stage.node()
+    answer = stage.drive()
+    begin, robot.robot.unplugged = now(), True
+    assert stage.refused(answer, 'no sample came', begin) < 2.0
+    stage.says('no samples on imu/data_raw for')
+
+
+@pytest.mark.parametrize('rate', [0.0, 0.3], ids=['soft stop', 'teleop'])
+def test_a_second_commander_is_obeyed_at_once(stage, rate):
+    robot, other = stage.robot(), SecondCommander(stage.ros.node)
+    stage.closing.append(other.close)
+    stage.node()
+    answer = stage.drive()
+    begin, other.rate = now(), rate
+    stage.wait_until(answer.done, 30.0, 'the answer')
+    assert any(each in answer.result().message
+               for each in ('another node sent a command', *HELD_UP)), answer.result().message
+    own = [when for when, each in list(robot.commands) if each not in (0.0, rate) and when > begin]
+    assert max(own, default=begin) - begin < 2.0
+    stage.wait_until(lambda: abs(robot.robot.rate - rate) < 0.01, 10.0, 'the other one has it')
+    answer = stage.call()
+    stage.wait_until(answer.done, 30.0, 'the answer')
+    assert not answer.result().success, 'somebody else commands the robot'
+
+
+def test_two_publishers_of_samples_are_named_and_no_heading_is_made_of_them(stage):
+    robot = stage.robot()
+    stage.node()
+    second = stage.ros.node.create_publisher(Imu, 'imu/data_raw', 100)
+    robot.also = second.publish
+    stage.says('publishers send on imu/data_raw (/test_client, /test_client)')
+    received = len(stage.samples)
+    robot.robot.command(0.7)
+    stage.wait_until(lambda: robot.robot.heading > 1.0, what='a turn')
+    assert len(stage.samples) < received + 50
+    answer = stage.call()
+    stage.wait_until(answer.done, 30.0, 'the answer')
+    assert 'publishers send on imu/data_raw' in answer.result().message
+    robot.robot.command(0.0)
+
+
+def test_a_node_that_is_ended_in_mid_run_commands_zero_first(stage):
+    robot = stage.robot()
+    node = stage.node()
+    stage.drive()
+    assert node.stop(signal.SIGTERM) == 0
+    stage.wait_until(lambda: robot.commands[-1][1] == 0.0, what='a zero')
+    stage.wait_until(lambda: abs(robot.robot.rate) < 0.01, what='the robot to stand')
+
+
+@pytest.mark.usefixtures('by_udp')
+def test_a_node_that_is_killed_leaves_its_last_command_and_the_next_one_does_not_drive(stage):
+    """A base without a time-out turns on; the documents say so."""
+    robot = stage.robot()
+    node = stage.node()
+    stage.drive()
+    node.waited = True
+    node.process.kill()
+    node.process.wait()
+    begin = now()
+    stage.wait_until(lambda: robot.turned_since(begin) > math.radians(60.0), what='it turns on')
+    stage.node()
+    answer = stage.call()
+    stage.wait_until(answer.done, 30.0, 'the answer')
+    assert 'odom or cmd_vel shows that the robot moves' in answer.result().message
+    robot.robot.command(0.0)
