@@ -14,7 +14,6 @@ import pytest
 
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import Sample, Settings, find
-from gyro_calibration.driver.serial_faults import Line
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -27,7 +26,7 @@ STEP = 2e-5  # rad/s from a sample to the next
 NEARLY = 0.3  # rad; what it turns in 1 s, by which a busy machine may be late at first; the gaps of these tests are longer
 FIRST = 0.3  # rad/s
 SETTINGS = Settings(columns=('gyro_rad_s',))
-DRIVER = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'reopen_interval': 0.05, 'sample_rate': RATE}
+DRIVER = {'protocol': 'csv', 'columns': '[gyro_rad_s]', 'sample_rate': RATE}
 WAITING = 1.0  # s; a publisher that waited for a subscriber would fall behind by more than that, and by more and more
 MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-5}\n'
 
@@ -181,18 +180,6 @@ def test_neither_ten_subscribers_nor_one_that_stalls_cost_the_others_anything(co
         assert heard.latency(turning, place) < alone + WAITING
         assert heard.missing(begin) == 0
     os.killpg(stalled.pid, signal.SIGCONT)
-
-
-def test_the_heading_goes_on_over_a_line_that_damages_frames_and_comes_in_bursts(compensation, start_node, tmp_path):
-    """Half a percent of all bytes, so that one frame in six is lost; a CRC tells which."""
-    _, heard = compensation()
-    start_node('driver_node', {'port': tmp_path / 'gyro', 'protocol': 'kvh_1750', 'sample_rate': RATE})
-    line = Line(lost_bytes=0.0015, doubled_bytes=0.0015, flipped_bytes=0.002, burst=0.016)
-    with Turning(tmp_path / 'gyro', 'kvh_1750', line=line, generator=np.random.default_rng(1)).emulator:
-        heard.more(600)
-    assert heard.missing() > 50
-    assert heard.error(0, -1) < 4.0 * math.sqrt(heard.variances[-1]) + NEARLY
-    heard.says('lost_samples: 1')
 
 
 _STUCK = """
