@@ -218,6 +218,31 @@ def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on_with_a
     assert abs(error) < 3.0 * deviation, (error, deviation)
 
 
+def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path):
+    """Its dead predecessor is listed for up to 20 s; sequence numbers show who really sends."""
+    rig = Rig(tmp_path, model='')
+    for sequence in [*range(1, 101), *range(1, 201)]:
+        if sequence == 1:
+            rig.publishers = ['/driver_node'] * (1 if rig.clock.now < 1000.5 else 2)
+            rig.pipeline.publishers(rig.publishers)
+        rig.clock.now += INTERVAL
+        rig.fed += 10 ** 7
+        assert rig.pipeline.sample(rig.fed, 0.5, sequence=sequence)
+        rig.guards()
+    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
+
+
+def test_two_publishers_that_both_send_are_found_by_their_sequence_numbers(tmp_path):
+    rig = Rig(tmp_path, model='')
+    rig.publishers = ['/a', '/b']
+    rig.pipeline.publishers(rig.publishers)
+    for number in range(10):
+        for sequence in (1000 + number, 5 + number):
+            rig.fed += 5 * 10 ** 6
+            rig.pipeline.sample(rig.fed, 0.5, sequence=sequence)
+    assert '2 publishers send' in rig.pipeline.conflict
+
+
 def test_one_jump_back_is_no_conflict(tmp_path):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(100, 0.5))
@@ -522,7 +547,7 @@ OK, WARN, ERROR = range(3)
     (lambda rig: setattr(rig.robot, 'stamps_stand', True), ERROR, 'the stamp stands still'),
     (lambda rig: rig.publishers.append('/other'), ERROR, '2 publishers send'),
     (lambda rig: setattr(rig, 'ros_speed', 0.0), ERROR, 'ROS time stands still'),
-    (lambda rig: setattr(rig.robot, 'bias', 1e9), ERROR, 'rad/s came, and this gyro reports'),
+    (lambda rig: setattr(rig.robot, 'bias', 1e9), ERROR, 'beyond what this gyro reports'),
 ], ids=['none', 'unplugged', 'stamps', 'publishers', 'clock', 'absurd rates'])
 def test_the_diagnostics_name_what_is_wrong_within_two_seconds(tmp_path, reported, fault, level,
                                                               words):
