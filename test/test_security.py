@@ -9,17 +9,16 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
-from fake_gyro import FakeGyro
-from test_compensation_node import profile_rates
+from rig import rested
 
 import gyro_calibration
 
 try:
-    from geometry_msgs.msg import Twist
     from nav_msgs.msg import Odometry
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
     from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
     from sensor_msgs.msg import Imu, Temperature
+    from std_srvs.srv import Trigger
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
@@ -154,11 +153,11 @@ def test_no_rule_is_a_pattern_or_stands_twice():
 #: Of each enclave the node, and settings of its parameters that together bring everything that it may have.
 SETTINGS = {
     'driver_node': [{}, {'use_sim_time': True}],
-    'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}, {'reference': 'odometry'}],
-    'compensation_node_that_drives': [{'drive_profile': True, 'wheels': 'both', 'use_sim_time': True}],
+    'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}],
+    'compensation_node_that_drives': [{'calibration.drive': True, 'use_sim_time': True}],
 }
 #: What a node has only where it is asked for.
-ONLY_THEN = {('subscriber', '/clock'), ('subscriber', 'odom'), ('subscriber', 'cmd_vel'), ('publisher', 'cmd_vel')}
+ONLY_THEN = {('subscriber', '/clock')}
 
 
 def begun(start_node, tmp_path, enclave):
@@ -217,13 +216,14 @@ def test_the_policy_allows_a_recording_exactly_what_it_takes(start_node, ros, wa
 def called_with_names(path):
     """Return the names of topics and services that a file writes down where it makes an end point."""
     calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
-    makers = ('create_publisher', 'create_subscription', 'create_service', 'create_client', '_listen')
-    made = [call for call in calls if isinstance(call.func, ast.Attribute) and call.func.attr in makers]
+    makers = ('create_publisher', 'create_subscription', 'create_service', 'create_client',
+              'publish_on', 'subscribe_to')
+    made = [call for call in calls if ast.unparse(call.func).rpartition('.')[2] in makers]
     given = [argument.value for call in made for argument in call.args if isinstance(argument, ast.Constant)]
     return {value for value in given if isinstance(value, str)}
 
 
-@pytest.mark.parametrize('module', ['driver_node', 'compensation_node', 'calibration_services', 'diagnostics', 'runner'])
+@pytest.mark.parametrize('module', ['driver_node', 'compensation_node', 'diagnostics', 'runner'])
 def test_every_topic_that_a_node_can_make_is_in_the_policy(module):
     """Also one that none of the settings of the test above brings."""
     ruled = {rule.text for rules in POLICY.iter('profile') for kind in rules for rule in kind}
@@ -251,23 +251,18 @@ def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
 
 
 def test_only_the_calibration_and_the_demonstration_can_command_a_robot():
-    makers = {path.name for path in FILES for line in path.read_text().splitlines() if 'create_publisher' in line and 'cmd_vel' in line}
-    assert makers == {'calibration_services.py', 'demo.py'}
+    makers = {path.name for path in FILES for line in path.read_text().splitlines()
+              if 'create_publisher' in line and 'cmd_vel' in line}
+    assert makers == {'compensation_node.py', 'demo.py'}
 
 
-@pytest.fixture
-def start(start_node, ros, wait_until, tmp_path):
-    """Return a function that starts the compensation and a gyro for it."""
-    def start(**parameters):
-        given = {'calibration_file': tmp_path / 'calibration.yaml', **parameters}
-        return start_node('compensation_node', parameters=given), FakeGyro(ros, wait_until)
-    return start
-
-
-def allowing(drives):
-    """Return the request by which any ROS client can set drive_profile."""
-    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=drives)
-    return SetParameters.Request(parameters=[Parameter(name='drive_profile', value=value)])
+def test_only_a_session_that_may_drive_sends_commands(tmp_path):
+    """Not even where the profile has long begun to turn."""
+    rig = rested(tmp_path)
+    assert not rig.begin()
+    rig.robot.command(0.7)
+    rig.go(10.0)
+    assert not rig.commands and not rig.session.drives
 
 
 def drivers(ros):
@@ -275,34 +270,20 @@ def drivers(ros):
     return {info.node_name for info in ros.node.get_publishers_info_by_topic('/cmd_vel')}
 
 
-def test_without_drive_profile_calibrate_moves_nothing(start, ros):
-    """Not even where the profile has long begun to turn; the node is no publisher of commands."""
-    _, gyro = start()
-    commands = ros.collect(Twist, 'cmd_vel', 10)
-    answer = gyro.call_later('calibrate')
-    gyro.wait_until(gyro.calibrating)
-    gyro.play(profile_rates()[:600])
-    assert gyro.calibrating() and not answer.done()
-    assert not commands and not drivers(ros)
-
-
-def test_taking_drive_profile_back_stops_the_robot_and_gives_the_run_up(start, ros, wait_until):
-    """Samples come all the time; where a busy machine holds them up, the robot is stopped for that."""
-    _, gyro = start()
-    commands, taken = ros.collect(Twist, 'cmd_vel', 10), []
-    assert ros.call(SetParameters, '/compensation_node/set_parameters', allowing(True)).results[0].successful
-    client = ros.node.create_client(SetParameters, '/compensation_node/set_parameters')
-    assert client.wait_for_service(30.0)
-    answer = gyro.call_later('calibrate')
-    gyro.wait_until(gyro.calibrating)
-
-    def take_back(_):
-        if not taken and commands and commands[-1].angular.z > 0.5:
-            taken.append(client.call_async(allowing(False)))
-    gyro.play(profile_rates(), until=answer.done, before=take_back)
-    wait_until(answer.done)
-    assert not answer.result().success and 'while the robot was driven' in answer.result().message
-    wait_until(lambda: commands[-1].angular.z == 0.0 and drivers(ros) == {'compensation_node'})
+def test_the_node_is_no_publisher_of_commands_before_it_may_drive(start_node, ros, wait_until,
+                                                                 tmp_path):
+    start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml'})
+    put = ros.node.create_client(SetParameters, '/compensation_node/set_parameters')
+    assert put.wait_for_service(30.0) and not drivers(ros)
+    request = Trigger.Request()
+    assert ros.call(Trigger, '/compensation_node/cancel_calibration', request).success is False
+    assert not drivers(ros)
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+    allowing = SetParameters.Request(parameters=[Parameter(name='calibration.drive', value=value)])
+    assert ros.call(SetParameters, '/compensation_node/set_parameters', allowing).results[0].successful
+    answer = ros.call(Trigger, '/compensation_node/calibrate')
+    assert 'no sample comes on imu/data_raw' in answer.message
+    wait_until(lambda: drivers(ros) == {'compensation_node'}, what='a publisher of commands')
 
 
 @pytest.mark.parametrize('node', ['driver_node', 'compensation_node'])
@@ -310,7 +291,7 @@ def test_no_client_changes_which_files_and_ports_a_running_node_uses(node, start
     start_node(node, {'calibration_file': tmp_path / 'calibration.yaml'} if node == 'compensation_node' else {})
     names = ros.call(ListParameters, f'/{node}/list_parameters').result.names
     chosen = sorted(name for name in names if name == 'port' or name.endswith('_file'))
-    assert chosen == (['port'] if node == 'driver_node' else ['bias_file', 'calibration_file', 'model_file', 'profile_file'])
+    assert chosen == (['port'] if node == 'driver_node' else ['calibration.profile_file', 'calibration_file', 'model_file'])
     for name in chosen:
         given = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='/tmp/other'))
         answers = [ros.call(SetParameters, f'/{node}/set_parameters', SetParameters.Request(parameters=[given])).results[0],
