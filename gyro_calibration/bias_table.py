@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import plain, reason, write_atomically
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.settings_file import read_settings, settings_text
@@ -526,10 +526,11 @@ def read_bias_table(path: str | Path, model: GyroModel, prior: Prior | None = No
     except FileNotFoundError:
         return BiasTable(model, prior), ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        reason = ' '.join(str(error).split())[:200]
-        return BiasTable(model, prior), f'{path} cannot be read as a bias table ({reason}): it is learned anew, and the file is kept'
+        said = f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, and the file is kept'
+        return BiasTable(model, prior), plain(said)
     if digest != model_digest(model):
-        return BiasTable(model, prior), f'the bias table in {path} belongs to another model: it is learned anew, and the file is kept'
+        return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another model: it is learned anew, and the file is '
+                                              'kept')
     return BiasTable(model, prior, entries, jumps), ''
 
 
@@ -562,7 +563,7 @@ def _keep_aside(path: Path, digest: str) -> str:
     while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
         number += 1
     path.rename(other)
-    return f'what was in {path} is now in {other}'
+    return plain(f'what was in {path} is now in {other}')
 
 
 def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:

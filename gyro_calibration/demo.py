@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import Sample, find
+from gyro_calibration.files import write_atomically
 from gyro_calibration.heading import Threshold, filter_rates, integrate
 from gyro_calibration.log import DEGREE, Array, Log, write_log
 from gyro_calibration.model import GyroModel
@@ -300,7 +301,7 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
     write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true - true[0]))
     errors = {name: np.abs(heading - (true - true[0])) / DEGREE for name, heading in headings.items()}
     table = _table(errors)
-    (out / 'table.md').write_text(table)
+    write_atomically(out / 'table.md', table.encode())
     text = f'{table}\nSelf-calibration: {calibration}.\nSeed {seed}. Picture, table and log are in {out}.'
     means = {name: float(error.mean()) for name, error in errors.items()}
     return Demonstration(text, {'seed': seed, **calibration.figures(), 'mean_error_deg': means})

@@ -1,19 +1,134 @@
-"""Read files within bounds, whoever wrote them, and write files that are complete or not there, also when the process is killed."""
+"""
+Read files within bounds, whoever wrote them, and write files that are complete or not there.
+
+What is no file (a pipe, a socket, a device, a folder) is neither waited for nor replaced. A
+symbolic link is followed when it is read, and replaced when it is written: what it points to stays
+as it is. A file that is replaced keeps its mode, and its owner and group where that is allowed.
+
+"""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
+import secrets
+import select
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-#: Beyond this no value of a gyro lies, not even a count of 64 bits, and products of some such values still are numbers.
+#: Beyond this no value of a gyro lies, not even a count of 64 bits, and products of some such
+#: values still are numbers.
 LARGEST = 1e20
+#: Times that compressed data may grow, where sensor data shrink to a tenth; and bytes that any may
+#: grow to.
+GROWTH, GROWN = 100, 1 << 24
+#: A pipe that nobody has begun to write to after so many ms is given up.
+_PATIENCE = 900
+
+#: Kind of what is no regular file -> its name.
+_KINDS = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe', stat.S_IFSOCK: 'a socket',
+          stat.S_IFCHR: 'a device', stat.S_IFBLK: 'a device'}
+#: Number of an error -> what to do about it.
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), 'make room in {folder}'),
+    **dict.fromkeys((errno.ENOTDIR, errno.EEXIST),
+                    'a part of {folder} is a file; name another folder'),
+    **dict.fromkeys((errno.EISDIR, errno.EINVAL), 'name a file, or move away what is there'),
+    errno.ENOENT: 'name one that exists',
+    errno.ENAMETOOLONG: 'give it a shorter name',
+    errno.ELOOP: 'name the file that its links should lead to',
+}
+
+
+class InputError(ValueError):
+    """What was given cannot be used; the message is one printable line: given, wanted, remedy."""
+
+    def __init__(self, message: object = ''):
+        super().__init__(plain(message))
+
+
+def plain(text: object, kept: str = '') -> str:
+    r"""
+    Return a text as a terminal, a log of ROS or a page may show it.
+
+    What cannot be printed (escapes that steer a terminal, ends of lines, marks that turn the
+    direction of writing, bytes of a name that are no text) becomes its escape in Python, such as
+    \\x1b, but for the characters that are to be kept.
+
+    """
+    return ''.join(each if each.isprintable() or each in kept else
+                   each.encode('unicode_escape').decode() for each in str(text))
+
+
+def reason(error: Exception) -> str:
+    """Return what went wrong, as a part of a sentence that names the file itself."""
+    if isinstance(error, OSError) and error.strerror:
+        return f'{error.strerror[0].lower()}{error.strerror[1:]}'
+    return plain(' '.join(str(error).split())[:200] or type(error).__name__)
+
+
+def remedy(error: OSError, path: str | Path) -> str:
+    """Return what to do where a file cannot be read or written."""
+    words = _REMEDIES.get(error.errno or 0, 'make {path} readable and writable, or name another')
+    return plain(words.format(path=path, folder=Path(path).parent))
+
+
+def explained(error: OSError) -> str:
+    """Return an error of the operating system as a sentence with its remedy if it names a file."""
+    if error.filename is None or not error.strerror:
+        return plain(error)
+    path = str(error.filename)
+    return f'{plain(path)}: {reason(error)}; {remedy(error, path)}'
+
+
+def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
+    """
+    Open a regular file for reading, or also a pipe that somebody writes to.
+
+    Raises
+    ------
+    OSError : it cannot be opened, or is something else, which might never end
+
+    """
+    # To open a device may already do something; and what is open may be another file than before.
+    _refuse_kind(path, os.stat(path).st_mode, pipes)
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        mode = os.fstat(handle).st_mode
+        _refuse_kind(path, mode, pipes)
+        if stat.S_ISFIFO(mode) and not _is_written_to(handle):
+            raise OSError(errno.EINVAL, 'it is a pipe that nobody writes to', str(path))
+        os.set_blocking(handle, True)
+        return open(handle, 'rb')
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def _refuse_kind(path: str | Path, mode: int, pipes: bool = False) -> None:
+    if not stat.S_ISREG(mode) and not (pipes and stat.S_ISFIFO(mode)):
+        kind = _KINDS.get(stat.S_IFMT(mode), 'of another kind')
+        number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
+        wanted = 'a file or a pipe' if pipes else 'a file'
+        raise OSError(number, f'it is {kind}, where {wanted} is wanted', str(path))
+
+
+def _is_written_to(handle: int) -> bool:
+    """Tell whether somebody has a pipe open to write, if only from soon on."""
+    waiting = select.poll()
+    waiting.register(handle, select.POLLIN)
+    if waiting.poll(_PATIENCE):
+        return True
+    try:
+        os.read(handle, 1)
+    except BlockingIOError:  # who writes takes time
+        return True
+    return False
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
@@ -22,16 +137,11 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 
     Raises
     ------
-    OSError : it cannot be opened
-    ValueError : it is a pipe, a device or a folder, which might never end, or has more bytes than `most`
+    OSError : as `opened`
+    ValueError : it has more bytes than `most`
 
     """
-    # Without waiting, since a pipe that nobody writes to would be waited for; and a terminal is not to become ours.
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise ValueError('it is no regular file')
-    with open(handle, 'rb') as file:
+    with opened(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
         raise ValueError(f'it has more than {most} bytes')
@@ -48,7 +158,7 @@ def write_atomically(path: str | Path, data: bytes) -> tuple[int, int]:
 
     Raises
     ------
-    OSError : the folder cannot be written to; the old file is as it was
+    OSError : as `replacing`; the old file is as it was
 
     """
     with replacing(path) as file:
@@ -72,35 +182,101 @@ def version(file: str | Path | int) -> tuple[int, int]:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """Give a file to write to, which becomes `path` in one step when all is written; after an error the old file is as it was."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    """
+    Give a file to write to, which becomes `path` in one step when all is written.
+
+    After an error the old file is as it was.
+
+    Raises
+    ------
+    OSError : the folder cannot be written to, or what is there is no file
+
+    """
+    path, temporary = Path(path), None
     try:
-        with os.fdopen(handle, 'wb') as file:
-            with suppress(OSError):  # a file system without locks has leftovers instead
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, or the process is killed
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        old = replaceable(path)
+        remove_leftovers(path)
+        # Nobody else may read what only the owner of the old file may; a new one gets what the
+        # umask leaves.
+        handle, temporary = _created(path, 0o644 if old is None else 0o600)
+        try:
+            with os.fdopen(handle, 'wb') as file:
+                yield file
+                file.flush()
+                if old is not None:
+                    _make_alike(file.fileno(), old)
+                os.fsync(file.fileno())
+                os.replace(temporary, path)
+        except BaseException:
+            with suppress(FileNotFoundError):
+                os.unlink(temporary)
+            raise
+    except OSError as error:
+        ours = error.filename in (None, temporary) or Path(error.filename) in path.parents
+        if error.errno is None or not ours:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _created(path: Path, mode: int) -> tuple[int, str]:
+    """Return a new temporary file beside another, open and locked, and its path."""
+    while True:
+        temporary = str(path.parent / f'{_stem(path)}{secrets.token_hex(4)}')
+        handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+        with suppress(OSError):  # a file system without locks has leftovers instead
+            # until it is closed, or the process is killed
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(handle).st_nlink:
+            return handle, temporary
+        os.close(handle)  # another writer took it for a leftover before it was locked
+
+
+def replaceable(path: str | Path) -> os.stat_result | None:
+    """
+    Return the status of a regular file that is to be replaced; None for a new file or a link.
+
+    Raises
+    ------
+    OSError : it is a pipe, a socket, a device or a folder, or a link to one; or nobody can look
+
+    """
+    try:
+        if stat.S_ISREG((here := os.lstat(path)).st_mode):
+            return here
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:  # also where a link leads nowhere
+        return None
+    _refuse_kind(path, mode)
+    return None
+
+
+def _make_alike(handle: int, old: os.stat_result) -> None:
+    """Give a new file owner, group and mode of the old one, as far as that is allowed."""
+    for owner in ((-1, old.st_gid), (old.st_uid, -1)):
+        with suppress(OSError):
+            os.fchown(handle, *owner)
+    os.fchmod(handle, old.st_mode & 0o777)
+
+
+def _stem(path: Path) -> str:
+    """Return what the names of temporary files begin with; a long name is cut to leave room."""
+    return f'.{os.fsdecode(os.fsencode(path.name)[:200])}.'
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Remove what killed writers of a file have left beside it, and nothing that somebody is writing."""
+    """Remove what killed writers of a file left beside it, but nothing that is being written."""
     path = Path(path)
-    temporary = re.compile(re.escape(f'.{path.name}.') + '[a-z0-9_]{8}')
-    with suppress(OSError):  # nobody waits for it, and a folder that cannot be read or written to is told when it matters
-        for name in filter(temporary.fullmatch, os.listdir(path.parent)):
-            _remove_unlocked(path.parent / name)
+    leftover = re.compile(re.escape(_stem(path)) + '[a-z0-9_]{8}')
+    # Nobody waits for it, and a folder that cannot be read or written to is told when it matters.
+    with suppress(OSError):
+        for name in filter(leftover.fullmatch, os.listdir(path.parent)):
+            with suppress(OSError):
+                _remove_unlocked(path.parent / name)
 
 
 def _remove_unlocked(path: Path) -> None:
-    with suppress(BlockingIOError), open(path, 'rb') as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.unlink(path)
+    if stat.S_ISREG(os.lstat(path).st_mode):
+        with opened(path) as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.unlink(path)

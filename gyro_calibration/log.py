@@ -12,9 +12,7 @@ import gzip
 import io
 import itertools
 import math
-import os
 import reprlib
-import stat
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -26,7 +24,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_calibration.files import LARGEST, replacing
+from gyro_calibration.files import GROWN, GROWTH, LARGEST, InputError, opened, plain, reason, replacing
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -48,8 +46,6 @@ _FULL, _FASTEST = 0.1, 35.0
 _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
 #: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
 _WHOLE, _TEXT = 1 << 29, 10
-#: A compressed log is a tenth as large as its text; where it is less than a hundredth, the text is there to fill memory or disk.
-_UNFOLDED = 100
 
 #: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
 COLUMNS: Mapping[str, tuple[str, float]] = {
@@ -78,11 +74,11 @@ Named = dict[str, tuple[int, float]]
 Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
-class LogError(ValueError):
+class LogError(InputError):
     """A file is not a log; the message names file, row and column."""
 
 
-class DataRefused(ValueError):
+class DataRefused(InputError):
     """The data do not allow an answer; the message says why and what would."""
 
 
@@ -172,7 +168,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    with _refusing(path), _opened(path) as file, _reading(file, compressed) as text:
+    with _refusing(path), opened(path, pipes=True) as file, _reading(file, compressed) as text:
         lines = _lines(text)
         notes, header, first_line = _head(path, _bounded(lines, _HEAD))
         named, unfolded = _named_columns(path, header), 0
@@ -180,8 +176,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             named.pop('time', None)
         while block := _block(lines, rows):
             unfolded += sum(map(len, block))
-            if compressed and file.seekable() and unfolded > _BLOCK + _UNFOLDED * file.tell():
-                raise LogError(f'{path}: unfolds to more than {_UNFOLDED} times its size, as no log does; unpack it if that is what was '
+            if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
+                raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log does; unpack it if that is what was '
                                'recorded')
             places, arrays, others = _quickly(block, first_line, header, named) or _carefully(path, block, lines, first_line, header, named)
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -203,14 +199,7 @@ def _refusing(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f'{path}: cannot be read as a log ({error}); wanted a CSV file, .csv or .csv.gz') from error
-
-
-def _opened(path: str | Path) -> BinaryIO:
-    """Open a file or a pipe; a device may never end."""
-    if not (stat.S_ISREG(mode := os.stat(path).st_mode) or stat.S_ISFIFO(mode)):
-        raise OSError('it is neither a file nor a pipe')
-    return open(path, 'rb')
+        raise LogError(f'{path}: cannot be read as a log ({reason(error)}); wanted a CSV file, .csv or .csv.gz') from error
 
 
 def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
@@ -281,10 +270,15 @@ def _named_columns(path: str | Path, header: list[str]) -> Named:
 
 def _distinct(header: list[str]) -> list[str]:
     """Return the names of columns, each once: a second x is x.1."""
-    names: list[str] = []
+    taken, numbers, names = set(header), dict[str, int](), list[str]()
     for name in header:
-        tried = itertools.chain([name], (f'{name}.{number}' for number in itertools.count(1)))
-        names.append(next(each for each in tried if each not in names and (each == name or each not in header)))
+        tried = name
+        while name in numbers and tried in taken:
+            numbers[name] += 1
+            tried = f'{name}.{numbers[name]}'
+        numbers.setdefault(name, 0)
+        taken.add(tried)
+        names.append(tried)
     return names
 
 
@@ -348,8 +342,8 @@ def _most(quantity: str) -> float:
 
 
 def shown(text: str) -> str:
-    """Return a text of a file for a message: not more than a line, and nothing that a terminal would obey."""
-    return ''.join(letter if letter.isprintable() else ' ' for letter in text[:100])
+    """Return a text of a file for a message: not more than a line."""
+    return plain(text[:100])
 
 
 def _is_number(text: str) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.effects import CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial
-from gyro_calibration.files import LARGEST, write_atomically
+from gyro_calibration.files import LARGEST, InputError, reason, write_atomically
 from gyro_calibration.log import Array, shown
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise
@@ -24,8 +24,12 @@ POLYNOMIAL = 'rate_temperature_polynomial'
 _HIGHEST = 20
 
 
-class ModelError(ValueError):
+class ModelError(InputError):
     """A file is not a model; the message names file, place and remedy."""
+
+
+class ModelMissing(ModelError):
+    """There is no such file."""
 
 
 def read_model(path: str | Path) -> GyroModel:
@@ -40,9 +44,9 @@ def read_model(path: str | Path) -> GyroModel:
     try:
         content = read_settings(path)
     except FileNotFoundError:
-        raise ModelError(f'{path}: there is no such file; calibrate first, or name another model file') from None
+        raise ModelMissing(f'{path}: there is no such file; calibrate first, or name another model file') from None
     except (OSError, ValueError) as error:
-        raise ModelError(f'{path}: cannot be read as YAML ({error}); restore the file or calibrate again') from error
+        raise ModelError(f'{path}: cannot be read as YAML ({reason(error)}); restore the file or calibrate again') from error
     try:
         return _from_content(content)
     except _PlaceError as error:

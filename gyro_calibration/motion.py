@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gyro_calibration.files import LARGEST, read_bytes
+from gyro_calibration.files import LARGEST, InputError, read_bytes, reason
 from gyro_calibration.log import DEGREE, SHORTEST, Array, shown
 
 #: Bytes of a motion profile: an hour at 100 Hz has half of it.
 BYTES = 16_000_000
 
 
-class MotionError(ValueError):
+class MotionError(InputError):
     """A file is not a motion profile; the message names file and column."""
 
 
@@ -123,8 +123,11 @@ def read_motion(path: str | Path) -> Motion:
         name = _moving_column(path, header)
         columns = {each: header.index(each) for each in ('time_s', name)}
         time, values = np.fromiter(_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MotionError(f'{path}: cannot be read as a motion profile ({error}); wanted a CSV file with time_s and heading_deg') from error
+    except MotionError:
+        raise
+    except (OSError, ValueError, csv.Error) as error:
+        raise MotionError(f'{path}: cannot be read as a motion profile ({reason(error)}); wanted a CSV file with time_s and '
+                          'heading_deg') from error
     known = np.isfinite(values)
     time, values = time[known], values[known] * _WORDS[name]
     if len(time) < 2 or not (np.diff(time) >= SHORTEST).all():
@@ -143,11 +146,7 @@ def _moving_column(path: str | Path, header: list[str]) -> str:
 
 
 def _lines(path: str | Path) -> io.StringIO:
-    try:
-        data = read_bytes(path, BYTES)
-    except ValueError as error:
-        raise OSError(str(error)) from error
-    return io.StringIO(data.decode('utf-8-sig'), newline=None)
+    return io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
 
 
 def _numbers(path: str | Path, rows: Iterable[list[str]], columns: dict[str, int]) -> Iterator[float]:

@@ -11,6 +11,7 @@ import numpy as np
 from gyro_calibration.allan import AllanChart, NoiseFit
 from gyro_calibration.calibration import Calibration
 from gyro_calibration.dwells import Dwells
+from gyro_calibration.files import replacing
 from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.turn import TurnErrors
@@ -251,5 +252,6 @@ def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None) -> Any:
 
 def _save(figure: Any, path: str | Path) -> None:
     from matplotlib import pyplot
-    figure.savefig(path, dpi=110)
+    with replacing(path) as file:
+        figure.savefig(file, dpi=110, format=Path(path).suffix[1:])
     pyplot.close(figure)

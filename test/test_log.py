@@ -92,12 +92,12 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize('read', [read_log, read_in_pairs])
 @pytest.mark.parametrize('path', ['/dev/zero', '/dev/null', '.'])
 def test_a_device_or_a_folder_is_no_log(path, read):
-    with pytest.raises(LogError, match='neither a file nor a pipe'):
+    with pytest.raises(LogError, match='it is a (device|folder), where a file or a pipe is wanted'):
         read(path)
 
 
 def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.log._BLOCK', 1 << 16)
+    monkeypatch.setattr('gyro_calibration.log.GROWN', 1 << 16)
     path = tmp_path / 'log.csv.gz'
     with gzip.open(path, 'wb') as file:
         file.write(b'gyro_dps\n')

@@ -18,6 +18,7 @@ from gyro_calibration.cli.verb import UsageError, add_topics, output_of, positiv
 from gyro_calibration.driver.emulator import Emulator, emulate
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings, find
 from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.files import plain
 from gyro_calibration.log import DEGREE, Array, DataRefused
 
 
@@ -64,8 +65,10 @@ def _emulate(given: argparse.Namespace) -> None:
     generator = np.random.default_rng(secrets.randbits(32) if given.seed is None else given.seed)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, line, generator)
     _handle_signals(lambda *_: emulator.stop())
+    def answer(path: str) -> None:
+        print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else plain(path), flush=True)
     try:
-        emulate(emulator, lambda path: print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else path, flush=True))
+        emulate(emulator, answer)
     finally:
         _handle_signals(signal.SIG_IGN)  # launch sends a second one, which must not hit a program that is about to end
 

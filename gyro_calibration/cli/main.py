@@ -18,10 +18,9 @@ import numpy as np
 
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.verb import UsageError
-from gyro_calibration.log import DataRefused, LogError
-from gyro_calibration.model_file import ModelError
-from gyro_calibration.motion import MotionError
+from gyro_calibration.cli.verb import Answer, UsageError, say
+from gyro_calibration.files import InputError, explained, plain, reason
+from gyro_calibration.log import DataRefused
 
 DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
 
@@ -32,19 +31,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _refuse_empty(given)
         answer = given.verb(given)
+        text = None if answer is None else _text(answer, given.json)
     except DataRefused as error:
-        print(f'gyro_calibration: {error}', file=sys.stderr)
+        say(error)
         return NO_ANSWER
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-        print(f'gyro_calibration: the numbers are too large or too far apart to be computed with ({error}); see whether columns and units '
-              'are right', file=sys.stderr)
+        say(f'the numbers are too large or too far apart to be computed with ({reason(error)}); see whether columns and units are right')
         return NO_ANSWER
-    except (LogError, ModelError, MotionError, UsageError, OSError) as error:
-        print(f'gyro_calibration: {error}', file=sys.stderr)
+    except InputError as error:
+        say(error)
         return WRONG_USE
-    if answer is not None:
-        _show(json.dumps(_numbers(answer.data), allow_nan=False) if given.json else answer.text)
+    except OSError as error:
+        say(explained(error))
+        return WRONG_USE
+    if text is not None:
+        _show(text)
     return DONE
+
+
+def _text(answer: Answer, as_json: bool) -> str:
+    return json.dumps(_numbers(answer.data), allow_nan=False) if as_json else answer.text
 
 
 def _numbers(value: Any) -> Any:
@@ -67,13 +73,20 @@ def _show(text: str) -> None:
     """Print; a reader that has gone, as `head` does, is no error, nor is the name of a file that is no text."""
     encoding = sys.stdout.encoding or 'utf-8'
     try:
-        print(text.encode(encoding, 'backslashreplace').decode(encoding), flush=True)
+        print(plain(text, kept='\n').encode(encoding, 'backslashreplace').decode(encoding), flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with arguments without what a terminal would obey, as names of files have it."""
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        super()._print_message(plain(message, kept='\n'), file)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='gyro_calibration', description='Calibrate a gyro, so that a robot knows its heading.')
+    parser = _Parser(prog='gyro_calibration', description='Calibrate a gyro, so that a robot knows its heading.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
     for verb in VERBS:

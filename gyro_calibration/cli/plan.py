@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.cli.verb import Answer, UsageError, bar, positive, verb, whole
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION, NAMED, Motion, read_motion
@@ -85,7 +85,7 @@ def read_limits(path: str) -> Ability:
     try:
         content = read_settings(path)
     except (OSError, ValueError) as error:
-        raise UsageError(f'{path}: cannot be read as YAML ({error}); begin with a copy of config/limits.yaml') from error
+        raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); begin with a copy of config/limits.yaml') from error
     if not isinstance(content, dict):
         raise UsageError(f'{path}: holds no names with values; wanted {", ".join(NEEDED)} and others, as in config/limits.yaml')
     unknown = [name for name in content if name not in LIMITS]

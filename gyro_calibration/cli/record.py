@@ -14,11 +14,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gyro_calibration.cli.verb import Answer, UsageError, positive, verb
+from gyro_calibration.cli.verb import Answer, UsageError, positive, say, verb
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import KINDS, PIECE, CsvRecorder, DiskFull, McapRecorder, MessageLog, Notes, about
+from gyro_calibration.files import plain
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.messages import BILLION
 from gyro_calibration.storage import Message
@@ -142,7 +143,7 @@ class _Session:
     def run(self) -> None:
         """Record until it is to end, and close the file whatever happens."""
         try:
-            with tqdm(desc=self._given.out, unit=' samples', leave=False, disable=None) as shown:
+            with tqdm(desc=plain(self._given.out), unit=' samples', leave=False, disable=None) as shown:
                 try:
                     self._take(lambda: self._tick(shown))
                 finally:
@@ -237,7 +238,7 @@ class _PortSession(_Session):
             return  # it listens again at each attempt
         found, self._told = self._connection, said
         name = f'samples of {found.protocol.name} come at {found.baud} bit/s' if found.protocol else ''
-        print(f'gyro_calibration: {name if state.name == "reading" else said}', file=sys.stderr)
+        say(name if state.name == 'reading' else said)
 
     def _why(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
@@ -320,8 +321,7 @@ class _TopicSession(_Session):
             self._waiting = False
             self._missing, self._known = node.missing, node.known()
             if self._missing:
-                print(f'gyro_calibration: nobody publishes {", ".join(self._missing)} so far; there are {", ".join(self._known) or "none"}',
-                      file=sys.stderr)
+                say(f'nobody publishes {", ".join(self._missing)} so far; there are {", ".join(self._known) or "none"}')
 
     def _details(self) -> dict[str, Any]:
         return {**super()._details(), 'messages': self._heard}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import secrets
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def _simulate(given: argparse.Namespace) -> Answer:
 
 def simulated(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
-    if given.motion not in NAMED and not Path(given.motion).exists():
+    if given.motion not in NAMED and not os.path.exists(given.motion):
         raise UsageError(f'{given.motion}: there is no such motion; name a file, or one of {", ".join(NAMED)}')
     motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
     if motion.duration * given.sample_rate > MOST:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -16,14 +17,14 @@ from typing import Any
 from tqdm import tqdm
 
 from gyro_calibration import __version__
-from gyro_calibration.files import LARGEST
+from gyro_calibration.files import LARGEST, InputError, opened, plain
 from gyro_calibration.log import DEGREE, Array, Log, read_log, read_log_blocks
 from gyro_calibration.model import GyroModel
 from gyro_calibration.recording import Topics, blocks_of, read_recording
 from gyro_calibration.storage import files_of, is_recording
 
 
-class UsageError(ValueError):
+class UsageError(InputError):
     """The program was called in a way that cannot work; the message is one sentence."""
 
 
@@ -100,6 +101,11 @@ def read(given: argparse.Namespace) -> Log:
     return _turned(given, log)
 
 
+def say(text: object) -> None:
+    """Say something on standard error."""
+    print(f'gyro_calibration: {plain(text)}', file=sys.stderr, flush=True)
+
+
 def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
     """Show on a terminal how far the work on some items is, if it takes longer than two seconds."""
     return tqdm(items, desc=what, delay=2.0, leave=False, disable=None)
@@ -107,7 +113,8 @@ def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
 
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:
     """Return what a model file says of where it comes from: logs, date, program."""
-    files = [{'name': file.name, **({'sha256': digest(file)} if file.is_file() else {})} for path in paths for file in files_of(path)]
+    files = [{'name': plain(file.name), **({'sha256': digest(file)} if os.path.isfile(file) else {})}
+             for path in paths for file in files_of(path)]
     return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'), 'program': f'gyro_calibration {__version__}'}
 
 
@@ -119,7 +126,7 @@ def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 def digest(path: Path) -> str:
     """Return the SHA-256 of a file, which is no pipe: that was read already, and would be waited for."""
     found = hashlib.sha256()
-    with open(path, 'rb') as file:
+    with opened(path) as file:
         while piece := file.read(1 << 20):
             found.update(piece)
     return found.hexdigest()
@@ -138,9 +145,8 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
 @contextmanager
 def _bytes_of(path: str) -> Iterator[Callable[[int], None]]:
     """Show on a terminal how many bytes of a log are read, and give the function that is to be told."""
-    files = [file for file in files_of(path) if file.is_file()]
-    size = sum(file.stat().st_size for file in files) or None
-    with tqdm(total=size, desc=path, unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
+    size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
+    with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
         yield lambda place: _show_place(shown, place)
 
 
@@ -152,7 +158,7 @@ def _recorded(given: argparse.Namespace) -> Log:
     """Read a recording, and say on standard error what was taken and mended: no answer of a verb shows the notes of a log."""
     topics = Topics(given.topic, given.reference_topic, given.temperature_topic)
     with _bytes_of(given.log) as heard:
-        return read_recording(given.log, topics, given.rate, heard, lambda note: print(f'gyro_calibration: {note}', file=sys.stderr))
+        return read_recording(given.log, topics, given.rate, heard, say)
 
 
 def _sensitivity(given: argparse.Namespace) -> float | None:
