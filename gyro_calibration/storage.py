@@ -2,7 +2,8 @@
 What a ROS 2 recording holds: the messages of a folder, of an .mcap file or of a .db3 file.
 
 A recording whose program was killed lacks its closing part and the index, so neither is looked at: the records are gone through from the
-beginning, up to the end or the tear. Nothing in a file is believed that could take more memory than `LARGEST`.
+beginning, up to the end or the tear. Nothing in a file is believed that could take more memory than `LARGEST`, or that grows to more than
+`GROWTH` times the file.
 
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import os
 import re
 import shutil
 import sqlite3
@@ -25,13 +27,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
+from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
 from gyro_calibration.log import LogError, shown
 from gyro_calibration.messages import LAYOUTS
 
 #: Bytes of a record or of a chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
 LARGEST = 1 << 28
-#: Times that a compressed file may grow; sensor data shrink to a tenth.
-GROWTH = 200
 _PIECE = 1 << 20
 
 _MAGIC = b'\x89MCAP0\r\n'
@@ -72,13 +73,12 @@ class Contents:
 
 def said(text: object) -> str:
     """Return a text of a file as it may stand in a sentence: in one line, not too long, and without what a terminal would obey."""
-    return ''.join(each if each.isprintable() else '?' for each in ' '.join(str(text).split()))[:_MOST_CHARACTERS]
+    return plain(' '.join(str(text).split()))[:_MOST_CHARACTERS]
 
 
 def is_recording(path: str | Path) -> bool:
     """Return whether a path is that of a recording, by its name."""
-    path = Path(path)
-    return path.is_dir() or _kind_of(path) is not None
+    return os.path.isdir(path) or _kind_of(Path(path)) is not None
 
 
 def files_of(path: str | Path) -> list[Path]:
@@ -93,9 +93,12 @@ def files_of(path: str | Path) -> list[Path]:
 
     """
     path = Path(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return [path]
-    found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
+    try:
+        found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
+    except OSError as error:
+        raise LogError(f'{path}: cannot be read ({reason(error)}); {remedy(error, path)}') from error
     if not found:
         raise LogError(f'{path}: a folder without an .mcap or .db3 file; name the folder of a ROS 2 recording, or a log file')
     return sorted(found, key=_natural)
@@ -119,12 +122,12 @@ def read_messages(path: str | Path, contents: Contents, heard: Heard = lambda pl
     done = 0
     for file in files_of(path):
         try:
-            with _plain(file) as plain:
+            with _unpacked_file(file) as source:
                 read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
-                yield from read(plain, file, contents, partial(_shifted, heard, done))
+                yield from read(source, file, contents, partial(_shifted, heard, done))
             done += file.stat().st_size
         except OSError as error:
-            raise LogError(f'{file}: cannot be read ({error.strerror or error})') from error
+            raise LogError(f'{file}: cannot be read ({reason(error)}); {remedy(error, file)}') from error
     if contents.left_out:
         parts = 'part of the recording was' if contents.left_out == 1 else 'parts of the recording were'
         contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
@@ -144,20 +147,40 @@ def _natural(path: Path) -> list[Any]:
 
 
 @contextmanager
-def _plain(path: Path) -> Iterator[Path]:
+def _unpacked_file(path: Path) -> Iterator[Path]:
     """Give a file without its compression."""
-    if path.suffix != '.zstd':
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder, open(path, 'rb') as packed:
-        plain, left = Path(folder) / path.stem, GROWTH * path.stat().st_size + LARGEST
-        with open(plain, 'wb') as file:
-            for piece in _unpacked(packed):
-                left -= len(piece)
-                if left < 0:
-                    raise LogError(f'{path}: grows to more than {GROWTH} times its size; it is not a recording')
-                file.write(piece)
-        yield plain
+    with opened(path) as packed:
+        if path.suffix != '.zstd':
+            yield path
+            return
+        with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+            source, budget = Path(folder) / path.stem, _Budget(path)
+            with open(source, 'wb') as file:
+                for piece in _unpacked(packed):
+                    budget.spend(len(piece))
+                    file.write(piece)
+            yield source
+
+
+class _Budget:
+    """What the content of a file may grow to where it is compressed."""
+
+    def __init__(self, path: Path):
+        self._path, self._left = path, GROWN + GROWTH * path.stat().st_size
+
+    def spend(self, size: int) -> None:
+        """
+        Take some bytes.
+
+        Raises
+        ------
+        LogError : there are too many
+
+        """
+        self._left -= size
+        if self._left < 0:
+            raise LogError(f'{self._path}: grows to more than {GROWTH} times its size, as no recording does; record again, or unpack it if '
+                           'that is what was recorded')
 
 
 def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
@@ -183,12 +206,12 @@ def _library(name: str) -> Any:
 # MCAP
 
 
-def _from_mcap(plain: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
-    with open(plain, 'rb') as file:
-        end = plain.stat().st_size
+def _from_mcap(source: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+    with open(source, 'rb') as file:
+        end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader, told = _McapReader(contents), 0
+        reader, told = _McapReader(contents, _Budget(path)), 0
         for code, body in _records(file, end, contents):
             if code == _DATA_END:
                 return
@@ -223,8 +246,8 @@ def _records(stream: BinaryIO, end: int, contents: Contents) -> Iterator[tuple[i
 class _McapReader:
     """Reads the records of one file; it remembers channels and their schemas."""
 
-    def __init__(self, contents: Contents):
-        self._contents = contents
+    def __init__(self, contents: Contents, budget: _Budget):
+        self._contents, self._budget = contents, budget
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str]] = {}
 
@@ -232,7 +255,7 @@ class _McapReader:
         """Give the messages in a record; a torn chunk is read as far as it goes."""
         try:
             if code == _CHUNK:
-                data = _chunk_data(body, torn)
+                data = _chunk_data(body, torn, self._budget)
                 for inner, content in _records(io.BytesIO(data), len(data), self._contents):
                     yield from self.read(inner, content) if inner != _CHUNK else ()
             elif code == _MESSAGE:
@@ -259,7 +282,7 @@ class _McapReader:
     def _message(self, body: bytes) -> Iterator[Message]:
         number, _, received, _ = struct.unpack_from('<HIQQ', body)
         if number in self._channels:
-            yield Message(*self._channels[number], received, _message_data(body[22:]))
+            yield Message(*self._channels[number], received, _message_data(body[22:], self._budget))
 
 
 class _Damaged(ValueError):
@@ -284,50 +307,63 @@ def _about(body: bytes) -> list[str]:
     return notes
 
 
-def _chunk_data(body: bytes, torn: bool) -> bytes:
+def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:
     """Return the records of a chunk as bytes, and of a torn one those that are there."""
     _, _, size, check = struct.unpack_from('<QQQI', body)
     compression, place = _text(body, 28)
     if size > LARGEST:
         raise _Damaged
-    data = _expanded(compression, body[place + 8:], size)
+    data = _expanded(compression, body[place + 8:], size, budget)
     if not torn and (len(data) != size or check and zlib.crc32(data) != check):
         raise _Damaged
     return data
 
 
-def _expanded(compression: str, data: bytes, size: int) -> bytes:
+def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> bytes:
     """Return what is in compressed data, and not more than the size that it should have."""
     if compression == '':
         return data[:size]
-    if compression == 'zstd':
-        pieces, length = [], 0
-        for piece in _unpacked(io.BytesIO(data)):
-            pieces.append(piece)
-            length += len(piece)
-            if length > size:
-                break
-        return b''.join(pieces)[:size]
-    if compression == 'lz4':
-        try:
-            expanded: bytes = _library('lz4.frame').LZ4FrameDecompressor().decompress(data, max_length=size)
-        except (RuntimeError, EOFError) as error:
-            raise _Damaged from error
-        return expanded
-    raise _Damaged
+    if compression not in _COMPRESSIONS:
+        raise _Damaged
+    expanded = bytearray()
+    for piece in _COMPRESSIONS[compression](data):
+        budget.spend(len(piece))
+        expanded += piece
+        if len(expanded) > size:
+            break
+    del expanded[size:]
+    return bytes(expanded)
 
 
-def _message_data(data: bytes) -> bytes:
+def _from_zstandard(data: bytes) -> Iterator[bytes]:
+    return _unpacked(io.BytesIO(data))
+
+
+def _from_lz4(data: bytes) -> Iterator[bytes]:
+    decompressor = _library('lz4.frame').LZ4FrameDecompressor()
+    try:
+        piece = decompressor.decompress(data, max_length=_PIECE)
+        while piece:
+            yield piece
+            piece = b'' if decompressor.eof else decompressor.decompress(b'', max_length=_PIECE)
+    except (RuntimeError, EOFError) as error:
+        raise _Damaged from error
+
+
+_COMPRESSIONS = {'zstd': _from_zstandard, 'lz4': _from_lz4}
+
+
+def _message_data(data: bytes, budget: _Budget) -> bytes:
     """Return the bytes of a message that may be compressed by itself."""
-    return _expanded('zstd', data, 1 << 16) if data.startswith(_ZSTANDARD_MAGIC) else data
+    return _expanded('zstd', data, 1 << 16, budget) if data.startswith(_ZSTANDARD_MAGIC) else data
 
 
 # SQLite
 
 
-def _from_database(plain: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
-    with _database(plain, path, contents) as database:
-        channels = _topics(database, path, contents)
+def _from_database(source: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+    with _database(source, path, contents) as database:
+        channels, budget = _topics(database, path, contents), _Budget(path)
         size, last, count = path.stat().st_size, _last_row(database), 0
         try:
             for row, topic, received, data in _rows(database):
@@ -339,17 +375,22 @@ def _from_database(plain: Path, path: Path, contents: Contents, heard: Heard) ->
                 if not (isinstance(received, int) and isinstance(data, bytes)):
                     contents.left_out += 1
                     continue
-                yield Message(*channels[topic], received, _message_data(data))
+                yield Message(*channels[topic], received, _message_data(data, budget))
         except _DATABASE_ERRORS as error:
             contents.notes.append(f'{path.name} is damaged after {count} messages ({_why(error)}), and was read up to there')
 
 
 @contextmanager
-def _database(plain: Path, path: Path, contents: Contents) -> Iterator[sqlite3.Connection]:
-    """Open a database for reading only: with what a killed writer left beside it, without, and at last as much as is there of it."""
+def _database(source: Path, path: Path, contents: Contents) -> Iterator[sqlite3.Connection]:
+    """
+    Open a database for reading only: with what a killed writer left beside it, without, and at last as much as is there of it.
+
+    Its tables are read as they lie there: nothing in its schema is computed, whose cost nothing in the file would bound.
+
+    """
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
-        ways = ('mode=ro', lambda: plain), ('mode=ro&immutable=1', lambda: plain), ('mode=ro', lambda: _shortened(plain, Path(folder)))
+        ways = ('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source), ('mode=ro', lambda: _shortened(source, Path(folder)))
         for how, file in ways:
             try:
                 database, tables = _opened(file(), how)
@@ -358,7 +399,7 @@ def _database(plain: Path, path: Path, contents: Contents) -> Iterator[sqlite3.C
                 continue
             with closing(database):
                 if not {'topics', 'messages'} <= tables:
-                    raise LogError(f'{path}: is a database, but not a ROS 2 recording; name a recording')
+                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables of stored columns; name a recording')
                 yield database
                 return
     raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); name a recording, or record again')
@@ -369,20 +410,48 @@ def _why(error: Exception | None) -> str:
 
 
 def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
-    """Return a database and the names of its tables, which show whether it can be read."""
+    """Return a database and the names of its plain tables, which show whether it can be read."""
     database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
     try:
         database.text_factory = partial(str, encoding='utf-8', errors='replace')
-        # A view could go on for ever, a table cannot.
-        return database, {name for name, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        database.set_progress_handler(_Steps(file.stat().st_size), _Steps.AT_ONCE)
+        if sys.version_info >= (3, 11):
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _PIECE)
+        database.execute('PRAGMA trusted_schema = OFF')
+        tables = {name for name, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        stored = {name for name in sorted(tables & {'topics', 'messages'})
+                  if not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
+        database.set_authorizer(_authorized)
+        return database, stored
     except BaseException:
         database.close()
         raise
 
 
-def _shortened(plain: Path, folder: Path) -> Path:
+class _Steps:
+    """Ends what takes more steps of SQLite than the rows of a file can: the smallest row has a dozen bytes and takes some 30 steps."""
+
+    AT_ONCE, A_BYTE, ANYWAY = 1000, 10, 1_000_000
+
+    def __init__(self, size: int):
+        self._left = self.A_BYTE * size + self.ANYWAY
+
+    def __call__(self) -> bool:
+        self._left -= self.AT_ONCE
+        return self._left < 0
+
+
+def _authorized(action: int, first: str | None, second: str | None, _: str | None, within: str | None) -> int:
+    """Let SQLite read the two tables of a recording, with the functions that are used here, and nothing that a view asks for."""
+    reads = action == sqlite3.SQLITE_READ and first in ('topics', 'messages')
+    computes = action == sqlite3.SQLITE_FUNCTION and second in ('length', 'max', 'typeof')
+    allowed = within is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
+    return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
+
+
+def _shortened(source: Path, folder: Path) -> Path:
     """Return a copy of a torn database that says itself how long it is, for none is opened that is shorter than it says."""
-    copy = Path(shutil.copy(plain, folder))
+    copy = Path(shutil.copy(source, folder))
     with open(copy, 'r+b') as file:
         head = file.read(100)
         if len(head) == 100:
@@ -415,5 +484,9 @@ def _last_row(database: sqlite3.Connection) -> int:
 
 
 def _rows(database: sqlite3.Connection) -> Iterator[Any]:
-    """Give row, topic, time and data of the messages; none of those that are wanted here is large."""
-    return database.execute('SELECT rowid, topic_id, timestamp, CASE WHEN length(data) < 65536 THEN data END FROM messages')
+    """Give row, topic, time and data of the messages; none of those that are wanted here is large, and nothing else is loaded."""
+    return database.execute("""
+        SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
+               CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
+               CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
+        FROM messages""")
