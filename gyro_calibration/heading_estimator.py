@@ -36,7 +36,7 @@ _LOST_RATE, _LOST = 1.0 / 60.0, 15.0
 _STILL = 0.5
 #: In motion that is computed so often, s, and where the rate has changed by more than so much, rad/s, and such a part of it.
 _HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
-#: A calibration that turns out to be older or younger by so much is carried anew, s.
+#: A calibration that turns out to be older or younger by so much is carried anew, s; one from further ahead has no known age.
 _OLDER = 3600.0
 #: Plausible stamps, s, and specific forces, m/s², are not beyond.
 _LATEST, _STRONGEST = 1e12, 1e5
@@ -216,6 +216,9 @@ class HeadingEstimator:
             return model, None
         carried = carry(calibration, self.table, self.age(now), now, self._known_temperature, self._this_run)
         self._sentence = carried.sentence
+        if (self._dated(now) or 0.0) < -_OLDER:
+            self._sentence = (f'the calibration is dated {calibration.time}, which is later than the clock of this computer: its age is '
+                              'not known and taken for a year; set the clock, or calibrate again')
         return with_self_calibration(model, carried.calibration), 0.0
 
     def _from_table(self, model: GyroModel, now: float) -> tuple[GyroModel, float | None]:
@@ -232,14 +235,19 @@ class HeadingEstimator:
         return self._sentence if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else ''
 
     def age(self, now: float) -> float:
-        """Return how long ago the bias was calibrated, s; a year where nobody wrote it down."""
+        """Return how long ago the bias was calibrated, s; a year where nobody knows."""
+        age = self._dated(now)
+        return _YEAR if age is None or age < -_OLDER else max(age, 0.0)
+
+    def _dated(self, now: float) -> float | None:
+        """Return the age, s, as the date and the clock have it; None without a date."""
         calibration = self.model.self_calibration
         written = calibration.time if calibration else str(self.model.origin.get('date', ''))
         try:
             when = datetime.fromisoformat(written)
         except ValueError:
-            return _YEAR
-        return max(now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp(), 0.0)
+            return None
+        return now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp()
 
     def known_for(self, now: float) -> float:
         """Return since when the variance of the bias holds, s: a carried calibration has its age in it."""

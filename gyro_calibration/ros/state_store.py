@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import errno
+import os
 from pathlib import Path
 
 from gyro_calibration.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
-from gyro_calibration.files import remove_leftovers, version
+from gyro_calibration.files import plain, reason, remedy, remove_leftovers, version
 from gyro_calibration.model import GyroModel, SelfCalibration, same_effects, with_self_calibration
-from gyro_calibration.model_file import ModelError, read_model, write_model
+from gyro_calibration.model_file import ModelError, ModelMissing, read_model, write_model
 
 
 class StateStore:
@@ -45,7 +45,7 @@ class StateStore:
         for file, seen in self._seen.items():
             found = _version(file)
             if found is not None and found != seen:
-                self.shared_hint = (f'{file} was written by somebody else, and whoever writes next replaces that: give each node a '
+                self.shared_hint = plain(f'{file} was written by somebody else, and whoever writes next replaces that: give each node a '
                                     'calibration_file of its own, or restart this one to use what is there')
 
     def _written(self, file: Path, version: tuple[int, int]) -> None:
@@ -55,23 +55,19 @@ class StateStore:
         model = GyroModel()
         if model_file:
             try:
-                model = read_model(Path(model_file).expanduser())
+                model = read_model(os.path.expanduser(model_file))
             except ModelError as error:
                 self.problem = f'uncalibrated: {error}'
                 return model
-        if not self._calibration_file.exists():
-            return model
         try:
             stored = read_model(self._calibration_file)
+        except ModelMissing:
+            return model
         except ModelError as error:
             self.hint = f'the last self-calibration is not used: {error}'
             return model
-        if not same_effects(stored, model):
-            self.hint = f'the self-calibration in {self._calibration_file} is not used: it belongs to another model; calibrate again'
-            return model
-        if all(numbers := [each.gyro.get('serial_number', '') for each in (stored, model)]) and numbers[0] != numbers[1]:
-            self.hint = (f'the self-calibration in {self._calibration_file} is not used: it belongs to the gyro with the serial number '
-                         f'{numbers[0]}, and the model to {numbers[1]}; calibrate again')
+        if fault := _fault(stored, model):
+            self.hint = plain(f'the self-calibration in {self._calibration_file} is not used: {fault}; calibrate again')
             return model
         return with_self_calibration(model, stored.self_calibration)
 
@@ -81,7 +77,8 @@ class StateStore:
         try:
             self._written(self._calibration_file, write_model(self._calibration_file, self.model))
         except OSError as error:
-            self.hint = f'the calibration is in use but NOT STORED ({error}): {_remedy(error, self._calibration_file)} and calibrate again'
+            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): {remedy(error, self._calibration_file)}, '
+                              'and calibrate again')
         return self.hint
 
     def keep_table(self, now: float, ending: bool = False) -> None:
@@ -94,12 +91,20 @@ class StateStore:
             self._written(self._bias_file, written)
         except OSError as error:
             self.table.not_kept(now)
-            self.table_hint = f'the bias table cannot be written ({error}): {_remedy(error, self._bias_file)}'
+            self.table_hint = plain(f'the bias table cannot be written ({reason(error)}): {remedy(error, self._bias_file)}')
 
 
-def _remedy(error: OSError, file: Path) -> str:
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return f'make room in {file.parent}' if full else f'make {file} writable'
+def _fault(stored: GyroModel, model: GyroModel) -> str:
+    """Return why a stored self-calibration does not belong to a model, as a part of a sentence; '' if it does."""
+    if stored.self_calibration is None:
+        return 'the file holds none, as one that was cut off'
+    if not same_effects(stored, model):
+        return 'it belongs to another model'
+    theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))
+    if theirs == ours:
+        return ''
+    of = f'the gyro with the serial number {theirs}' if theirs else 'a gyro without a serial number'
+    return f'it belongs to {of}, and the model to {ours or "one without"}'
 
 
 def _version(file: Path) -> tuple[int, int] | None:
