@@ -87,6 +87,15 @@ class Intervals:
         self._until -= 1
         if not self._until:
             self._look()
+        return self.count(interval)
+
+    def count(self, interval: float) -> int:
+        """
+        Return how many samples are lost in an interval, s, and count them.
+
+        Alone for one over which nothing is integrated: it says nothing of the usual one.
+
+        """
         if interval > self._limit:
             self._late = max(round((interval - self._even) / self.usual), 1)
             self.lost += self._late

@@ -462,6 +462,7 @@ class HeadingTracker:
         self._recognize()
         if interval < 0.0:
             return f'the stamp jumps back by {-interval:.3f} s'
+        self.intervals.count(interval)
         self._go_on(replace(self._nothing, duration=interval, lost=(fastest * interval) ** 2, unseen=True), self._reached)
         self._take()
         return f'no samples for {interval:.3f} s'
@@ -603,6 +604,10 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     still : as in `HeadingTracker.add`
     hindsight : let all that came later speak too
 
+    Raises
+    ------
+    OverflowError : hindsight is wanted, and a heading or its variance is no finite number
+
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
     found = np.empty((len(time), 5))
@@ -613,6 +618,8 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted, tracker.intervals)
     if not hindsight:
         return live
+    if not np.isfinite(found).all():
+        raise OverflowError('the variance of the heading is beyond all numbers')
     later, with_hindsight, rested = in_hindsight(tracker, time, rate)
     return replace(live, heading=later, variance=with_hindsight, resting=rested)
 

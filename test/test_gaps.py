@@ -147,6 +147,17 @@ def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
     assert found.intervals.lost == (~comes).sum() and found.intervals.longest == pytest.approx(0.9, abs=0.02)
 
 
+@pytest.mark.parametrize('false_alarms', [0.0, 0.1])
+@pytest.mark.parametrize('gap', [0.5, 0.99, 1.01, 30.0, 86400.0])
+def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap, false_alarms):
+    tracker, lost, losses = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms)), round(gap / INTERVAL), 3
+    for index in range(400 * (losses + 1)):
+        said = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
+        assert bool(said) == (gap > 1.0 and index % 400 == 0 < index)
+    assert tracker.intervals.lost == losses * lost and tracker.intervals.longest == pytest.approx(gap + INTERVAL)
+    assert tracker.intervals.usual == pytest.approx(INTERVAL)
+
+
 def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that_waits():
     tracker, still = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings()), np.array([0.0, -1.0])
     generator, headings = np.random.default_rng(4), []

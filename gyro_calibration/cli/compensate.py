@@ -98,12 +98,24 @@ def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> 
     """Give the log block by block with its new columns, and count what is found in it."""
     pieces = _followed(given, model) if given.rest or given.hindsight else _pieces(given, model)
     for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
+        _refuse_infinite(given, piece)
         found.add(piece)
         yield piece.log, {name: _at(piece.known, values) for name, values in piece.columns.items()}
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
     if found.rows == found.rows_without_output + found.refused_samples:
         raise DataRefused(f'{given.log}: {none_plausible(model)}')
+
+
+def _refuse_infinite(given: argparse.Namespace, piece: _Piece) -> None:
+    """Refuse a sample for which the model gives no finite rate or heading."""
+    for name, values in piece.columns.items():
+        if not (finite := np.isfinite(values)).all():
+            row = int(np.argmin(finite))
+            output = float(np.asarray(piece.log.output)[piece.known][row])
+            at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
+            raise DataRefused(f'{given.log}: {name} is no finite number from an output of {output:g} rad/s{at} on; remove the sample if no '
+                              'gyro says that, or see whether columns, units and the model are right')
 
 
 def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
