@@ -1,0 +1,464 @@
+"""
+Files that are no files, that cannot be opened, that grow without end, or that say odd things.
+
+Each ends within seconds in one sentence that names it and says what to do, or is read for what it
+is; what was there before is there afterwards.
+
+"""
+
+import json
+import os
+import re
+import signal
+import socket
+import sqlite3
+import stat
+import struct
+import subprocess
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from gyro_calibration.bias_table import BiasTable, Prior
+from gyro_calibration.files import InputError, explained, plain, reason, write_atomically
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import Log, LogError, read_log, write_log
+from gyro_calibration.model import GyroModel, SelfCalibration
+from gyro_calibration.model_file import ModelError, read_model, write_model
+from gyro_calibration.motion import MotionError, read_motion
+from gyro_calibration.noise import Noise
+from gyro_calibration.ros.state_store import StateStore
+from gyro_calibration.storage import Contents, read_messages
+from gyro_calibration.tracking import Settings
+
+MODEL = 'effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 1.0e-4}\n'
+ROWS = ''.join(f'{row / 100:.2f},{0.1 * (row % 7)}\n' for row in range(400))
+LONG = 300 * 'x'
+
+
+@pytest.fixture(autouse=True)
+def _within_seconds():
+    """Let a test that waits for ever fail instead."""
+    def fail(*_):
+        raise TimeoutError('it waits')
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / 'model.yaml').write_text(MODEL)
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ROWS)
+    return tmp_path
+
+
+def make_socket(path):
+    with socket.socket(socket.AF_UNIX) as made:
+        made.bind(str(path))
+
+
+KINDS = {'a pipe': os.mkfifo, 'a socket': make_socket, 'a folder': os.mkdir,
+         'a device': lambda path: os.symlink('/dev/null', path)}
+each_kind = pytest.mark.parametrize('kind', KINDS)
+
+
+# What is no file
+
+
+@each_kind
+@pytest.mark.parametrize('read, error, name', [
+    (lambda path: read_log(path), LogError, 'a.csv'),
+    (lambda path: read_log(path), LogError, 'a.csv.gz'),
+    (lambda path: read_model(path), ModelError, 'a.yaml'),
+    (lambda path: read_motion(path), MotionError, 'a.csv'),
+    (lambda path: list(read_messages(path, Contents())), LogError, 'a.mcap'),
+    (lambda path: list(read_messages(path, Contents())), LogError, 'a.mcap.zstd'),
+    (lambda path: list(read_messages(path, Contents())), LogError, 'a.db3'),
+], ids=['log', 'packed log', 'model', 'motion', 'mcap', 'packed mcap', 'db3'])
+def test_what_is_no_file_is_not_read(read, error, name, kind, tmp_path):
+    KINDS[kind](tmp_path / name)
+    with pytest.raises(error) as raised:
+        read(tmp_path / name)
+    assert str(tmp_path / name) in str(raised.value)
+    assert kind in str(raised.value) or name.endswith('3') or kind == 'a folder', raised.value
+
+
+@each_kind
+def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, folder, run):
+    words = ['compensate', folder / 'log.csv', '--model', folder / 'model.yaml', '--out']
+    for name in ('.out.csv.abcd1234', '.calibration.yaml.abcd1234', 'there.csv', 'calibration.yaml'):
+        KINDS[kind](folder / name)
+    before = {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()}
+    assert run(*words, folder / 'out.csv')[0] == 0
+    code, _, error = run(*words, folder / 'there.csv')
+    assert code == 2 and f'there.csv: it is {kind}, where a file is wanted; name a file' in error
+    store = StateStore('', folder / 'calibration.yaml', folder / 'biases.yaml', Prior())
+    assert kind in store.hint and store.model.self_calibration is None
+    assert 'NOT STORED' in store.keep(SelfCalibration(0.01, 0.02)) and 'name a file' in store.hint
+    (folder / 'out.csv').unlink()
+    assert {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()} == before
+
+
+def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
+    os.mkfifo(tmp_path / 'log.csv')
+    writer = 'import sys, time; file = open(sys.argv[1], "w"); time.sleep(2); print("gyro_dps\\n1\\n2", file=file)'
+    with subprocess.Popen([sys.executable, '-c', writer, tmp_path / 'log.csv'], stdout=subprocess.PIPE):
+        for _ in range(20):  # until the writer has begun, which a busy machine may hold up
+            try:
+                assert len(read_log(tmp_path / 'log.csv')) == 2
+                return
+            except LogError as error:
+                assert 'a pipe that nobody writes to' in str(error)
+    raise AssertionError('it was never read')
+
+
+# What cannot be opened
+
+
+@pytest.mark.parametrize('path, words', [
+    (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
+    ('log.csv/a.csv', 'a directory|file exists'), ('circle.csv', 'too many levels of symbolic links'),
+    ('closed/a.csv', 'permission denied')])
+def test_what_cannot_be_opened_is_said_with_its_remedy(path, words, folder, run, monkeypatch):
+    (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
+    deny(monkeypatch, folder / 'closed')
+    path = folder / path
+    for read, error in ((read_log, LogError), (read_model, ModelError), (read_motion, MotionError)):
+        with pytest.raises(error) as raised:
+            read(path)
+        assert re.search(words, str(raised.value)) or 'closed' in str(path)
+    store = StateStore(str(path), path, path.with_suffix('.yaml'), Prior())
+    assert 'uncalibrated' in store.problem and str(path) in store.problem
+    store = StateStore('', path, path.with_suffix('.yaml'), Prior())
+    if 'circle' not in path.name:  # a link is replaced by what is written
+        said = store.keep(SelfCalibration())
+        assert 'NOT STORED' in said and re.search(words, said)
+        code, _, error = run('compensate', folder / 'log.csv', '--model', folder / 'model.yaml', '--out', path)
+        assert code == 2 and error.count('\n') == 1 and re.search(words, error) and ';' in error
+    code, _, error = run('compensate', path, '--model', folder / 'model.yaml', '--out', folder / 'out.csv')
+    assert code == 2 and error.count('\n') == 1 and path.name in error
+
+
+def deny(monkeypatch, closed):
+    """Let a folder be closed also to root, who may do everything."""
+    for name in ('open', 'stat', 'lstat', 'listdir', 'mkdir', 'replace', 'scandir'):
+        real = getattr(os, name)
+
+        def refuse(path, *more, real=real, **how):
+            if isinstance(path, (str, os.PathLike)) and str(path).startswith(str(closed)):
+                raise PermissionError(13, 'Permission denied', str(path))
+            return real(path, *more, **how)
+        monkeypatch.setattr(os, name, refuse)
+
+
+def test_the_longest_name_that_there_may_be_is_written(folder):
+    path = folder / (251 * 'x' + '.csv')
+    write_atomically(path, b'new')
+    write_atomically(path, b'newer')
+    assert path.read_bytes() == b'newer' and len(os.listdir(folder)) == 3
+
+
+@pytest.mark.parametrize('number', [28, 30, 13, 36, 20, 2, 40, 122])
+def test_an_error_of_the_system_names_file_and_remedy(number):
+    said = explained(OSError(number, os.strerror(number), '/data/a\x1b[2Jb'))
+    assert said.startswith('/data/a\\x1b[2Jb: ') and '; ' in said and reason(OSError(number, 'X y')) == 'x y'
+
+
+# Links and modes
+
+
+WRITERS = {
+    'compensate': ('compensate log.csv --model model.yaml --out {}', 'a.csv'),
+    'packed': ('compensate log.csv --model model.yaml --out {}', 'a.csv.gz'),
+    'simulate': ('simulate --motion rest --model model.yaml --out {}', 'a.csv'),
+    'picture': ('allan rest.csv --picture {}', 'a.png'),
+    'model': ('allan rest.csv --out {}', 'a.yaml'),
+}
+
+
+@pytest.mark.parametrize('words, name', WRITERS.values(), ids=WRITERS)
+def test_a_link_is_replaced_and_a_file_keeps_its_mode(words, name, folder, run, monkeypatch):
+    if name.endswith('.png'):
+        pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    monkeypatch.chdir(folder)
+    if 'rest.csv' in words:
+        rates = 1e-3 * np.random.default_rng(0).standard_normal(3000)
+        write_log('rest.csv', Log(output=rates, time=np.arange(3000) / 100.0))
+    (folder / 'precious').write_text('precious')
+    (folder / name).symlink_to(folder / 'precious')
+    first = run(*words.format(name).split())
+    assert first[0] == 0, first
+    assert (folder / 'precious').read_text() == 'precious' and not (folder / name).is_symlink()
+    (folder / name).chmod(0o600)
+    again = run(*words.format(name).split())
+    assert again[0] == 0, again
+    assert (folder / name).stat().st_mode & 0o777 == 0o600
+
+
+def test_a_new_file_has_the_mode_that_the_umask_leaves_and_an_old_one_its_own(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_atomically(tmp_path / 'new', b'x')
+        assert (tmp_path / 'new').stat().st_mode & 0o777 == 0o640
+        for mode in (0o600, 0o664, 0o400):
+            (tmp_path / 'new').chmod(mode)
+            write_atomically(tmp_path / 'new', b'y')
+            assert (tmp_path / 'new').stat().st_mode & 0o777 == mode
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='only root gives files away')
+def test_a_file_keeps_its_owner(tmp_path):
+    write_atomically(tmp_path / 'a', b'x')
+    os.chown(tmp_path / 'a', 1234, 4321)
+    write_atomically(tmp_path / 'a', b'y')
+    status = (tmp_path / 'a').stat()
+    assert (status.st_uid, status.st_gid) == (1234, 4321)
+
+
+# What a terminal would obey
+
+
+ESCAPES = '\x1b[31m\x9b2J\u202e\u2066\x07\r'
+
+
+def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
+    name = folder / f'a{ESCAPES}b.csv'
+    name.write_bytes((folder / 'log.csv').read_bytes())
+    model, out = folder / 'model.yaml', folder / f'o{ESCAPES}.csv'
+    tries = [
+        ('compensate', name, '--model', model, '--out', out),
+        ('compensate', name, '--model', model, '--out', out, '--json'),
+        ('compensate', f'{name}2', '--model', model, '--out', out),
+        ('compensate', folder / 'log.csv', '--model', f'{model}{ESCAPES}', '--out', out),
+        ('compensate', name, f'--{ESCAPES}'), ('simulate', '--motion', ESCAPES, '--model', model, '--out', out),
+        ('allan', name), ('diagnose', name, '--out', folder / 'd'), ('fit', name, '--out', folder / 'm.yaml')]
+    for text in (f'time_s,gyro_dps{ESCAPES}\n0,1\n', f'time_s,gyro_dps\n0,{ESCAPES}\n1,1\n',
+                 f'{ESCAPES},gyro_dps,gyro_rad_s\n0,1,2\n'):
+        path = folder / f'{len(tries)}.csv'
+        path.write_text(text, newline='')
+        tries.append(('compensate', path, '--model', model, '--out', out))
+    path = folder / 'named.yaml'
+    path.write_text(MODEL + f'gyro: {{name: {json.dumps(ESCAPES)}}}\nbad{json.dumps(ESCAPES)}: 1\n')
+    tries.append(('compensate', folder / 'log.csv', '--model', path, '--out', out))
+    for words in tries:
+        code, answer, error = run(*words)
+        assert code in (0, 1, 2) and answer + error
+        assert not [each for each in answer + error if not each.isprintable() and each != '\n'], words
+
+
+def test_messages_are_one_printable_line():
+    assert str(InputError(f'a{ESCAPES}\nb')) == 'a\\x1b[31m\\x9b2J\\u202e\\u2066\\x07\\r\\nb'
+    assert plain(plain('\x1b')) == plain('\x1b') and plain('a\nb', kept='\n') == 'a\nb'
+    assert plain('Größe 1°, \udcff') == 'Größe 1°, \\udcff'
+
+
+# The calibration of a robot
+
+
+STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
+
+
+@pytest.mark.parametrize('model, calibration, hint', [
+    ('', 'effects: {}\n', 'holds none'),
+    ('effects: {}\n' + STORED, 'effects: {}\n', 'holds none'),
+    ('', 'effects: {}\ngyro: {serial_number: "8"}\n' + STORED, 'the serial number 8, and the model to one without'),
+    ('effects: {}\ngyro: {serial_number: "7"}\n', 'effects: {}\n' + STORED, 'without a serial number, and the model to 7'),
+    ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
+    ('', '', 'the file'),
+])
+def test_a_calibration_that_is_not_used_is_told(model, calibration, hint, tmp_path):
+    """One that the model file itself has is kept then."""
+    (tmp_path / 'model.yaml').write_text(model or 'effects: {}\n')
+    (tmp_path / 'calibration.yaml').write_text(calibration)
+    store = StateStore(str(tmp_path / 'model.yaml'), tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
+    assert hint in store.hint and 'not used' in store.hint and 'calibrate again' in store.hint
+    assert (store.model.self_calibration is not None) == ('self_calibration' in model)
+
+
+@pytest.mark.parametrize('ahead, known', [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
+def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
+    """Until the clock is right: a robot without a battery for it begins in the past."""
+    from gyro_calibration.assumptions import Assumptions
+    now, variance = 1.7e9, (1e-5) ** 2
+    date = str(np.datetime64(round(now + ahead), 's')) + '+00:00'
+    calibration = SelfCalibration(0.0, 0.01, ((1e-8, 0.0), (0.0, variance)), date)
+    model = GyroModel(noise=Noise(angle_random_walk=1e-4), self_calibration=calibration)
+    live = HeadingEstimator(model, BiasTable(model, Prior()), Assumptions(), Settings(), 10.0, now)
+    live.add(0.0, 0.01, now)
+    assert (live.age(now) == max(-ahead, 0.0)) == known == ('later than the clock' not in live.sentence)
+    assert known or live.bias_variance > 100.0 * variance
+    live.clock_was_set(ahead + 60.0)
+    live.add(0.01, 0.01, now + ahead + 60.0)
+    assert 'later than the clock' not in live.sentence and live.age(now + ahead + 60.0) == pytest.approx(60.0)
+
+
+# What grows
+
+
+@pytest.mark.parametrize('count', [1600, 30_000])
+def test_equal_names_of_columns_take_no_longer_than_others(count, tmp_path):
+    names = ['x'] * count
+    (tmp_path / 'wide.csv').write_text(f'gyro_dps,x.2,{",".join(names)}\n' + f'1,2,{",".join("3" * count)}\n' * 2)
+    found = list(read_log(tmp_path / 'wide.csv').others)
+    assert found[:4] == ['x.2', 'x', 'x.1', 'x.3'] and len(set(found)) == count + 1
+
+
+def text(value):
+    return struct.pack('<I', len(value)) + value.encode()
+
+
+def record(code, body):
+    return struct.pack('<BQ', code, len(body)) + body
+
+
+def mcap(content, compression, times):
+    """Return an MCAP file of so many equal chunks."""
+    compress = {'zstd': lambda data: pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
+                'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
+    packed = compress(content)
+    chunk = record(6, struct.pack('<QQQI', 0, 0, len(content), 0) + text(compression) + struct.pack('<Q', len(packed)) + packed)
+    schema = record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Imu') + text('ros2msg') + text(''))
+    channel = record(4, struct.pack('<HH', 1, 1) + text('/imu') + text('cdr') + text(''))
+    return b'\x89MCAP0\r\n' + schema + channel + chunk * times
+
+
+def small_messages(size):
+    message = record(5, struct.pack('<HIQQ', 1, 0, 0, 0))
+    return message * (size // len(message))
+
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4'])
+@pytest.mark.parametrize('content', [bytes, small_messages], ids=['zeros', 'messages'])
+def test_a_small_recording_that_unfolds_to_gigabytes_is_refused(content, compression, tmp_path):
+    (tmp_path / 'a.mcap').write_bytes(mcap(content(64 << 20), compression, 40 if compression == 'zstd' else 1))
+    refused(tmp_path / 'a.mcap', 'grows to more than 100 times its size')
+
+
+def test_messages_that_unfold_once_more_are_counted_too(tmp_path):
+    inner = pytest.importorskip('zstandard').ZstdCompressor().compress(bytes(1 << 16))
+    message = record(5, struct.pack('<HIQQ', 1, 0, 0, 0) + inner)
+    (tmp_path / 'a.mcap').write_bytes(mcap(message * 20_000, 'zstd', 1))
+    refused(tmp_path / 'a.mcap', 'grows to more than 100 times its size')
+
+
+def refused(path, words, megabytes=60):
+    """Check that a recording is refused, and that this takes little memory."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=words):
+            for _ in read_messages(path, Contents()):
+                pass
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < megabytes << 20
+
+
+PLAIN = 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB'
+
+
+@pytest.mark.parametrize('messages, more, words', [
+    (PLAIN + ' AS (CAST(hex(zeroblob(100000 + id)) AS BLOB)))', '', 'tables of stored columns'),
+    (PLAIN + ' AS (CAST(hex(zeroblob(10)) AS BLOB)) STORED)', '', 'tables of stored columns'),
+    ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
+     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n', '', 'not a ROS 2 recording'),
+    ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
+     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n',
+     "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'", 'cannot be read'),
+], ids=['generated', 'stored', 'view', 'view called a table'])
+def test_nothing_in_the_schema_of_a_recording_is_computed(messages, more, words, tmp_path):
+    with database(tmp_path / 'a.db3') as made:
+        made.execute(messages)
+        if 'AS (' in messages and 'VIEW' not in messages:
+            made.executemany('INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)', ((row,) for row in range(10)))
+        made.executescript(more)
+    refused(tmp_path / 'a.db3', words)
+
+
+def database(path):
+    made = sqlite3.connect(path)
+    made.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
+    made.execute("INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu', 'cdr')")
+    return made
+
+
+def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_path):
+    with database(tmp_path / 'a.db3') as made:
+        made.execute(PLAIN + ')')
+        rows = [(1, row, bytes(5_000_000 if row % 50 == 0 else 400)) for row in range(100)]
+        made.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)', rows)
+        made.execute('CREATE TRIGGER t AFTER INSERT ON messages BEGIN DELETE FROM messages; END')
+    contents = Contents()
+    assert len(list(read_messages(tmp_path / 'a.db3', contents))) == 98 and contents.left_out == 2
+
+
+# Numbers and letters that nobody meant
+
+
+ODD = {
+    'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n', 'header': b'time_s,gyro_dps\n',
+    'two rows': b'time_s,gyro_dps\n0,1\n1,1\n', 'all zero': rb'0,0', 'all equal': rb'0,5',
+    'huge': rb'0,1e19', 'tiny': rb'0,1e-300', 'one huge': rb'0,0', 'signs': rb'0,-1e19', 'nan': rb'0,nan',
+    'half nan': rb'0,nan', 'fast': rb'0,1', 'slow': rb'0,1',
+    'semicolons': b'time_s;gyro_dps\n0;1\n1;1\n', 'commas as points': b'time_s;gyro_dps\n0,0;1,5\n0,1;1,5\n',
+    'utf-16': 'time_s,gyro_dps\n0,1\n1,1\n'.encode('utf-16'), 'latin-1': 'time_s,gyro_dps,ä\n0,1,ö\n1,1,ü\n'.encode('latin-1'),
+    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'quotes': b'time_s,gyro_dps\n"0,1\n1,1\n', 'not packed': b'\x1f\x8b\x08abc',
+    'tabs': b'time_s\tgyro_dps\n0\t1\n1\t1\n', 'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
+    'bom and crlf': b'\xef\xbb\xbftime_s,gyro_dps\r\n0,1\r\n1,2\r\n2,1\r\n', 'cr': b'time_s,gyro_dps\r0,1\r1,2\r2,1\r',
+}
+
+
+def odd_log(name):
+    """Return the bytes of an odd log; of one given by a row, of 600 of them."""
+    if b'\n' in ODD[name] or b'\r' in ODD[name] or name in ('empty', 'not packed'):
+        return ODD[name]
+    value = ODD[name].partition(b',')[2].decode()
+    step = {'fast': 1e-9, 'slow': 1e17}.get(name, 0.01)
+    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300 else '1' if name == 'half nan' and row % 2 else value, row % 60)
+            for row in range(600)]
+    columns = 'time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc'
+    return '\n'.join([columns, *(f'{time},{rate},{rate},{warm}' for time, rate, warm in rows), '']).encode()
+
+
+VERBS = {
+    'compensate': 'compensate {log} --model {model} --out {out}',
+    'rest': 'compensate {log} --model {model} --out {out} --rest',
+    'hindsight': 'compensate {log} --model {model} --out {out} --hindsight',
+    'counts': 'compensate {log} --model {model} --out {out} --sensitivity 1e19',
+    'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19', 'fit': 'fit {log} --out {out}',
+    'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
+    'profile': 'self-calibrate {log} --profile {log} --out {out}', 'turns': 'self-calibrate {log} --turns nearest --out {out}',
+    'turn': 'turn {log} --model {model}', 'plan': 'plan --limits {log}', 'simulate': 'simulate --motion {log} --model {model} --out {out}',
+    'diagnose': 'diagnose {log} --out {folder}', 'as a model': 'compensate {log} --model {log} --out {out}',
+}
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
+    """What is finite is answered in finite numbers, and what is refused leaves no file."""
+    model = tmp_path / 'model.yaml'
+    model.write_text('effects: {bias: {bias: 0.1}, cubic_nonlinearity: {cubic_nonlinearity: 1.0e-3}}\nnoise: {angle_random_walk: 1.0e-4}\n')
+    for name in ODD:
+        log, out = tmp_path / 'log.csv', tmp_path / 'out.csv'
+        log.write_bytes(odd_log(name))
+        words = [word.format(log=log, out=out, model=model, folder=tmp_path / 'found') for word in VERBS[verb].split()]
+        with np.errstate(all='ignore'):
+            code, answer, error = run(*words, '--json')
+        said = [line for line in error.splitlines() if line.startswith('gyro_calibration: ')]
+        assert code in (0, 1, 2) and len(said) == (code > 0) and bool(answer) == (code == 0), (name, error)
+        assert not answer or json.loads(answer)
+        assert code == 0 or not out.exists(), name
+        out.unlink(missing_ok=True)
+
+
+def test_a_model_with_the_name_of_a_log_that_is_no_text_is_written(tmp_path):
+    model = GyroModel(origin={'files': [{'name': plain('a\udcff.csv')}]})
+    write_model(tmp_path / 'model.yaml', model)
+    assert read_model(tmp_path / 'model.yaml').origin == model.origin
