@@ -5,6 +5,7 @@ Files of settings: models, bias tables, limits. They are YAML as people write it
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,14 @@ def _line(text: object) -> str:
 
 
 def settings_text(content: Any) -> str:
-    """Return names, texts, numbers and lists as YAML, which `read_settings` reads as they were."""
+    """
+    Return names, texts, numbers and lists as YAML, which `read_settings` reads as they were.
+
+    Raises
+    ------
+    ArithmeticError : a number is not finite
+
+    """
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
@@ -102,6 +110,12 @@ class _Dumper(yaml.SafeDumper):
         return self.represent_scalar('tag:yaml.org,2002:str', data, '"' if re.search('[\x85\u2028\u2029]', data) else None)
 
 
+def _number(dumper: Any, value: float) -> Any:
+    if not math.isfinite(value):
+        raise ArithmeticError(f'{value:g} is no number that a file may hold')
+    return yaml.SafeDumper.represent_float(dumper, value)
+
+
 def _refuse(problem: str, at: Any) -> None:
     raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
 
@@ -122,6 +136,7 @@ _KINDS: dict[str, tuple[str, list[str], Any]] = {
     'map': ('', [], yaml.SafeLoader.construct_yaml_map),
 }
 _Dumper.add_representer(str, _Dumper.represent_str)
+_Dumper.add_representer(float, _number)
 for _name, (_pattern, _first, _constructor) in _KINDS.items():
     _tag = f'tag:yaml.org,2002:{_name}'
     _Loader.add_constructor(_tag, _constructor)

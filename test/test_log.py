@@ -61,7 +61,7 @@ REFUSED = {
     'beyond a gyro': ('time_s,gyro_dps\n0,1\n1,1e300\n', 'line 3, column gyro_dps: 1e300 is beyond 1e+20, which no gyro means; remove the'),
     'no time between': ('time_s,gyro_dps\n0,1\n1e-300,1\n', 'line 3, column time_s: 1e-300 s does not come after 0 s'),
     'a text of lines': ('gyro_dps,place\n1,a\n"1\n\n2",b\n', "'1\\n\\n2' is not a number"),
-    'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a b,time_s;'),
+    'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a\\nb,time_s;'),
     'a header of 30 000 columns': ('time_s,' + 'x,' * 30000 + '\n1,1\n', 'no gyro column among time_s,x'),
     'an endless line': ('gyro_dps\n' + '1,' * 40000 + '\n1\n', 'a line has more than 65536 characters'),
     'an endless row': ('gyro_dps,place\n1,"' + 'a\nb","' * 3_500_000 + '\n', 'has more than 16777216 characters'),

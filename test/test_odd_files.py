@@ -458,6 +458,15 @@ def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
         out.unlink(missing_ok=True)
 
 
+@pytest.mark.parametrize('bias', [np.nan, np.inf, -np.inf])
+def test_no_file_is_written_that_cannot_be_read(bias, tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    with pytest.raises(ArithmeticError, match='is no number that a file may hold'):
+        write_model(path, GyroModel(self_calibration=SelfCalibration(0.0, bias)))
+    store = StateStore('', path, tmp_path / 'biases.yaml', Prior())
+    assert 'NOT STORED' in store.keep(SelfCalibration(0.0, bias)) and not path.exists()
+
+
 def test_a_model_with_the_name_of_a_log_that_is_no_text_is_written(tmp_path):
     model = GyroModel(origin={'files': [{'name': plain('a\udcff.csv')}]})
     write_model(tmp_path / 'model.yaml', model)

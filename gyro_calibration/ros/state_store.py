@@ -76,9 +76,9 @@ class StateStore:
         self.model, self.hint = with_self_calibration(self.model, calibration), ''
         try:
             self._written(self._calibration_file, write_model(self._calibration_file, self.model))
-        except OSError as error:
-            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): {remedy(error, self._calibration_file)}, '
-                              'and calibrate again')
+        except (OSError, ArithmeticError) as error:
+            wanted = remedy(error, self._calibration_file) if isinstance(error, OSError) else 'see whether the rates are right'
+            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): {wanted}, and calibrate again')
         return self.hint
 
     def keep_table(self, now: float, ending: bool = False) -> None:
