@@ -12,7 +12,6 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +28,6 @@ from rclpy.clock import ROSClock
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
@@ -52,8 +50,6 @@ from gyro_calibration.ros.runner import (
 )
 from gyro_calibration.ros.wheels import Velocity
 
-#: What a middleware says that does not number messages.
-_UNNUMBERED = (1 << 64) - 1
 #: Between two looks at who is there and whether time goes on, s.
 _WATCH_INTERVAL = 0.2
 _NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
@@ -128,10 +124,7 @@ class CompensationNode(Node):
             self._pose_message.pose.covariance[7 * place] = UNMEASURED_VARIANCE
             self._rate_message.twist.covariance[7 * place] = UNMEASURED_VARIANCE
         subscribe_to(self, Temperature, 'imu/temperature', self._on_temperature)
-        # Humble does not tell which message of its publisher one is.
-        numbered = hasattr(Subscription, 'CallbackType')
-        self._samples = subscribe_to(self, Imu, 'imu/data_raw',
-                                     self._on_numbered_imu if numbered else self._on_imu)
+        self._samples = subscribe_to(self, Imu, 'imu/data_raw', self._on_imu)
         subscribe_to(self, Odometry, 'odom', self._on_odometry)
         subscribe_to(self, TwistStamped if self._stamped else Twist, 'cmd_vel', self._on_command)
         if self._values.calibration_drive:
@@ -156,19 +149,14 @@ class CompensationNode(Node):
         self._pipeline.command(_velocity(message.twist if self._stamped else message))
         self._answer_ended()
 
-    def _on_numbered_imu(self, message: Imu, info: Mapping[str, int]) -> None:
-        number = info['publication_sequence_number']
-        self._on_imu(message, None if number == _UNNUMBERED else number)
-
-    def _on_imu(self, message: Imu, number: int | None = None) -> None:
+    def _on_imu(self, message: Imu) -> None:
         force = message.linear_acceleration.z
         reported = message.linear_acceleration_covariance[0] != NOT_REPORTED
         known = force if reported and math.isfinite(force) else None
         output = message.angular_velocity.z
         if message.angular_velocity_covariance[0] == NOT_REPORTED:
             output = math.nan  # REP-145: the message holds no rate
-        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers,
-                                      number)
+        found = self._pipeline.sample(_stamp(message.header), output, known, self._receivers)
         if found is not None:
             self._publish(message, found)
         if self._waiting:

@@ -193,7 +193,7 @@ class Pipeline:
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
-        self._several, self._sequence, self._switches = '', 0, 0
+        self._several, self._switches = '', 0
         self._good = 0.0, 0.0, 0.0
         self._recent: deque[tuple[float, float]] = deque()
 
@@ -262,7 +262,7 @@ class Pipeline:
         self.session.add_command(velocity)
 
     def sample(self, stamp: int, output: float, specific_force: float | None = None,
-               receivers: int = 0, sequence: int | None = None) -> Output | None:
+               receivers: int = 0) -> Output | None:
         """
         Take a sample.
 
@@ -272,7 +272,6 @@ class Pipeline:
         output : rad/s
         specific_force : along the input axis, m/s², where it came
         receivers : number of other nodes that receive cmd_vel
-        sequence : of the message, which its publisher counts, where the middleware tells it
 
         Returns
         -------
@@ -283,10 +282,9 @@ class Pipeline:
         counts['samples'] += 1
         if stamp < self._newest:
             self._see_jump(now)
+        if self._several:
+            self._look_for_switch(stamp)
         self._newest = stamp
-        if self._several and (sequence is None or sequence <= self._sequence):
-            self._see_switch(sequence)
-        self._sequence = sequence or 0
         if self.conflict:
             counts['refused_samples'] += 1
             return None
@@ -395,15 +393,17 @@ class Pipeline:
             tracker = self.estimator.tracker
             self._good = tracker.heading, tracker.variance, self._last
 
-    def _see_switch(self, sequence: int | None) -> None:
+    def _look_for_switch(self, stamp: int) -> None:
         """
-        Count a sample of another publisher than that of the one before it.
+        Count a sample that comes too soon after the one before it to be of the same publisher.
 
-        One is that of a driver which was started again, and whose dead predecessor the middleware
-        still lists. Without sequence numbers each publisher counts as one that sends.
+        A sample of another one divides an interval, so that one part is at most half of it. A
+        driver that was started again sends alone, although the middleware lists its dead
+        predecessor for up to 20 s.
 
         """
-        self._switches += 1 if sequence is not None else 2
+        if not 2.0 * (stamp - self._newest) > NSEC_PER_SEC * self.estimator.tracker.intervals.usual:
+            self._switches += 1
         if self._switches > 1:
             self._refuse_all(self._several)
 

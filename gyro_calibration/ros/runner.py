@@ -13,10 +13,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from xml.etree import ElementTree
 
 import rclpy
 from rcl_interfaces.msg import (
@@ -239,20 +237,17 @@ def answer_later(service: Service) -> None:
 
 def _executor() -> Executor:
     """
-    Return the events executor, which takes half of the processor time, where it is sound.
+    Return the events executor, which takes half of the processor time, where there is one.
 
-    Before rclpy 7.1.11 (Jazzy) and 9.1.2 (Kilted) it cannot call what takes a message and its
-    number.
+    It awaits no ``async`` callback and passes no message information before rclpy 7.1.11 (Jazzy);
+    the nodes use neither.
 
     """
-    # lib/pythonX.Y/site-packages/rclpy/__init__.py stands beside share/rclpy/package.xml
-    manifest = Path(rclpy.__file__).parents[4] / 'share' / 'rclpy' / 'package.xml'
-    text = ElementTree.parse(manifest).findtext('version', '') if manifest.exists() else ''
-    version = tuple(int(part) for part in text.split('.') if part.isdigit())
-    if (7, 1, 11) <= version < (8,) or version >= (9, 1, 2):
+    try:
         from rclpy.experimental import EventsExecutor
-        return EventsExecutor()
-    return SingleThreadedExecutor()
+    except ImportError:  # Humble
+        return SingleThreadedExecutor()
+    return EventsExecutor()
 
 
 def spin(node: Node, stop: threading.Event) -> None:
