@@ -308,7 +308,7 @@ class HeadingEstimator:
         '', or why the integration began anew with this sample; where the sample is refused, only `refused` grows
 
         """
-        if not self._plausible(time, output, force):
+        if not self.plausible(time, output, force):
             self._refused += 1
             return ''
         last, self._time = self._time, time
@@ -332,8 +332,8 @@ class HeadingEstimator:
         self._gather(time, bool(said))
         return said
 
-    def _plausible(self, time: float, output: float, force: float | None) -> bool:
-        """Tell whether such a gyro may report that; no nan is plausible."""
+    def plausible(self, time: float, output: float, force: float | None = None) -> bool:
+        """Tell whether such a gyro may report that, as for `add`, which refuses a sample if not; no nan is plausible."""
         limit = self.used.rate_limit
         return -limit <= output <= limit and -_LATEST <= time <= _LATEST and (force is None or -_STRONGEST <= force <= _STRONGEST)
 
