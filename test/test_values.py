@@ -23,7 +23,7 @@ from gyro_calibration.log import DEGREE, Log, write_log
 from gyro_calibration.log_compensation import LogCompensation, compensate_log
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import Check
+from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.tracking import HeadingTracker, Settings
 
 hypothesis = pytest.importorskip('hypothesis', reason='hypothesis is not installed')
@@ -239,7 +239,7 @@ def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk)
 @tries(40)
 @hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE), max_size=300))
 def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
-    check, time = Check(NOISE, 1e-3), 0.0
+    check, time = HealthMonitor(NOISE, 1e-3), 0.0
     for step, output, rate in samples:
         time = time + step if math.isfinite(time + step) else step
         if check.add(time, output, rate):
