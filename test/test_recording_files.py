@@ -304,7 +304,7 @@ def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_p
 
 @pytest.mark.parametrize('name', ['missing.mcap', 'missing.db3', 'missing.db3.zstd'])
 def test_a_recording_that_is_not_there_is_one_sentence_and_is_not_made(tmp_path, name):
-    with pytest.raises(LogError, match=f'{name}: cannot be read .No such file or directory.'):
+    with pytest.raises(LogError, match=f'{name}: cannot be read .no such file or directory.'):
         read_recording(tmp_path / name)
     assert not list(tmp_path.iterdir())
 
