@@ -10,6 +10,7 @@ Samples, odometry and commands go in with the time of the steady clock; commands
 from __future__ import annotations
 
 import math
+import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -312,7 +313,7 @@ class CalibrationSession:
         if kind == PROFILE:
             try:
                 file = values.calibration_profile_file
-                motion = read_motion(Path(file).expanduser()) if file else CALIBRATION
+                motion = read_motion(Path(os.path.expanduser(file))) if file else CALIBRATION
             except MotionError as error:
                 return str(error)
             duration = motion.duration

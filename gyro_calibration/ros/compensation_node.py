@@ -106,8 +106,8 @@ class CompensationNode(Node):
 
     def _calibration_file(self) -> Path:
         if self._values.calibration_file:
-            return Path(self._values.calibration_file).expanduser()
-        home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
+            return Path(os.path.expanduser(self._values.calibration_file))
+        home = Path(os.path.expanduser(os.environ.get('ROS_HOME', '~/.ros')))
         name = self.get_fully_qualified_name().strip('/').replace('/', '_')
         return home / 'gyro_calibration' / f'{name}.yaml'
 
