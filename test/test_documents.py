@@ -83,7 +83,7 @@ def row(parameter):
         text = number(default)
     else:
         text = f'`[{", ".join(default)}]`'
-    limits = ' to '.join(map(number, parameter.range or ()))
+    limits = ' to '.join(map(number, parameter.range or ())) or ', '.join(map('`{}`'.format, parameter.choices))
     return f'| `{parameter.name}` | {text} | {parameter.unit} | {limits} | {"yes" if parameter.dynamic else ""} | {parameter.description} |'
 
 
@@ -92,10 +92,16 @@ def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
     assert table in (ROOT / 'docs/on_a_robot.md').read_text(), f'put this table there:\n{table}'
 
 
+def flat(values, group=''):
+    """Yield the parameters of a file, those of groups with their dots: calibration.drive."""
+    for name, value in values.items():
+        yield from flat(value, f'{group}{name}.') if isinstance(value, dict) else [(f'{group}{name}', value)]
+
+
 def test_the_configuration_holds_every_parameter_with_its_default(parameters):
     yaml = pytest.importorskip('yaml')
     files = [yaml.safe_load((ROOT / 'config' / name).read_text()) for name in ('driver.yaml', 'compensation.yaml')]
-    configured = [values['ros__parameters'] for file in files for values in file.values()]
+    configured = [dict(flat(values['ros__parameters'])) for file in files for values in file.values()]
     wanted = {parameter.name: list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
               for parameter in parameters}
     assert wanted in configured

@@ -1,9 +1,15 @@
 """The example for robot_localization is what that program reads, and fuses what the node publishes."""
 
+import ast
+import math
+import re
 from pathlib import Path
 
 import pytest
 import yaml
+from rig import INTERVAL, Robot, rested
+
+from gyro_calibration.log import DEGREE
 
 CONFIG = Path(__file__).parents[1] / 'config' / 'robot_localization.yaml'
 STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw', 'ax', 'ay', 'az']
@@ -35,6 +41,50 @@ def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
 
 
 def test_the_launch_file_in_the_documentation_can_be_read():
-    page = (CONFIG.parents[1] / 'docs' / 'on_a_robot.md').read_text()
+    page = (CONFIG.parents[1] / 'docs' / 'nav2.md').read_text()
     code = page.partition('```python\n')[2].partition('```')[0]
     assert 'generate_launch_description' in compile(code, 'launch', 'exec').co_names and CONFIG.name in code
+
+
+def arguments_of(launch_file):
+    """Return the names of the arguments that gyro.launch.py declares."""
+    names = {}
+    for node in ast.parse(launch_file.read_text()).body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict):
+            names[node.targets[0].id] = {key.value for key in node.value.keys}
+    return names['DRIVER'] | names['COMPENSATION'] | names['OTHERS'] | {'driver_config', 'compensation_config'}
+
+
+def test_the_launch_arguments_that_the_documents_name_are_those_of_the_launch_file():
+    declared = arguments_of(CONFIG.parents[1] / 'launch' / 'gyro.launch.py')
+    page = (CONFIG.parents[1] / 'docs' / 'on_a_robot.md').read_text()
+    table = page.partition('| launch argument |')[2].partition('\n\n')[0]
+    rows = [line.split('|')[1] for line in table.splitlines()[2:]]
+    assert {name for row in rows for name in re.findall(r'`(\w+)`', row)} == declared
+    other = (CONFIG.parents[1] / 'docs' / 'nav2.md').read_text()
+    used = set(re.findall(r"'(\w+)': '", other)) | set(re.findall(r'`(\w+):=', other))
+    assert used <= declared
+
+
+def test_the_launch_arguments_that_are_parameters_are_parameters_of_the_nodes():
+    pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
+    from gyro_calibration.ros import driver_node, pipeline
+    tree = ast.parse((CONFIG.parents[1] / 'launch' / 'gyro.launch.py').read_text())
+    for name, table in (('DRIVER', driver_node.PARAMETERS), ('COMPENSATION', pipeline.PARAMETERS)):
+        node = next(each.value for each in tree.body if isinstance(each, ast.Assign) and each.targets[0].id == name)
+        wanted = {value.elts[0].value for value in node.values}
+        assert wanted <= {parameter.name for parameter in table}
+
+
+def test_what_is_fused_of_a_turn_is_as_good_as_the_node_claims(parameters, tmp_path):
+    """A filter for one state, the yaw, that takes the rates with their variances as they come."""
+    assert fused(parameters, 'imu0') == ['vyaw']
+    rig = rested(tmp_path, robot=Robot(scale_factor_error=0.02, bias=0.3 * DEGREE))
+    begin = len(rig.outputs) - 1
+    rig.robot.command(0.5)
+    rig.go(10.0)
+    rates = rig.outputs[begin:]
+    yaw = sum(each.rate for each in rates[1:]) * INTERVAL
+    truth = rig.truth[rates[-1].stamp] - rig.truth[rates[0].stamp]
+    systematic = sum(math.sqrt(each.rate_variance) for each in rates[1:]) * INTERVAL
+    assert abs(yaw - truth) < systematic and all(each.rate_variance > 0.0 for each in rates)
