@@ -42,6 +42,7 @@ MODEL = 'effects: {bias: {bias: 0.0}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 FULL_RATE = math.radians(40.0)
 TELEOP = 0.3  # rad/s
 WATCHED = 10.0  # s after a fault
+SPINNING = 'import time\nend = time.monotonic() + 45\nwhile time.monotonic() < end: pass'
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 
@@ -138,8 +139,10 @@ class Stage:
         given = {'model_file': self._folder / 'model.yaml', 'calibration_file': self._folder / 'calibration.yaml',
                  self.names.drive: True, **(parameters or {})}
         command = [sys.executable, '-m', self.names.module, '--ros-args']
-        command += [word for name, value in given.items() for word in ('-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
-        log = open(self._folder / 'node.txt', 'wb')
+        texts = {name: str(value).lower() if isinstance(value, bool) else value
+                 for name, value in given.items()}
+        command += [word for name, text in texts.items() for word in ('-p', f'{name}:={text}')]
+        log = self._closing.enter_context(open(self._folder / 'node.txt', 'wb'))
         self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, cwd=self._tree,
                                         env={**os.environ, 'PYTHONPATH': str(self._tree)})
         self._closing.callback(end, self.process)
@@ -384,7 +387,7 @@ def busy(stage):
     stage.start()
     with ExitStack() as spinning:
         for _ in range(2):
-            process = subprocess.Popen([sys.executable, '-c', 'import time\nend = time.monotonic() + 45\nwhile time.monotonic() < end: pass'])
+            process = subprocess.Popen([sys.executable, '-c', SPINNING])
             spinning.callback(process.wait)
             spinning.callback(process.kill)
         stage.fault()

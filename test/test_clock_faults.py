@@ -61,7 +61,8 @@ def test_driver_and_compensation_go_on_together_where_the_clock_is_set(set_clock
             later, begin = heading[-1].header.stamp.sec + (HOUR if hours == 3.0 else -2.0 * HOUR), len(heading)
             wait_until(lambda: abs(heading[-1].header.stamp.sec - later) < 100.0 and len(heading) > begin + 200,  # noqa: B023, at once
                        what='headings with stamps of the clock that was set')
-        wait_until(lambda: any(value.value.startswith('2, ') for value in values_of(diagnostics, 'clock_steps')), what='two steps of the clock')
+        wait_until(lambda: any(value.value.startswith('2, ') for value in values_of(diagnostics, 'clock_steps')),
+                   what='two steps of the clock')
     messages = list(heading)
     steps = np.diff([stamp.sec + 1e-9 * stamp.nanosec for stamp in (message.header.stamp for message in messages)])
     jumps = np.where(np.abs(steps) > 100.0, np.round(steps / HOUR) * HOUR, 0.0)
