@@ -56,8 +56,9 @@ def measured(terms=LINEAR, seed=1, **table):
 @pytest.mark.parametrize('terms, table', [
     (CUBIC, Table()), (SINE, Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)), (SINE, Table(told=True)),
     (CUBIC, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True))])
-def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table):
-    generator, runs = np.random.default_rng(7), 25
+@pytest.mark.parametrize('runs', [10, pytest.param(100, marks=pytest.mark.evidence)])
+def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs):
+    generator = np.random.default_rng(7)
     values, rates = (np.array(each) for each in zip(*(run(terms, table, generator) for _ in range(runs))))
     for errors in (values, rates):
         held = (np.abs(errors) <= 1.96).sum(axis=0)
@@ -132,8 +133,9 @@ def test_three_speeds_of_a_record_player_leave_one_degree_of_freedom():
     np.testing.assert_allclose(1.959964 * np.sqrt(np.diag(fit.model.covariance)), student_intervals, rtol=1e-5)
 
 
-def test_intervals_from_three_speeds_hold_the_truth():
-    generator, runs = np.random.default_rng(3), 400
+@pytest.mark.parametrize('runs', [40, pytest.param(400, marks=pytest.mark.evidence)])
+def test_intervals_from_three_speeds_hold_the_truth(runs):
+    generator = np.random.default_rng(3)
     held = 0
     for _ in range(runs):
         table = dwells([0.0, 3.49, 4.71], 0.01 + 0.02 * np.array([0.0, 3.49, 4.71]) + 1e-3 * generator.standard_normal(3))

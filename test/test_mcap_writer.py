@@ -24,8 +24,8 @@ def recording(tmp_path):
         imu = serialize(time, 'gyro', numbers)
         writer.add('/imu/data_raw', IMU, DEFINITIONS[IMU], time, imu)
         if number % 10 == 0:
-            temperature = serialize(time, 'gyro', [20.0 + number, 0.0])
-            writer.add('/imu/temperature', TEMPERATURE, DEFINITIONS[TEMPERATURE], time, temperature)
+            degc = serialize(time, 'gyro', [20.0 + number, 0.0])
+            writer.add('/imu/temperature', TEMPERATURE, DEFINITIONS[TEMPERATURE], time, degc)
         if number % 100 == 99:
             assert writer.pending > 0
             pieces.append(writer.chunk())

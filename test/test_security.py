@@ -4,6 +4,7 @@ import ast
 import signal
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -30,6 +31,7 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 # What the package may import, run and start
 
 
+@cache
 def names(path):
     """Return what a file imports, and what it calls, with its dots: ``yaml.load``."""
     nodes = list(ast.walk(ast.parse(path.read_text())))

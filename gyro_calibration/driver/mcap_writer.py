@@ -84,7 +84,8 @@ class McapWriter:
             self._records += self._channels[topic]
         number = self._numbers[topic]
         self._indexes[number].append((received, len(self._records)))
-        self._records += _record(_MESSAGE, struct.pack('<HIQQ', number, 0, received, received), data)
+        head = struct.pack('<HIQQ', number, 0, received, received)
+        self._records += _record(_MESSAGE, head, data)
 
     def chunk(self) -> bytes:
         """Return the messages since the last chunk as one, with its index; nothing without any."""
