@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import Line, damaged
+from gyro_calibration.driver.serial_faults import SerialFaults, damaged
 from gyro_calibration.log import DEGREE
 
 SHARES = (0.001, 0.01, 0.1)
@@ -30,8 +30,8 @@ def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
     """Return the rates that arrive, rad/s, and as the first one that which a good line gives."""
     protocol, generator = find(name), np.random.default_rng(1)
     settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None), full_scale=full_scale)
-    encode, decoder, line = protocol.encoder(settings), protocol.decoder(settings), Line(0.0, 0.0, *(3 * [share / 3.0]))
-    good = protocol.awakening + b''.join(encode(Sample(SENT, 25.0, 1.0, number)) for number in range(4))
+    encode, decoder, line = protocol.encoder(settings), protocol.decoder(settings), SerialFaults(0.0, 0.0, *(3 * [share / 3.0]))
+    good = protocol.preamble + b''.join(encode(Sample(SENT, 25.0, 1.0, number)) for number in range(4))
     rates = [protocol.decoder(settings).feed(good)[-1].output]
     for number in range(FRAMES):
         data = damaged(line, encode(Sample(SENT, 25.0, number / protocol.rate, number)), generator)

@@ -112,7 +112,6 @@ def _instrumented():
     with contextlib.redirect_stderr(io.StringIO()), atheris.instrument_imports(include=['gyro_calibration', 'yaml'], exclude=exclude):
         import fuzzed
         if fuzzed.HAS_ROS:
-            import gyro_calibration.ros.compensation_settings
             import gyro_calibration.ros.driver_node  # noqa: F401  here, so that it is watched
     return fuzzed.TARGETS
 

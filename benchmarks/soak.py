@@ -7,7 +7,7 @@ The whole graph for an hour: emulated gyro -> driver_node -> compensation_node -
 
 The emulated KVH 1750 turns at rates that hold the number of the sample, so the subscriber knows of each corrected rate which sample it is:
 none may be missing and none come twice. Latency is counted from when a sample is due on the line until its corrected rate is taken by the
-subscriber, so emulator, driver, compensation and two hops of DDS are in it. StateStore is the resident memory of a process: the median of the
+subscriber, so emulator, driver, compensation and two hops of DDS are in it. Memory is the resident memory of a process: the median of the
 last tenth of the run against that of its second tenth, for the first one is the warm-up.
 
 At the full line rate the baud decides how many samples come. A driver that gets more than 1 kHz publishes means of several samples; the
@@ -110,7 +110,7 @@ def arriving(name: str, output: float, rate: float) -> float:
     """Return what comes of an output by a wire format, which rounds it."""
     settings, protocol = settings_of(name, rate), find(name)
     encode, decoder = protocol.encoder(settings), protocol.decoder(settings)
-    data = protocol.awakening + b''.join(encode(Sample(output, 25.0, 1.0, number)) for number in range(4))
+    data = protocol.preamble + b''.join(encode(Sample(output, 25.0, 1.0, number)) for number in range(4))
     return decoder.feed(data)[-1].output
 
 
@@ -259,7 +259,7 @@ class Run:
 
     def _wiring(self) -> dict[str, object]:
         """Return the parameters of the driver beyond its port and format."""
-        given: dict[str, object] = {'silence_timeout': 5.0, 'reopen_interval': 0.1}
+        given: dict[str, object] = {}
         if self.given.protocol in SENSITIVITY:
             given['sensitivity'] = SENSITIVITY[self.given.protocol]
         if self.given.rate != find(self.given.protocol).rate:
@@ -269,7 +269,7 @@ class Run:
         return given
 
     def _node(self, name: str, **parameters: object) -> list[object]:
-        return [sys.executable, '-m', f'gyro_calibration.{name}', '--ros-args',
+        return [sys.executable, '-m', f'gyro_calibration.ros.{name}', '--ros-args',
                 *itertools.chain.from_iterable(('-p', f'{key}:={value}') for key, value in parameters.items())]
 
     def _begin(self, name: str, command: list[object]) -> None:
@@ -319,7 +319,7 @@ class Run:
         return {
             'protocol': self.given.protocol, 'rate_hz': self.given.rate, 'lasted_s': self.lasted, 'sent': int(numbers[SENT]),
             'sent_with_leading': int(numbers[ALL]), 'read_by_driver': int(gyro_said.get('samples', -1)),
-            'lost_by_driver': int(gyro_said.get('lost samples', -1)), 'bytes_nobody_took': int(numbers[LOST_BYTES]),
+            'lost_by_driver': int(gyro_said.get('lost_samples', -1)), 'bytes_nobody_took': int(numbers[LOST_BYTES]),
             'messages': seen.messages, 'missing': seen.missing + int(numbers[SENT]) - seen.last - 1 if self.given.leading else None,
             'repeated': seen.repeated if self.given.leading else None, 'latency_ms': seen.latency_ms,
             'heading_error_deg': math.remainder(unsettled, 2.0 * math.pi) / DEGREE,

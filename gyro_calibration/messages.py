@@ -16,7 +16,7 @@ import numpy as np
 
 from gyro_calibration.log import Number
 
-BILLION = 1_000_000_000
+NSEC_PER_SEC = 1_000_000_000
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
 ODOMETRY, POSE, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
 
@@ -79,7 +79,7 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
             place += -place % 4
             place += 4 + struct.unpack_from(f'{order}I', data, place)[0]
         # Aligned to eight bytes from the fifth on.
-        return seconds * BILLION + nanoseconds, struct.unpack_from(f'{order}{layout.numbers}d', data, place + (4 - place) % 8)
+        return seconds * NSEC_PER_SEC + nanoseconds, struct.unpack_from(f'{order}{layout.numbers}d', data, place + (4 - place) % 8)
     except struct.error as error:
         raise MessageError(f'a message of {len(data)} bytes is too short for what it should hold') from error
 
@@ -87,7 +87,7 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
     """Return a message of a header, with the stamp in ns since 1970, and of numbers, as `parse` takes it."""
     text = frame.encode() + b'\0'
-    head = struct.pack(f'<4xiII{len(text)}s', stamp // BILLION, stamp % BILLION, len(text), text)
+    head = struct.pack(f'<4xiII{len(text)}s', stamp // NSEC_PER_SEC, stamp % NSEC_PER_SEC, len(text), text)
     return b'\0\1\0\0' + head[4:] + bytes((4 - len(head)) % 8) + struct.pack(f'<{len(numbers)}d', *numbers)
 
 

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from gyro_calibration.log import ROWS, Array, Log, LogError, Mask
 from gyro_calibration.messages import (
-    BILLION,
     IMU,
     LAYOUTS,
     NOT_REPORTED,
+    NSEC_PER_SEC,
     ODOMETRY,
     POSE,
     TEMPERATURE,
@@ -183,7 +183,7 @@ class _Reader:
         if not use_stamps:
             self._notes.append('headers have no stamps: times are those at which messages were received')
         gyro = self._in_order(gyro.timed(use_stamps), rate)
-        time = (gyro.stamps - gyro.stamps[0]) / BILLION
+        time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
         self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, time_s from {_seconds(gyro.stamps[0])} s on')
         log = Log(output=self._output(gyro), time=time, specific_force=self._force(gyro))
         if temperature is not None:
@@ -275,8 +275,8 @@ class _Reader:
         back = np.maximum.accumulate(gyro.stamps) - gyro.stamps
         if not back.any():
             return gyro
-        if back.max() > _LARGEST_STEP_BACK * BILLION:
-            place = int(np.argmax(back > _LARGEST_STEP_BACK * BILLION))
+        if back.max() > _LARGEST_STEP_BACK * NSEC_PER_SEC:
+            place = int(np.argmax(back > _LARGEST_STEP_BACK * NSEC_PER_SEC))
             raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s at sample {place + 1}, as of '
                            'a clock that was set; cut the recording there, or give --rate')
         self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
@@ -323,7 +323,7 @@ class _Reader:
 
         """
         course = _rising(course.taken(np.isfinite(course.numbers[:, 0])))
-        at = (course.stamps - begin) / BILLION
+        at = (course.stamps - begin) / NSEC_PER_SEC
         if not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE or at[-1] < -_LONG_WITHOUT_TEMPERATURE:
             self._notes.append(f'temperature: {course.topic} says none at the times of the gyro, and was left out')
             return None
@@ -339,7 +339,7 @@ class _Reader:
         if course.topic == gyro.topic:
             raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; name another by --reference-topic')
         course = _rising(course)
-        at, wrapped, rate = (course.stamps - gyro.stamps[0]) / BILLION, _headings(course), _rates(course)
+        at, wrapped, rate = (course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course), _rates(course)
         heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
         if rate is not None and heading is not None and not rate.any() and np.nanmax(heading) - np.nanmin(heading) > 0.1:
             self._notes.append('the rates of the reference are never filled in, and were left out')
@@ -419,7 +419,7 @@ def _at(time: Array, at: Array, values: Array) -> Array:
 
 
 def _seconds(nanoseconds: np.int64) -> str:
-    return f'{int(nanoseconds) // BILLION}.{int(nanoseconds) % BILLION:09d}'
+    return f'{int(nanoseconds) // NSEC_PER_SEC}.{int(nanoseconds) % NSEC_PER_SEC:09d}'
 
 
 def _listed(names: Sequence[str], word: str = 'and') -> str:

@@ -117,7 +117,7 @@ def _wire(protocol: Protocol) -> _Wire:
     settings, decoder = settings_of(protocol), protocol.decoder(settings_of(protocol))
     encode = protocol.encoder(settings)
     frames = [encode(Sample(0.01 * number - 0.05, 20.0, 0.01 * number, number)) for number in range(1, 5)]
-    decoder.feed(protocol.awakening)
+    decoder.feed(protocol.preamble)
     return _Wire(protocol, settings, frames, [sample.output for frame in frames for sample in decoder.feed(frame)])
 
 
@@ -133,12 +133,12 @@ def check_decoder(wire: _Wire, data: bytes) -> int:
     whole, parted = (wire.protocol.decoder(wire.settings) for _ in range(2))
     samples = whole.feed(data)
     assert [sample for piece in pieces(data) for sample in parted.feed(piece)] == samples
-    counts = [(each.discarded_bytes, each.faults, each.out_of_range) for each in (whole, parted)]
+    counts = [(each.discarded_bytes, each.faults, each.refused_samples) for each in (whole, parted)]
     assert counts[0] == counts[1], counts
     for sample in samples:
         numbers = (sample.output, sample.temperature, sample.time, sample.specific_force, *sample.health.values())
         assert all(number is None or math.isfinite(number) for number in numbers) and sample.missing >= 0, sample
-    _check_account(wire, data, len(samples) + whole.faults + whole.out_of_range)
+    _check_account(wire, data, len(samples) + whole.faults + whole.refused_samples)
     after = [(sample.output, sample.missing) for sample in whole.feed(b''.join(wire.frames))]
     assert after[-len(wire.rates) + 2:] == [(rate, 0) for rate in wire.rates[2:]], 'not right again after two frames'
     return len(samples)
@@ -165,13 +165,13 @@ def _check_account(wire: _Wire, data: bytes, used: int) -> None:
 def _clean(wire: _Wire) -> Splitter:
     """Return a splitter that knows where the next frame begins."""
     splitter = wire.protocol.splitter()
-    splitter.feed(wire.protocol.awakening)
+    splitter.feed(wire.protocol.preamble)
     return splitter
 
 
 def _decoder_seeds(wire: _Wire) -> list[bytes]:
     frames, garbage = wire.frames, random.Random(0).randbytes(20)
-    return [wire.protocol.awakening + b''.join(frames), frames[0] + garbage + frames[1], frames[0][:-1] + b''.join(frames[1:]), frames[2]]
+    return [wire.protocol.preamble + b''.join(frames), frames[0] + garbage + frames[1], frames[0][:-1] + b''.join(frames[1:]), frames[2]]
 
 
 #: Every protocol, also those to come.
@@ -197,7 +197,7 @@ def _listening_seeds() -> list[bytes]:
 def check_clock(data: bytes) -> int:
     """Any samples at any times: stamps are finite and increase strictly, and the count of what was lost is one."""
     head, data = (data[:2] + b'\0\0')[:2], data[2:]
-    clock = SampleClock((1.0, 10.0, 100.0, 1000.0, 11000.0)[head[0] % 5], (0, 128, 256, 65536)[head[1] % 4], bool(head[1] & 4))
+    clock = SampleClock((1.0, 10.0, 100.0, 1000.0, 11000.0)[head[0] % 5], (0, 128, 256, 65536)[head[1] % 4])
     arrival, last = 1000.0, -math.inf
     for sequence, late, count, missing in struct.iter_unpack('<HBBB', data[:len(data) // 5 * 5]):
         arrival += 10.0 ** (late / 32.0 - 5.0)
@@ -438,9 +438,8 @@ def wild_value(data: bytes) -> object:
 
 
 def check_parameters(data: bytes) -> bool:
-    from gyro_calibration.ros.compensation_settings import PARAMETERS
-
     from gyro_calibration.ros.driver_node import PARAMETERS as OF_DRIVER
+    from gyro_calibration.ros.pipeline import PARAMETERS
     table = [*PARAMETERS, *OF_DRIVER]
     parameter, value = table[(data[0] if data else 0) % len(table)], wild_value(data[1:])
     try:

@@ -1,22 +1,24 @@
-"""A gyro on a pseudo-terminal that is found, listened to, lost, and found again, without ROS."""
+"""A gyro on a port that is found, recognized, lost, and found again: by an injected clock, without ROS."""
 
-import contextlib
 import itertools
+import math
 import os
-import resource
-import select
+import random
 import threading
-import time
-import tty
 
+import numpy as np
 import pytest
+from fake_port import BEGIN, Reading, World
 
 from gyro_calibration.driver.connection import Connection, resolve
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.serial_faults import SerialFaults, damaged
 from gyro_calibration.driver.serial_port import PortError
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
+SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None) for name in PROTOCOLS}
+NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of the gyro'
 
 
 def turning(rate=0.5, frequency=100.0):
@@ -24,116 +26,134 @@ def turning(rate=0.5, frequency=100.0):
     return (Sample(rate, 31.5, k / frequency) for k in itertools.count())
 
 
-class Worker:
-    """Works in `_thread` until `_stop` is set, while it is used as a context manager."""
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        self._thread.join()
+# On a pseudo-terminal
 
 
-class Taker(Worker):
-    """Takes chunks in a thread, as the driver does, and keeps them and the states."""
-
-    def __init__(self, port, protocol='auto', **options):
-        self.chunks, self.states, self._stop = [], [], threading.Event()
-        self.connection = Connection(str(port), protocol, on_change=self.states.append, **options)
-        self._thread = threading.Thread(target=self._take)
-
-    def _take(self):
-        for chunk in self.connection.chunks(self._stop):
-            self.chunks.append(chunk)
-
-    @property
-    def samples(self):
-        """All samples so far."""
-        return [sample for chunk in self.chunks for sample in chunk.samples]
-
-    @property
-    def problems(self):
-        """What was wrong so far."""
-        return [state.problem for state in self.states if state.problem]
+def test_samples_come_with_stamps_that_increase():
+    """From a replay, which waits for its reader: no sample is lost on a busy machine."""
+    changes, stop = [], threading.Event()
+    with Emulator(find('csv'), turning(), speed=2.0, wait_for_reader=True) as gyro:
+        connection = Connection(gyro.path, 'csv', on_change=changes.append)
+        reading = connection.chunks(stop)
+        chunks = list(itertools.takewhile(lambda _: connection.counts().samples < 100, reading))
+        reading.close()
+    stamps = [stamp for chunk in chunks for stamp in chunk.stamps]
+    assert [state.name for state in changes] == ['reading'] and connection.path == os.path.realpath(gyro.path)
+    assert (np.diff(stamps) > 0.0).all() and all(chunk.stamps[-1] <= chunk.arrival for chunk in chunks)
+    assert [sample.output for chunk in chunks for sample in chunk.samples] == pytest.approx([0.5] * len(stamps))
 
 
-@pytest.fixture
-def terminal():
-    """Return the file descriptor of a device without a protocol, and the path of its port."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    yield master, os.ttyname(slave)
-    os.close(master)
-    os.close(slave)
+def test_the_port_is_closed_when_nobody_takes_samples_any_more():
+    with Emulator(find('csv'), turning()) as gyro:
+        for _ in range(2):
+            for chunk in Connection(gyro.path, 'csv').chunks(threading.Event()):
+                assert chunk.samples
+                break
 
 
-def test_samples_come_with_stamps_that_increase(wait_until):
-    with Emulator(find('csv'), turning()) as gyro, Taker(gyro.path, 'csv') as taker:
-        wait_until(lambda: len(taker.samples) > 50)
-        assert [state.name for state in taker.states] == ['reading']
-        assert taker.connection.path == os.path.realpath(gyro.path)
-    stamps = [stamp for chunk in taker.chunks for stamp in chunk.stamps]
-    assert len(stamps) == len(taker.samples) == taker.connection.counts().samples
-    assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
-    assert all(chunk.stamps[-1] <= chunk.arrival for chunk in taker.chunks)
+def held():
+    """Return how many threads and file descriptors this process has."""
+    return threading.active_count(), len(os.listdir('/proc/self/fd'))
+
+
+def test_a_port_that_goes_and_comes_back_leaves_nothing_behind(tmp_path):
+    """Real ports, whose link is there or not; each is taken until it is lost."""
+    after, found = [], []
+    connection = Connection(str(tmp_path / 'gyro'), 'csv')
+    before, stop = held(), threading.Event()
+    for number in range(100):
+        stop.clear()
+        with Emulator(find('csv'), turning(0.01 * number), link=tmp_path / 'gyro'):
+            for chunk in connection.chunks(stop):
+                found.append(chunk.samples[-1].output)
+                stop.set()
+        after.append(held())
+    assert set(after) == {before} and connection.openings == 100
+    assert found == pytest.approx([0.01 * number for number in range(100)])
+
+
+def test_a_port_that_another_program_has_opened_is_reported(tmp_path):
+    stop, problems = threading.Event(), []
+
+    def on_change(state):
+        problems.append(state.problem)
+        stop.set()
+    with Emulator(find('csv'), turning()) as gyro:
+        taken = Connection(gyro.path, 'csv').chunks(threading.Event())
+        next(taken)
+        assert not list(Connection(gyro.path, 'csv', on_change=on_change).chunks(stop))
+        taken.close()
+    assert problems == [f'cannot open {gyro.path}: another program has opened it: stop that one']
+
+
+# Recognizing
 
 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
-def test_auto_finds_the_protocol_and_says_what_it_heard(name, wait_until):
-    settings = Settings(sensitivity=1e-6) if name == 'fizoptika' else Settings()
-    with Emulator(find(name), turning(), settings) as gyro, Taker(gyro.path, settings=settings) as taker:
-        wait_until(lambda: taker.samples, what=taker.states)
-        assert taker.connection.protocol is find(name)
-        assert name in taker.connection.heard
-        assert [state.name for state in taker.states] == ['listening', 'reading']
+def test_auto_finds_the_protocol_and_reports_it(name):
+    world = World(30.0, baud=find(name).baud)
+    world.gyro(name, settings=SETTINGS[name])
+    reading = Reading(world, settings=SETTINGS[name])
+    assert reading.connection.protocol is find(name) and name in reading.connection.detected
+    assert reading.names == ['listening', 'reading'] and len(reading.samples) > 100
+    assert reading.connection.baud == find(name).baud
 
 
-def test_auto_with_a_baud_listens_at_that_one_only(terminal, wait_until):
-    master, path = terminal
-    with Taker(path, baud=57600) as taker:
-        wait_until(lambda: os.write(master, b'\x00\x01\x02' * 10) and taker.problems)
-    assert 'of no protocol for sure at 57600 bit/s' in taker.problems[0]
+def test_auto_with_a_baud_listens_at_that_one_only():
+    world = World(3.0)
+    world.send(b'\x00\x01\x02')
+    assert 'of no protocol for sure at 57600 bit/s' in Reading(world, baud=57600).problems[0]
 
 
-def test_auto_asks_for_what_the_protocol_needs(wait_until):
-    settings = Settings(columns=('gyro_counts',), sensitivity=0.001)
-    with Emulator(find('csv'), turning(), settings) as gyro, Taker(gyro.path, settings=Settings(columns=('gyro_counts',))) as taker:
-        wait_until(lambda: taker.problems)
-    assert taker.problems[0].startswith(f'csv comes on {gyro.path}, but columns hold gyro_counts, but sensitivity is not set')
+def test_auto_asks_for_what_the_protocol_needs():
+    world, counts = World(5.0), Settings(columns=('gyro_counts',))
+    world.gyro('csv', settings=Settings(columns=('gyro_counts',), sensitivity=0.001))
+    problem = Reading(world, settings=counts).problems[0]
+    assert problem.startswith('csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
 
 
-def test_another_gyro_in_the_same_place_is_listened_to(tmp_path, wait_until):
-    with Taker(tmp_path / 'gyro', silence_timeout=0.3) as taker:
-        for name in ('kvh_dsp3000', 'minimu9'):
-            with Emulator(find(name), turning(), link=tmp_path / 'gyro'):
-                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading')
-    assert taker.connection.counts().samples == len(taker.samples)
+def test_another_gyro_in_the_same_place_is_recognized():
+    world = World(60.0)
+    world.gyro('kvh_dsp3000', end=20.0)
+    world.gyro('minimu9', begin=20.0)
+    reading = Reading(world)
+    assert reading.connection.protocol is find('minimu9') and reading.states[-1].name == 'reading'
+    assert reading.connection.counts().samples == len(reading.samples) > 4000
 
 
-def test_stamps_go_on_when_another_gyro_is_listened_to(tmp_path, wait_until):
-    """What comes at once after a stall, at the slow rate that csv usually has, seems to have begun long before."""
-    settings = Settings(columns=('gyro_dps',), sample_rate=10.0)
-    with Taker(tmp_path / 'gyro', settings=settings, silence_timeout=0.3) as taker:
-        for name in ('kvh_dsp3000', 'csv'):
-            with Emulator(find(name), turning(), settings, link=tmp_path / 'gyro', speed=20.0):
-                wait_until(lambda name=name: taker.connection.protocol is find(name) and taker.states[-1].name == 'reading')
-    stamps = [stamp for chunk in taker.chunks for stamp in chunk.stamps]
-    assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
+def test_stamps_go_on_when_another_gyro_is_recognized():
+    """The other sends 20 times faster than it is said to, and seems to have begun long before."""
+    world, settings = World(40.0), Settings(columns=('gyro_dps',), sample_rate=10.0)
+    world.gyro('kvh_dsp3000', end=20.0)
+    world.gyro('csv', settings=settings, begin=20.0, rate=200.0)
+    reading = Reading(world, settings=settings)
+    assert reading.connection.protocol is find('csv') and min(reading.steps) > 0.0
 
 
-def test_a_gyro_is_found_again_under_another_name(tmp_path, wait_until):
+def test_listening_ends_when_told_to():
+    stop = threading.Event()
+    world = World(60.0)
+    connection = Connection('/dev/gyro', on_change=lambda state: stop.set(), clock=world, make_port=world.port)
+    assert list(connection.chunks(stop)) == [] and connection.state.name == 'listening'
+
+
+# Finding and waiting
+
+
+def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
-    pattern = tmp_path / '*A9003XYZ*'
-    with Taker(pattern, 'csv', reopen_interval=0.05) as taker:
-        with Emulator(find('csv'), turning(0.1), link=tmp_path / 'usb-FTDI_A9003XYZ-if00-port0'):
-            wait_until(lambda: len(taker.samples) > 5)
-        wait_until(lambda: any('matches' in problem for problem in taker.problems))
-        with Emulator(find('csv'), turning(0.2), link=tmp_path / 'usb-FTDI_A9003XYZ-if00-port1') as gyro:
-            wait_until(lambda: taker.samples[-1].output > 0.15)
-            assert taker.connection.path == os.path.realpath(gyro.link)
-    assert any(f'no port matches {pattern}: plug the gyro in' in problem for problem in taker.problems)
+    world, names = World(30.0), [tmp_path / f'usb-FTDI_A9003XYZ-if0{number}' for number in range(2)]
+    names[0].touch()
+    world.gyro('csv', outputs=itertools.chain(itertools.repeat(0.1, 1500), itertools.repeat(0.2)))
+
+    def lose():
+        names[0].unlink()
+        return world.unplug()
+    world.at(10.0, lose)
+    world.at(15.0, lambda: names[1].touch() or world.plug())
+    reading = Reading(world, 'csv', tmp_path / '*A9003XYZ*')
+    assert reading.connection.path == str(names[1]) and reading.samples[-1].output == pytest.approx(0.2)
+    assert any(f'no port matches {tmp_path}/*A9003XYZ*: plug the gyro in' in problem for problem in reading.problems)
 
 
 def test_several_ports_that_match_are_named(tmp_path):
@@ -150,158 +170,187 @@ def test_several_names_of_one_port_are_no_question(tmp_path):
     assert resolve(str(tmp_path / 'gyro_*')) == str(tmp_path / 'gyro_a')
 
 
-def test_waiting_doubles_up_to_its_limit(wait_until):
-    with Taker('/nonexistent/gyro', 'csv', reopen_interval=0.01, reopen_limit=0.05) as taker:
-        wait_until(lambda: len(taker.problems) > 5)
-    assert [state.waiting for state in taker.states[:5]] == pytest.approx([0.01, 0.02, 0.04, 0.05, 0.05])
-
-
-def test_a_missing_port_costs_next_to_nothing(wait_until):
-    """Also where an interval of nothing is asked for, as far as the limit goes."""
-    begin, since = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
-    with Taker('/nonexistent/gyro', 'csv', reopen_interval=0.1, reopen_limit=0.4) as taker:
-        wait_until(lambda: len(taker.problems) == 7)  # after 0, 0.1, 0.3, 0.7, 1.1, 1.5, 1.9 s
-        waited, lasted, end = taker.connection.waited, time.monotonic() - since, resource.getrusage(resource.RUSAGE_SELF)
-    assert end.ru_utime + end.ru_stime - begin.ru_utime - begin.ru_stime < 0.1
-    assert 1.9 <= waited <= lasted
-
-
-def test_waiting_ends_at_once(wait_until):
-    taker = Taker('/nonexistent/gyro', 'csv', reopen_interval=60.0, reopen_limit=60.0)
-    with taker:
-        wait_until(lambda: taker.problems)
-        begin = time.monotonic()
-    assert time.monotonic() - begin < 5.0  # of 60 s; a busy machine is late
-
-
-def test_listening_ends_at_once(terminal):
-    _, path = terminal
-    connection, stop = Connection(path, silence_timeout=60.0), threading.Event()
-    threading.Timer(0.3, stop.set).start()
-    begin = time.monotonic()
-    assert list(connection.chunks(stop)) == [] and connection.state.name == 'listening'
-    assert time.monotonic() - begin < 5.0  # of 60 s; a busy machine is late
-
-
-def test_samples_end_the_waiting(tmp_path, wait_until):
+def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     """Else a gyro with a loose plug would be waited for longer and longer."""
-    with Taker(tmp_path / 'gyro', 'csv', reopen_interval=0.01, reopen_limit=10.0) as taker:
-        wait_until(lambda: len(taker.problems) > 4)
-        with Emulator(find('csv'), turning(), link=tmp_path / 'gyro'):
-            wait_until(lambda: taker.samples)
-        wait_until(lambda: taker.states[-1].name == 'failed')
-        first = next(state for state in taker.states[taker.states.index(next(s for s in taker.states if s.name == 'reading')):]
-                     if state.name == 'failed')
-    assert first.waiting == pytest.approx(0.01)
+    world = World(60.0)
+    world.plugged = False
+    world.gyro('csv')
+    world.at(30.0, world.plug)
+    world.at(50.0, world.unplug)
+    reading = Reading(world, 'csv')
+    waits = [state.waiting for state in reading.states if state.name == 'failed']
+    doubling = [0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
+    assert waits == pytest.approx([*doubling, *5 * [5.0], *doubling, 5.0])
+    assert reading.connection.waited == pytest.approx(31.3 + 10.0, abs=0.2)
 
 
-def test_a_gyro_that_falls_silent_is_opened_again(terminal, wait_until):
-    master, path = terminal
-    with Taker(path, 'csv', settings=ONE_COLUMN, silence_timeout=0.2, reopen_interval=0.05) as taker:
-        wait_until(lambda: os.write(master, b'1.0\r\n') and len(taker.samples) > 5)
-        wait_until(lambda: taker.problems)
-        count = len(taker.samples)
-        wait_until(lambda: os.write(master, b'1.0\r\n') and len(taker.samples) > count)
-        assert taker.connection.openings > 1
-    assert taker.problems[0] == f'nothing comes on {path} for 0.2 s: check the power and the wires of the gyro'
+def test_a_missing_port_is_tried_less_and_less_often():
+    world = World(3600.0)
+    world.plugged = False
+    Reading(world, 'csv')
+    assert world.attempts <= 6 + 3600 / 5
 
 
-class Board(Worker):
-    """A microcontroller that restarts when its port is opened, is deaf and dumb meanwhile, and then says a line again and again."""
-
-    def __init__(self, seconds, line, wanted=b'', answer=b''):
-        self._seconds, self._line, self._wanted, self._answer = seconds, line, wanted, answer
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        self.path = os.ttyname(slave)
-        os.close(slave)
-        os.set_blocking(self._master, False)
-        self._poll = select.poll()
-        self._poll.register(self._master, select.POLLIN)
-        self._stop, self._thread = threading.Event(), threading.Thread(target=self._run)
-        self.asked = 0
-
-    def _run(self):
-        line, talks, was_open = self._line, 0.0, False
-        while not self._stop.wait(0.01):
-            events = dict(self._poll.poll(0)).get(self._master, 0)
-            is_open = not events & select.POLLHUP
-            if is_open and not was_open:
-                line, talks = self._line, time.monotonic() + self._seconds
-            was_open = is_open
-            heard = os.read(self._master, 1000) if is_open and events & select.POLLIN else b''
-            self.asked += heard.count(self._wanted) if self._wanted else 0
-            if is_open and time.monotonic() > talks:
-                line = self._answer if self._wanted and self._wanted in heard else line
-                with contextlib.suppress(OSError):  # closed just now
-                    os.write(self._master, line)
-
-    def __exit__(self, *_):
-        super().__exit__()
-        os.close(self._master)
-
-
-@pytest.mark.parametrize('protocol', ['razor', 'auto'])
-def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_hears(protocol, wait_until):
-    angles, rates = b'#YPR=-142.28,-5.38,33.52\r\n', b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
-    with Board(1.2, angles, b'#ox', rates) as board, Taker(board.path, protocol, silence_timeout=5.0) as taker:
-        wait_until(lambda: taker.samples, what=taker.states)
-        asked, count = board.asked, len(taker.samples)
-        wait_until(lambda: len(taker.samples) > count + 150)  # 1.5 s
-        assert taker.connection.openings == 1
-        assert board.asked == asked, 'asked although it talks'
-
-
-@pytest.mark.parametrize('protocol', ['csv', 'auto'])
-def test_a_board_that_takes_long_to_restart_is_waited_for(protocol, wait_until):
-    """Its silence is told meanwhile."""
-    with Board(2.0, b'1.0\r\n') as board, Taker(board.path, protocol, settings=ONE_COLUMN, silence_timeout=0.3) as taker:
-        wait_until(lambda: taker.samples, what=taker.states)
-        assert taker.connection.openings == 1
-    assert taker.problems[0] == f'nothing comes on {board.path} for 0.3 s: check the power and the wires of the gyro'
-
-
-def test_a_board_that_says_something_else_while_it_starts_is_found_at_a_given_baud(terminal, wait_until):
-    master, path = terminal
-    with Taker(path, baud=115200, settings=ONE_COLUMN) as taker:
-        wait_until(lambda: os.write(master, b'\x00\x01\x02' * 10) and taker.problems)
-        wait_until(lambda: os.write(master, b'1.0\r\n2.0\r\n3.0\r\n') and taker.samples)
-        assert taker.connection.openings == 1
-
-
-def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known(terminal, wait_until):
-    """The rest of the frame is no bytes of another format."""
-    master, path = terminal
-    encode, numbers = find('kvh_dsp3000').encoder(), itertools.count()
-    with Taker(path, silence_timeout=0.5) as taker:
-        wait_until(lambda: os.write(master, encode(Sample(0.001 * next(numbers)))) and len(taker.samples) > 20)
-        os.write(master, encode(Sample(0.5))[:9])
-        wait_until(lambda: taker.problems)
-        assert taker.connection.protocol is find('kvh_dsp3000')
-    assert taker.problems[0] == f'nothing comes on {path} for 0.5 s: check the power and the wires of the gyro'
-
-
-def test_a_pause_is_in_the_stamps_but_counts_as_no_loss(tmp_path, wait_until):
-    with Taker(tmp_path / 'gyro', 'csv', reopen_interval=0.05) as taker:
-        for _ in range(2):
-            count = len(taker.samples)
-            with Emulator(find('csv'), turning(), Settings(), link=tmp_path / 'gyro'):
-                wait_until(lambda count=count: len(taker.samples) > count + 20)
-            time.sleep(0.5)
-        stamps = [stamp for chunk in taker.chunks for stamp in chunk.stamps]
-        assert max(later - earlier for earlier, later in itertools.pairwise(stamps)) > 0.45
-        assert taker.connection.counts().lost_samples == 0
-
-
-def test_the_port_is_closed_when_nobody_takes_samples_any_more():
-    with Emulator(find('csv'), turning()) as gyro:
-        connection = Connection(gyro.path, 'csv')
-        for _ in connection.chunks(threading.Event()):
-            break
-        other = Connection(gyro.path, 'csv')
-        assert next(other.chunks(threading.Event())).samples
+def test_waiting_ends_when_told_to():
+    stop = threading.Event()
+    connection = Connection('/nonexistent/gyro', 'csv', on_change=lambda state: stop.set())
+    assert list(connection.chunks(stop)) == [] and connection.state.name == 'failed'
 
 
 def test_a_protocol_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match="protocol 'bogus' is not known"):
+    with pytest.raises(ValueError, match="protocol 'bogus' is not known: .*, or auto to find it by listening"):
         Connection('/dev/null', 'bogus')
+
+
+# Silence
+
+
+def test_a_gyro_that_falls_silent_is_opened_again():
+    world = World(20.0)
+    world.gyro('csv', end=5.0)
+    world.gyro('csv', begin=12.0)
+    reading = Reading(world, 'csv')
+    assert reading.names == ['reading', *(len(reading.names) - 2) * ['failed'], 'reading']
+    assert reading.problems[0] == NOTHING and reading.times[1] == pytest.approx(7.0, abs=0.2)
+    assert reading.connection.openings > 1
+
+
+@pytest.mark.parametrize('period', [1.5, 10.0])
+def test_a_slow_gyro_is_silent_after_three_of_its_periods(period):
+    """Its period is known from the second sample on, or from the parameter."""
+    settings = Settings(columns=('gyro_dps',), sample_rate=1.0 / period if period > 5.0 else None)
+    world = World(30.5 * period)
+    world.send(b'1.0\r\n', end=20.5 * period, rate=1.0 / period)
+    reading = Reading(world, 'csv', settings=settings)
+    assert len(reading.samples) == 20 and reading.names[:2] == ['reading', 'failed']  # the first line is cut off
+    assert reading.times[1] == pytest.approx(23.0 * period, abs=1.0)
+
+
+@pytest.mark.parametrize(('protocol', 'line', 'reason'), [
+    ('csv', b'', NOTHING),
+    ('csv', b'!ANG:1,2,3,AN:1,2,3,4,5,6,7,8,9\r\n', 'bytes come on /dev/gyro, but no sample of csv for 2 s: check protocol, baud and'),
+    ('kvh_dsp3000', b'       0.015733   0\r\n', 'the gyro on /dev/gyro calls each of its samples invalid for 2 s: turn it off'),
+    ('kvh_dsp3000', b'     999.000000   1\r\n', 'each sample on /dev/gyro is beyond full scale for 2 s: check protocol, sens'),
+])
+def test_a_gyro_without_samples_is_reported_with_its_reason(protocol, line, reason):
+    world = World(30.0)
+    world.send(line)
+    reading = Reading(world, protocol)
+    assert reading.problems[0].startswith(reason) and not reading.samples
+    assert reading.times[0] == pytest.approx(2.0, abs=0.2)
+    assert 3 <= reading.connection.openings <= 5  # after 7 s each, as a board may restart
+
+
+@pytest.mark.parametrize('protocol', ['razor', 'auto'])
+def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_answers(protocol):
+    world = World(10.0)
+    world.restart, world.answer = 1.2, b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
+    world.send(b'#YPR=-142.28,-5.38,33.52\r\n')
+    reading = Reading(world, protocol)
+    assert len(reading.samples) > 500 and reading.connection.openings == 1
+    assert len(world.asked) <= 4, 'asked although it sends'
+
+
+@pytest.mark.parametrize('protocol', ['csv', 'auto'])
+def test_a_board_that_takes_long_to_restart_is_waited_for(protocol):
+    """Its silence is reported meanwhile."""
+    world = World(10.0)
+    world.restart = 4.5
+    world.send(b'1.0\r\n')
+    reading = Reading(world, protocol, settings=ONE_COLUMN)
+    assert reading.samples and reading.connection.openings == 1
+    assert reading.problems == [NOTHING]
+
+
+def test_a_board_that_sends_something_else_while_it_starts_is_found_at_a_given_baud():
+    world = World(10.0)
+    world.send(b'\x00\x01\x02', end=3.0)
+    world.send(b'1.0\r\n', begin=3.0)
+    reading = Reading(world, settings=ONE_COLUMN, baud=115200)
+    assert reading.problems and reading.samples and reading.connection.openings == 1
+
+
+def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
+    """The rest of the frame is no bytes of another format."""
+    world = World(10.0)
+    world.gyro('kvh_dsp3000', end=4.0)
+    world.send(iter([find('kvh_dsp3000').encode(Sample(0.5))[:9]]), begin=4.0, end=4.01)
+    reading = Reading(world)
+    assert reading.connection.protocol is find('kvh_dsp3000') and reading.problems[0] == NOTHING
+
+
+# Counts and stamps
+
+
+def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
+    world = World(20.0)
+    world.gyro('csv')
+    world.at(8.0, world.unplug)
+    world.at(9.0, world.plug)
+    reading = Reading(world, 'csv')
+    assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)  # tried at 8, 8.1, 8.3, 8.7, 9.5
+    assert reading.connection.counts().lost_samples == 0
+
+
+def test_without_a_gap_there_is_no_longest():
+    world = World(5.0)
+    world.gyro('csv')
+    assert Reading(world, 'csv').connection.longest_gap == 0.0
+
+
+def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():
+    generator, encode = random.Random(3), find('kvh_1750').encoder()
+    sent = [b'' if generator.random() < 0.02 else encode(Sample(1e-4 * number, sequence=number)) for number in range(8_000)]
+    world = World(8.0)
+    world.send(iter(sent), rate=1000.0)
+    reading = Reading(world, 'kvh_1750')
+    counts, numbers = reading.connection.counts(), np.round([1e4 * sample.output for sample in reading.samples])
+    assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
+    assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
+
+
+def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
+    lines = {10: b'       0.015733   0\r\n', 20: b'     999.000000   1\r\n'}
+    world = World(5.0)
+    world.send(lines.get(number % 100, b'       0.015733   1\r\n') for number in itertools.count())
+    reading = Reading(world, 'kvh_dsp3000')
+    counts = reading.connection.counts()
+    assert (counts.device_faults, counts.refused_samples, counts.discarded_bytes) == (5, 5, 0)
+    assert sum(step == pytest.approx(0.02, abs=1e-3) for step in reading.steps) == counts.lost_samples == 10
+
+
+@pytest.mark.parametrize('share', [0.001, 0.01, 0.1])
+@pytest.mark.parametrize('name', sorted(PROTOCOLS))
+def test_a_bad_line_is_survived_and_counted(name, share):
+    """At a tenth of all bytes long frames hardly ever arrive whole; a good line afterwards shows that decoding is right again."""
+    protocol, generator = find(name), np.random.default_rng(2)
+    bad = SerialFaults(lost_bytes=share / 3.0, doubled_bytes=share / 3.0, flipped_bytes=share / 3.0)
+    encode = protocol.encoder(SETTINGS[name])
+    frames = [encode(Sample(0.5, 25.0, number / 100.0, number)) for number in range(3000)]
+    world = World(30.0)
+    world.send((damaged(bad, frame, generator) if number < 2000 else frame for number, frame in enumerate(frames)))
+    reading = Reading(world, name, settings=SETTINGS[name])
+    exact = reading.samples[-1].output
+    last = [sample.output for chunk in reading.chunks for sample in chunk.samples if chunk.arrival > BEGIN + 20.5]
+    assert exact == pytest.approx(0.5, abs=0.01) and set(last) == {exact} and len(last) > 900
+    assert reading.connection.counts().discarded_bytes > 0 and min(reading.steps) > 0.0
+    assert all(math.isfinite(sample.output) for sample in reading.samples)
+
+
+def test_noise_is_discarded_and_counted():
+    noise = random.Random(1)
+    world = World(5.0)
+    world.send(noise.randbytes(200) + b'\r\n       0.015733   1\r\n' for _ in itertools.count())
+    reading = Reading(world, 'kvh_dsp3000')
+    assert {sample.output for sample in reading.samples} == {-math.radians(0.015733)}
+    assert reading.connection.counts().discarded_bytes > 50_000
+
+
+def test_single_bytes_make_whole_samples():
+    """As a slow line gives them to a fast host: 9600 bit/s is a byte a millisecond."""
+    data = b''.join(b'%.3f\r\n' % (0.001 * number) for number in range(1000))
+    world = World(10.0)
+    world.send((data[place:place + 1] for place in range(len(data))), rate=960.0)
+    reading = Reading(world, 'csv', settings=Settings(columns=('gyro_rad_s',)))
+    numbers = np.round([1000.0 * sample.output for sample in reading.samples])
+    assert (np.diff(numbers) == 1.0).all() and len(numbers) > 950

@@ -14,7 +14,7 @@ import pytest
 
 from gyro_calibration.driver.emulator import Emulator, emulate
 from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.driver.serial_port import PortError, SerialPort
 
 
@@ -154,9 +154,9 @@ def test_a_sample_without_a_time_is_refused():
         emulate(Emulator(find('csv'), [Sample(0.5)]))
 
 
-def received_over(line, protocol, count, rate):
+def received_over(faults, protocol, count, rate):
     """Return the samples of a short drive over a bad line, as lists of those that came together, and the bytes alike."""
-    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, line=line, generator=np.random.default_rng(1))
+    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, faults=faults, generator=np.random.default_rng(1))
     with gyro:
         port, decoder, received = SerialPort(gyro.path, 9600, timeout=0.5), protocol.decoder(), []
         port.open()
@@ -169,7 +169,7 @@ def received_over(line, protocol, count, rate):
 
 
 def test_lost_samples_leave_holes():
-    received = sum(received_over(Line(lost_samples=0.3), find('csv'), 200, 1000.0)[0], [])
+    received = sum(received_over(SerialFaults(lost_samples=0.3), find('csv'), 200, 1000.0)[0], [])
     numbers = [round((sample.time - 5.0) * 1000.0) for sample in received]
     assert 100 < len(numbers) < 180 and numbers == sorted(set(numbers))
     assert max(numbers) > 190
@@ -178,20 +178,20 @@ def test_lost_samples_leave_holes():
 def test_samples_are_numbered_before_any_is_lost():
     sent = []
     protocol = replace(find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
-    with Emulator(protocol, samples(100, 1e4), line=Line(lost_samples=0.5), generator=np.random.default_rng(1)) as gyro:
+    with Emulator(protocol, samples(100, 1e4), faults=SerialFaults(lost_samples=0.5), generator=np.random.default_rng(1)) as gyro:
         gyro.join()
     assert set(sent) < set(range(100)) and sent == sorted(sent) and 30 < len(sent) < 70
 
 
 def test_an_adapter_hands_over_in_bursts():
     """Sixteen samples of 1 ms each come together."""
-    received = [len(samples) for samples in received_over(Line(burst=0.016), find('csv'), 320, 1000.0)[0]]
+    received = [len(samples) for samples in received_over(SerialFaults(burst=0.016), find('csv'), 320, 1000.0)[0]]
     assert sum(received) == 320
     assert sum(count for count in received if count % 16 == 0) > 160  # a busy machine may take several bursts at once
 
 
 def test_a_slow_line_gives_single_bytes():
-    received, chunks = received_over(Line(piece=1), replace(find('kvh_ecore'), baud=600), 10, 5.0)
+    received, chunks = received_over(SerialFaults(piece=1), replace(find('kvh_ecore'), baud=600), 10, 5.0)
     assert sum(len(samples) for samples in received) == 10
     sizes = [len(chunk) for chunk in chunks if chunk]
     assert sizes.count(1) > 0.5 * len(sizes)
@@ -199,7 +199,7 @@ def test_a_slow_line_gives_single_bytes():
 
 def test_a_line_with_faults_needs_a_generator():
     with pytest.raises(ValueError, match='give a numpy Generator'):
-        Emulator(find('csv'), samples(), line=Line(lost_bytes=0.1))
+        Emulator(find('csv'), samples(), faults=SerialFaults(lost_bytes=0.1))
 
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():

@@ -21,7 +21,7 @@ MOTIONS = {
 def frames(name, count, rate=MOTIONS['rest'], force=None):
     """Return what a device sends, one sample after the other."""
     encode = find(name).encoder(SETTINGS[name])
-    return [find(name).awakening, *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))]
+    return [find(name).preamble, *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))]
 
 
 def received(data, ratio, idle=0):

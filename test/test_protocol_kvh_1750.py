@@ -112,10 +112,10 @@ def test_the_sequence_wraps_at_128():
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 3e38])
-def test_a_float_that_is_no_rate_is_out_of_range(value):
+def test_a_float_that_is_no_rate_is_refused(value):
     decoder = PROTOCOL.decoder(Settings(increments=False))
     assert decoder.feed(sealed(GOLDEN[:12] + struct.pack('>f', value) + GOLDEN[16:32])) == []
-    assert (decoder.out_of_range, decoder.discarded_bytes) == (1, 0)
+    assert (decoder.refused_samples, decoder.discarded_bytes) == (1, 0)
 
 
 def test_an_acceleration_that_is_no_number_gives_no_force():

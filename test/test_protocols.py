@@ -16,11 +16,11 @@ FIZOPTIKA = Settings(sensitivity=DPS / 27880.0)  # as one unit has it
 SETTINGS = {name: Settings() for name in ALL} | {'fizoptika': FIZOPTIKA}
 LARGEST = {  # deg/s
     'kvh_dsp3000': 500.0, 'kvh_1750': 500.0, 'kvh_ecore': 59.9, 'fizoptika': 300.0, 'minimu9': 2293.0, 'witmotion': 1999.9,
-    'razor': 2279.0, 'csv': 1e6,
+    'razor': 2279.0, 'csv': 2000.0,
 }
-RESOLUTION = {  # deg/s; that of the csv at 9 digits of 1e6, that of the 1750 at 24 bits of 500
+RESOLUTION = {  # deg/s; that of the csv at 9 digits, that of the 1750 at 24 bits of 500
     'kvh_dsp3000': 1e-6, 'kvh_1750': 3e-5, 'kvh_ecore': 0.00183, 'fizoptika': 1.0 / 27880.0, 'minimu9': 0.07, 'witmotion': 0.0611,
-    'razor': 0.573, 'csv': 1e-2,
+    'razor': 0.573, 'csv': 1e-5,
 }
 
 # Format, bytes, deg/s in the device's own sense of rotation.
@@ -46,13 +46,13 @@ def stream(name, count=20, seed=1):
         for k in range(count)
     ]
     protocol = find(name)
-    return samples, protocol.awakening + b''.join(map(protocol.encoder(SETTINGS[name]), samples))
+    return samples, protocol.preamble + b''.join(map(protocol.encoder(SETTINGS[name]), samples))
 
 
 def opened(name, settings=None):
     """Return a decoder that knows where the next frame begins."""
     decoder = find(name).decoder(settings or SETTINGS[name])
-    decoder.feed(find(name).awakening)
+    decoder.feed(find(name).preamble)
     return decoder
 
 
@@ -121,7 +121,7 @@ def test_garbage_costs_at_most_one_frame(name):
     garbage = bytes(random.Random(3).randrange(256) for _ in range(200))
     decoder = opened(name)
     decoder.feed(garbage)
-    received = decoder.feed(data.removeprefix(find(name).awakening))
+    received = decoder.feed(data.removeprefix(find(name).preamble))
     assert len(received) >= len(samples) - 1
     assert received[-1].output == pytest.approx(samples[-1].output, abs=RESOLUTION[name] * DPS)
     assert decoder.discarded_bytes >= 100
@@ -132,7 +132,7 @@ def test_half_a_number_is_no_number(name):
     """A port is opened in the middle of a line, where 120.5 looks like 20.5."""
     _, data = stream(name, 2)
     whole = {sample.output for sample in find(name).decoder().feed(data)}
-    for start in range(len(find(name).awakening) + 1, len(data)):
+    for start in range(len(find(name).preamble) + 1, len(data)):
         assert {sample.output for sample in find(name).decoder().feed(data[start:])} <= whole
 
 
@@ -157,8 +157,8 @@ def test_a_flipped_bit_gives_no_wrong_rate(name):
 @pytest.mark.parametrize('name', ALL)
 def test_after_any_garbage_decoding_is_right_again_within_two_frames(name):
     samples, data = stream(name, 6)
-    good = [sample.output for sample in opened(name).feed(data.removeprefix(find(name).awakening))]
-    whole, generator = data.removeprefix(find(name).awakening), random.Random(5)
+    good = [sample.output for sample in opened(name).feed(data.removeprefix(find(name).preamble))]
+    whole, generator = data.removeprefix(find(name).preamble), random.Random(5)
     for _ in range(200):
         decoder, start = opened(name), generator.randrange(len(whole))
         decoder.feed(garbage(generator, whole[:start]))
@@ -246,11 +246,40 @@ def test_an_endless_line_is_thrown_away(name):
     assert len(decoder.feed(find(name).encode(Sample(0.1)))) == 1
 
 
-@pytest.mark.parametrize('text', [b'nan', b'inf', b'-inf', b'1e999', b'1_0', b'0x10', b'', b'\xb2', b'1.5.2', b'--1', b'infinity'])
-def test_csv_discards_what_is_no_finite_rate(text):
+@pytest.mark.parametrize('text', [b'1_0', b'0x10', b'', b'\xb2', b'1.5.2', b'--1', b'nano'])
+def test_csv_discards_what_is_no_rate(text):
     decoder = opened('csv')
     assert decoder.feed(b'0.1,' + text + b',20.0\n') == []
     assert decoder.discarded_bytes == len(text) + 9
+
+
+# the last one is 12.345678 without its decimal point
+@pytest.mark.parametrize('text', [b'nan', b'inf', b'-inf', b'1e999', b'infinity', b'-2000.1', b'12345678'])
+def test_csv_refuses_a_rate_that_no_gyro_reports_and_leaves_a_gap(text):
+    decoder = opened('csv')
+    samples = decoder.feed(b'0.1,1.0,20.0\n0.2,' + text + b',20.0\n0.3,1.0,20.0\n')
+    assert [sample.missing for sample in samples] == [0, 1]
+    assert (decoder.refused_samples, decoder.discarded_bytes) == (1, 0)
+
+
+@pytest.mark.parametrize('text', [b'2500', b'-127.1', b'1e308', b'-1e308'])
+def test_a_temperature_that_no_sensor_reports_is_refused_and_the_rate_is_kept(text):
+    decoder = opened('csv')
+    sample, = decoder.feed(b'0.1,1.0,' + text + b'\n')
+    assert sample.temperature is None and sample.output == pytest.approx(DPS)
+    assert (decoder.refused_temperatures, decoder.refused_samples) == (1, 0)
+
+
+@pytest.mark.parametrize('name', ALL)
+def test_every_protocol_has_a_full_scale_and_an_assumed_noise(name):
+    protocol, settings = find(name), SETTINGS[name]
+    assert 0.0 < protocol.limit(settings) < math.inf
+    assert 0.0 < protocol.variance(settings) <= (0.5 * DPS) ** 2
+
+
+def test_a_full_scale_that_is_set_goes_before_that_of_the_protocol():
+    sample, = opened('csv', Settings(full_scale=100.0)).feed(b'0.1,5000.0,20.0\n')
+    assert sample.output == pytest.approx(5000.0 * DPS)
 
 
 @pytest.mark.parametrize('text', [b'nan', b'NaN', b''])
@@ -268,10 +297,10 @@ def test_a_failed_temperature_sensor_does_not_cost_the_rate(text):
     ('razor', b'#YPRAG=0,0,0,0,0,0,0,0,2290.0\r\n', Settings()),
     ('csv', b'0.1,501.0,20.0\n', Settings(full_scale=500.0 * DPS)),
 ])
-def test_a_rate_that_the_device_cannot_mean_is_thrown_away(name, data, settings):
+def test_a_rate_that_the_device_cannot_mean_is_refused(name, data, settings):
     decoder = opened(name, settings)
     assert decoder.feed(data) == []
-    assert decoder.out_of_range == 1
+    assert decoder.refused_samples == 1
 
 
 def test_a_sample_that_the_dsp3000_calls_invalid_is_a_fault():
@@ -303,7 +332,7 @@ def test_full_scale_follows_the_sensitivity():
     assert sample.output == pytest.approx(280.0 * DPS, rel=1e-4)
 
 
-@pytest.mark.parametrize('name', [name for name in ALL if name != 'csv'])
+@pytest.mark.parametrize('name', ALL)
 def test_an_emulated_gyro_saturates_at_its_full_scale(name):
     sample, = opened(name).feed(find(name).encode(Sample(-1000.0), SETTINGS[name]))
     assert sample.output == pytest.approx(-find(name).limit(SETTINGS[name]), rel=2e-4)

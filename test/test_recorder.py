@@ -9,7 +9,7 @@ import pytest
 from recordings import BEGIN, Messages, rosbags
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.driver.recorder import CsvRecorder, DiskFull, McapRecorder, MessageLog, WholePieces, about
+from gyro_calibration.driver.recorder import AtomicAppender, CsvRecorder, DiskFull, McapRecorder, MessageLog, about
 from gyro_calibration.log import LogError, read_log
 from gyro_calibration.messages import IMU, TEMPERATURE
 from gyro_calibration.recording import Topics, read_recording
@@ -88,7 +88,7 @@ def test_a_file_that_is_there_is_never_written_to(tmp_path):
     for name in ('a.csv', 'a.mcap'):
         (tmp_path / name).write_text('precious')
         with pytest.raises(FileExistsError):
-            WholePieces(str(tmp_path / name))
+            AtomicAppender(str(tmp_path / name))
         assert (tmp_path / name).read_text() == 'precious'
 
 
@@ -99,8 +99,25 @@ def test_a_recording_of_nothing_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize('name', ['a.csv', 'a.csv.gz', 'a.mcap'])
+def test_what_is_killed_before_its_first_piece_takes_no_name(tmp_path, name):
+    recorder = (McapRecorder if name.endswith('.mcap') else CsvRecorder)(str(tmp_path / name), notes)
+    for stamp, sample in samples(50):
+        recorder.add_sample(stamp, sample)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_is_taken_meanwhile_is_not_written_to(tmp_path):
+    pieces = AtomicAppender(str(tmp_path / 'a.csv'))
+    (tmp_path / 'a.csv').write_text('precious')
+    with pytest.raises(LogError, match='another program has made it meanwhile'):
+        pieces.append(b'a piece')
+    pieces.close()
+    assert (tmp_path / 'a.csv').read_text() == 'precious'
+
+
 def test_a_piece_that_does_not_fit_is_taken_back(tmp_path, monkeypatch):
-    pieces = WholePieces(str(tmp_path / 'a.csv'))
+    pieces = AtomicAppender(str(tmp_path / 'a.csv'))
     pieces.append(b'whole\n')
 
     class Full:
@@ -130,7 +147,7 @@ def test_a_piece_that_does_not_fit_is_taken_back(tmp_path, monkeypatch):
 
 def test_other_programs_read_the_whole_pieces_of_a_recording_on_a_full_disk(tmp_path, monkeypatch):
     reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
-    recorder, append = McapRecorder(str(tmp_path / 'a.mcap'), notes), WholePieces.append
+    recorder, append = McapRecorder(str(tmp_path / 'a.mcap'), notes), AtomicAppender.append
 
     def without_room(pieces, piece):
         if len(piece) > 100:
@@ -140,7 +157,7 @@ def test_other_programs_read_the_whole_pieces_of_a_recording_on_a_full_disk(tmp_
     for stamp, sample in samples(200):
         recorder.add_sample(stamp, sample)
     recorder.flush()
-    monkeypatch.setattr(WholePieces, 'append', without_room)
+    monkeypatch.setattr(AtomicAppender, 'append', without_room)
     for stamp, sample in samples(400)[200:]:
         recorder.add_sample(stamp, sample)
     with pytest.raises(DiskFull):

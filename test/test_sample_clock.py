@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.driver.timestamps import ClockDifference, LowerLine, SampleClock
+from gyro_calibration.driver.timestamps import LowerLine, NodeTime, SampleClock
 
 BURST = 0.016  # s; latency_timer of an FTDI adapter
 BUFFER = 113  # samples of 36 bytes that a port holds at most
@@ -243,41 +243,6 @@ def test_no_samples_have_no_stamps():
     assert SampleClock(100.0).stamp([], 1.0) == []
 
 
-def test_device_time_keeps_its_intervals_in_a_fast_replay():
-    """Rounded to double precision at each sample, the intervals would add up to 1e-4 less or more."""
-    clock = SampleClock(100.0, use_device_time=True)
-    stamps = [clock.stamp([Sample(0.0, time=50.0 + 0.001 * k)], 1e6 + 1e-4 * k)[0] for k in range(100_000)]
-    assert [stamps[1000 * k] - 1e6 for k in range(100)] == pytest.approx([float(k) for k in range(100)], abs=1e-6)
-
-
-def test_device_time_tells_of_lost_samples_in_a_replay_too():
-    clock = SampleClock(100.0, use_device_time=True)
-    for k in range(1000):
-        if k not in (500, 600, 601):
-            clock.stamp([Sample(0.0, time=0.01 * k)], 1e-3 * k)
-    assert clock.lost == 3
-    assert clock.period == pytest.approx(0.01, rel=0.01)
-
-
-@pytest.mark.parametrize('speed', [0.5, 10.0])
-def test_a_sample_without_a_device_time_is_a_usual_interval_after_the_one_before(speed):
-    clock = SampleClock(50.0, use_device_time=True)
-    samples = [Sample(0.0, time=None if k == 500 else 0.01 * k) for k in range(1000)]
-    stamps = [clock.stamp([sample], 5.0 + 0.01 * k / speed)[0] for k, sample in enumerate(samples)]
-    assert stamps == pytest.approx([5.0 + 0.01 * k for k in range(1000)], abs=1e-3)
-    assert clock.lost == 0
-
-
-@pytest.mark.parametrize('jump', [-100.0, -0.5, 100.0])
-def test_a_jump_of_device_time_never_puts_a_stamp_back(jump):
-    clock = SampleClock(100.0, use_device_time=True)
-    before = clock.stamp([Sample(0.0, time=time) for time in (10.0, 10.01, 10.02)], 500.0)[-1]
-    after = clock.stamp([Sample(0.0, time=10.03 + jump), Sample(0.0, time=10.04 + jump)], 502.0)
-    assert after == pytest.approx([502.0, 502.01], abs=1e-5)
-    replayed = clock.stamp([Sample(0.0, time=0.0)], 495.0)
-    assert before < after[0] < after[1] < replayed[0]
-
-
 def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(generator):
     """Compared with every line through two of the points."""
     x = np.arange(30.0)
@@ -292,11 +257,11 @@ def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(ge
 
 @pytest.mark.parametrize('by', [-HOUR, HOUR])
 def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
-    difference, others = ClockDifference(), []
+    node, others = NodeTime(), []
     for k in range(2000):
         steady = 100.0 + 0.01 * k
-        difference.follow(steady, 1.7e9 + 1.0005 * steady + by * (k >= 1000))
-        others.append(difference.other(steady))
+        node.watch(steady, 1.7e9 + 1.0005 * steady + by * (k >= 1000))
+        others.append(node.of(steady))
     true = [1.7e9 + 1.0005 * (100.0 + 0.01 * k) + by * (k >= 1000) for k in range(2000)]
     assert others == pytest.approx(true, rel=0.0, abs=0.002)
     steps = np.diff(others)
@@ -304,9 +269,9 @@ def test_another_clock_is_followed_slowly_and_at_once_where_it_was_set(by):
 
 
 def test_another_clock_that_runs_at_half_speed_or_stands_puts_no_stamp_back():
-    difference, others = ClockDifference(), []
+    node, others = NodeTime(), []
     for k in range(2000):
-        difference.follow(0.01 * k, min(0.005 * k, 8.0))
-        others.append(difference.other(0.01 * k - 0.002))
+        node.watch(0.01 * k, min(0.005 * k, 8.0))
+        others.append(node.of(0.01 * k - 0.002))
     assert (np.diff(others) > 0.0).all()
     assert others[1500] == pytest.approx(7.5, abs=0.15)

@@ -17,7 +17,7 @@ from gyro_calibration.cli.simulate import add_motion, simulated
 from gyro_calibration.cli.verb import UsageError, add_topics, output_of, positive, read, time_of, verb
 from gyro_calibration.driver.emulator import Emulator, emulate
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import Line
+from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.files import plain
 from gyro_calibration.log import DEGREE, Array, DataRefused
 
@@ -56,14 +56,14 @@ def _add_line(parser: argparse.ArgumentParser) -> None:
 
 def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since the answer of this verb is what goes on until it ends."""
-    (protocol, settings), line = _wire(given), _line(given)
+    (protocol, settings), faults = _wire(given), _faults(given)
     log = read(given) if given.log else simulated(given)[0]
     time, output = time_of(given, log), output_of(given, log)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples have an output; send a log with two or more')
     samples = _samples(time, output, log.temperature, given.repeat)
     generator = np.random.default_rng(secrets.randbits(32) if given.seed is None else given.seed)
-    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, line, generator)
+    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults, generator)
     _handle_signals(lambda *_: emulator.stop())
     def answer(path: str) -> None:
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else plain(path), flush=True)
@@ -88,9 +88,10 @@ def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     return protocol, settings
 
 
-def _line(given: argparse.Namespace) -> Line:
+def _faults(given: argparse.Namespace) -> SerialFaults:
     try:
-        return Line(given.lose_samples, given.invalid_samples, given.lose, given.double, given.flip, 1e-3 * given.burst, given.piece)
+        return SerialFaults(given.lose_samples, given.invalid_samples, given.lose, given.double,
+                            given.flip, 1e-3 * given.burst, given.piece)
     except ValueError as error:
         raise UsageError(str(error)) from None
 

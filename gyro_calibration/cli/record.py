@@ -19,9 +19,10 @@ from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import KINDS, PIECE, CsvRecorder, DiskFull, McapRecorder, MessageLog, Notes, about
+from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.files import plain
 from gyro_calibration.log import DEGREE, DataRefused
-from gyro_calibration.messages import BILLION
+from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.storage import Message
 
 Recorder = CsvRecorder | McapRecorder
@@ -204,7 +205,7 @@ class _PortSession(_Session):
             raise UsageError(str(error)) from None
         self._told = ''
         # Fixed at the beginning: the stamps must not jump where somebody sets the clock.
-        self._since = time.time_ns() - time.monotonic_ns()
+        self._since = time.time_ns() - round(steady() * NSEC_PER_SEC)
         super().__init__(given, stop)
 
     @property
@@ -227,7 +228,7 @@ class _PortSession(_Session):
     def _take(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
             for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
-                self._recorder.add_sample(round(stamp * BILLION) + self._since, sample)
+                self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._since, sample)
             tick()
 
     def _tell(self, state: State) -> None:

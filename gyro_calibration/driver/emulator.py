@@ -1,7 +1,8 @@
 """
-A gyro on a pseudo-terminal: samples from a simulation or a recording, sent in a wire format at their times.
+A gyro on a pseudo-terminal: samples of a simulation or a recording, sent at their times.
 
-A program opens the emulator's path as it would open the port of a real gyro. What it sends is read and ignored.
+A program opens the path of the emulator as it would open the port of a real gyro. What it sends is
+read and ignored.
 
 """
 
@@ -21,25 +22,27 @@ from pathlib import Path
 import numpy as np
 
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
-from gyro_calibration.driver.serial_faults import Line, damaged, delivered
+from gyro_calibration.driver.serial_faults import SerialFaults, damaged, delivered
 
 _POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
 _SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards
 _LINGERING = 1.0  # s; closing a pseudo-terminal throws away what its reader has not yet taken
-_BATCH = 0.0005  # s; what is due within it is written together, for above 2 kHz the waiting would take all the time there is
+_BATCH = 0.0005  # s; samples due within it are written together, as waiting takes too long
 
 
 class Emulator:
     """
     A gyro that programs can open.
 
-    Use it as a context manager, which sends from a thread of its own, or call `emulate`, which sends until the samples end.
+    Use it as a context manager, which sends from a thread of its own, or call `emulate`, which
+    sends until the samples end.
 
-    Samples are pulled one by one, each after the one before it was sent, so a source may be endless and may follow a motion that is
-    commanded meanwhile. The time of the first is the beginning; a source that is itself slower than its times sets the pace. Above 2 kHz,
-    and on a line with bursts, a few samples are pulled before they are sent together.
+    Samples are pulled one by one, each after the one before it was sent, so a source may be
+    endless and may follow a motion that is commanded meanwhile. The time of the first is the
+    beginning; a source that is itself slower than its times sets the pace. Above 2 kHz, and on a
+    line with bursts, a few samples are pulled before they are sent together.
 
-    Samples without a sequence are numbered from 0 on, before the line loses any.
+    Samples without a sequence are numbered from 0 on, before any are lost.
 
     Parameters
     ----------
@@ -48,20 +51,22 @@ class Emulator:
         Each with its time, in seconds.
     settings : Settings or None
     speed : float
-        How many times faster than real time; inf is as fast as the reader reads. At 1 or slower, bytes that nobody reads are lost, as on
-        a real line; faster is a replay, so it waits for the reader.
+        Times real time; inf is as fast as the reader reads. At 1 or slower, bytes that nobody
+        reads are lost, as on a real line; faster is a replay, which waits for the reader.
     link : path or None
-        A symbolic link to the pseudo-terminal, whose own name differs from run to run. It is removed at the end.
+        A symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
+        removed at the end.
     wait_for_reader : bool
         Whether to send the first sample only after a reader has opened the port.
-    line : Line or None
-        What happens to samples and bytes on their way; None is a line without faults.
+    faults : SerialFaults or None
+        What happens to samples and bytes on their way; None for nothing.
     generator : numpy.random.Generator or None
-        Says to which of them; a line without faults needs none.
+        Chooses which of them; a line without faults needs none.
 
     Raises
     ------
-    ValueError : the speed is not above 0, the settings do not suffice for the protocol, or a generator is missing
+    ValueError : the speed is not above 0, the settings do not suffice for the protocol, or a
+        generator is missing
     FileExistsError : the place of the link is taken by a file that is no link
 
     """
@@ -74,11 +79,12 @@ class Emulator:
         speed: float = 1.0,
         link: str | Path | None = None,
         wait_for_reader: bool = False,
-        line: Line | None = None,
+        faults: SerialFaults | None = None,
         generator: np.random.Generator | None = None,
     ):
         if not speed > 0.0:
-            raise ValueError(f'speed is {speed}, but must be above 0: 1 is real time, 10 is ten times faster')
+            raise ValueError(f'speed is {speed}, but must be above 0: 1 is real time, 10 is ten '
+                             'times faster')
         self._settings = settings or Settings()
         protocol.check(self._settings)
         self._protocol = protocol
@@ -86,9 +92,10 @@ class Emulator:
         self._speed = speed
         self.link = None if link is None else Path(link)
         self._wait_for_reader = wait_for_reader
-        self._line = line = line or Line()
-        if generator is None and line.is_random:
-            raise ValueError('the line loses or damages bytes, but no generator says which: give a numpy Generator')
+        self._faults = faults = faults or SerialFaults()
+        if generator is None and faults.is_random:
+            raise ValueError('the line loses or damages bytes, but no generator chooses which: '
+                             'give a numpy Generator')
         self._generator = generator or np.random.default_rng(0)  # never asked
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
@@ -100,7 +107,7 @@ class Emulator:
     def open(self) -> None:
         """Make the pseudo-terminal and the link to it; `path` is then its name."""
         self._master, slave = os.openpty()
-        tty.setraw(slave)  # else it echoes every sample, and its line discipline eats control characters
+        tty.setraw(slave)  # else it echoes samples, and its line discipline takes characters out
         self.path = os.ttyname(slave)
         os.close(slave)
         os.set_blocking(self._master, False)
@@ -122,8 +129,8 @@ class Emulator:
         """
         if self._wait_for_reader:
             self._wait_until_read()
-        self._send(self._protocol.awakening)
-        self._send_in_time(delivered(self._line, self._frames(), self._protocol.baud))
+        self._send(self._protocol.preamble)
+        self._send_in_time(delivered(self._faults, self._frames(), self._protocol.baud))
         if self.is_read():
             self._stop.wait(_LINGERING)
 
@@ -141,8 +148,9 @@ class Emulator:
 
     def close(self) -> None:
         """Unplug the gyro: its reader sees that the port is gone."""
-        if self.link is not None and self.link.is_symlink() and os.readlink(self.link) == self.path:
-            self.link.unlink()
+        link = self.link
+        if link is not None and link.is_symlink() and os.readlink(link) == self.path:
+            link.unlink()
         if self._master >= 0:
             os.close(self._master)
             self._master = -1
@@ -165,7 +173,8 @@ class Emulator:
         if self.link is None:
             return
         if self.link.exists() and not self.link.is_symlink():
-            raise FileExistsError(f'{self.link} is no link, so it is not replaced: choose another path for the link')
+            raise FileExistsError(f'{self.link} is no link, so it is not replaced: choose another '
+                                  'path for the link')
         temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
         os.symlink(self.path, temporary)
         os.replace(temporary, self.link)
@@ -181,25 +190,27 @@ class Emulator:
 
     def _frames(self) -> Iterator[tuple[float, bytes]]:
         """
-        Yield when each sample is due after the first, in the time of the host, and what comes of its bytes; lost samples are left out.
+        Yield when each sample is due after the first, in the time of the host, and its bytes.
+
+        Lost samples are left out.
 
         """
-        begin, line, generator = None, self._line, self._generator
+        begin, faults, generator = None, self._faults, self._generator
         encode = self._protocol.encoder(self._settings)
         for number, sample in enumerate(self._samples):
             due = _time(sample) / self._speed
             begin = due if begin is None else begin
-            if line.lost_samples and generator.random() < line.lost_samples:
+            if faults.lost_samples and generator.random() < faults.lost_samples:
                 continue
             if sample.sequence is None:
                 sample = replace(sample, sequence=number)
-            valid = not (line.invalid_samples and generator.random() < line.invalid_samples)
-            yield due - begin, damaged(line, encode(sample, valid), generator)
+            invalid = faults.invalid_samples and generator.random() < faults.invalid_samples
+            yield due - begin, damaged(faults, encode(sample, not invalid), generator)
 
     def _send_in_time(self, pieces: Iterable[tuple[float, bytes]]) -> None:
-        """Send each piece at its time; together with others, where they come faster than can be waited for."""
+        """Send each piece at its time, or with others that are due at once."""
         start, pending, sent = time.monotonic(), b'', -math.inf
-        batch = 0.0 if self._line.piece else _BATCH
+        batch = 0.0 if self._faults.piece else _BATCH
         for due, data in pieces:
             if pending and start + due > time.monotonic():
                 self._send(pending)
@@ -234,7 +245,8 @@ class Emulator:
 
 def _time(sample: Sample) -> float:
     if sample.time is None:
-        raise ValueError('a sample has no time, but the emulator sends each at its time: set Sample.time in seconds')
+        raise ValueError('a sample has no time, but the emulator sends each at its time: set '
+                         'Sample.time in seconds')
     return sample.time
 
 

@@ -1,4 +1,4 @@
-"""What happens to samples and their bytes between a gyro and the program that reads it: lost, doubled and flipped, late and in pieces."""
+"""Faults of a serial line: samples and bytes lost, doubled and flipped, late and in pieces."""
 
 from __future__ import annotations
 
@@ -9,28 +9,30 @@ from math import ceil
 import numpy as np
 
 _BITS_PER_BYTE = 10  # 8 data bits, a start and a stop bit
-_ROUNDING = 1e-6  # of an interval between bursts, by which a sample may seem to come just after one
+_ROUNDING = 1e-6  # of an interval between bursts; a sample may seem to come just after one
 
-_PROBABILITIES = ('lost_samples', 'invalid_samples', 'lost_bytes', 'doubled_bytes', 'flipped_bytes')
+_PROBABILITIES = ('lost_samples', 'invalid_samples',
+                  'lost_bytes', 'doubled_bytes', 'flipped_bytes')
 
 
 @dataclass(frozen=True)
-class Line:
+class SerialFaults:
     """
-    A line with its faults; the default has none.
+    The faults of a serial line; the default has none.
 
     Attributes
     ----------
     lost_samples, invalid_samples : float
-        Probability that a sample is never sent, or is sent as one that the device does not stand by. Either leaves a hole in the
-        sequence of the good ones.
+        Probability that a sample is never sent, or is sent as one that the device calls invalid.
+        Either leaves a hole in the sequence of the good ones.
     lost_bytes, doubled_bytes, flipped_bytes : float
         Probability that a byte is lost, comes twice, or comes with one of its bits flipped.
     burst : float
-        Bytes are kept and handed over together each so many seconds, as a USB adapter does that waits 0.016 s for more; 0 hands over at
-        once.
+        Interval, s, at which bytes are handed over together, as by a USB adapter that waits
+        0.016 s for more; 0 hands over at once.
     piece : int
-        Bytes are handed over in pieces of so many, each when the line has had the time for it; 0 hands over a sample in one piece.
+        Bytes that are handed over together, each piece when the line has had the time for it; 0
+        hands over a sample in one piece.
 
     Raises
     ------
@@ -49,11 +51,14 @@ class Line:
     def __post_init__(self) -> None:
         for name in _PROBABILITIES:
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f'{name} is {getattr(self, name)}, but must be a probability from 0 to 1')
+                raise ValueError(f'{name} is {getattr(self, name)}, but must be a probability '
+                                 'from 0 to 1')
         if self.lost_bytes + self.doubled_bytes + self.flipped_bytes > 1.0:
-            raise ValueError('lost_bytes, doubled_bytes and flipped_bytes add up to more than 1: a byte can meet one of the three')
+            raise ValueError('lost_bytes, doubled_bytes and flipped_bytes add up to more than 1: '
+                             'a byte can meet one of the three')
         if not (0.0 <= self.burst <= 10.0 and self.piece >= 0):
-            raise ValueError(f'burst is {self.burst} s and piece {self.piece}, but must be from 0 to 10 s, and a number of bytes')
+            raise ValueError(f'burst is {self.burst} s and piece {self.piece}, but must be from '
+                             '0 to 10 s, and a number of bytes')
 
     @property
     def is_random(self) -> bool:
@@ -61,10 +66,10 @@ class Line:
         return any(getattr(self, name) > 0.0 for name in _PROBABILITIES)
 
 
-def damaged(line: Line, data: bytes, generator: np.random.Generator) -> bytes:
+def damaged(faults: SerialFaults, data: bytes, generator: np.random.Generator) -> bytes:
     """Return what arrives of some bytes."""
-    lost, doubled = line.lost_bytes, line.lost_bytes + line.doubled_bytes
-    flipped = doubled + line.flipped_bytes
+    lost, doubled = faults.lost_bytes, faults.lost_bytes + faults.doubled_bytes
+    flipped = doubled + faults.flipped_bytes
     if flipped == 0.0:
         return data
     drawn = generator.random(len(data))
@@ -76,27 +81,30 @@ def damaged(line: Line, data: bytes, generator: np.random.Generator) -> bytes:
     return np.repeat(arrived, np.where(drawn < lost, 0, np.where(drawn < doubled, 2, 1))).tobytes()
 
 
-def delivered(line: Line, sent: Iterable[tuple[float, bytes]], baud: int) -> Iterator[tuple[float, bytes]]:
+def delivered(faults: SerialFaults, sent: Iterable[tuple[float, bytes]],
+              baud: int) -> Iterator[tuple[float, bytes]]:
     """
     Give the pieces in which bytes arrive, each with its time.
 
     Parameters
     ----------
-    line : Line
+    faults : SerialFaults
     sent : iterable of (float, bytes)
         When each sample is sent, in seconds, and its bytes; times do not decrease.
     baud : int
         Bits per second of the line.
 
     """
-    for due, data in _bursts(line.burst, sent) if line.burst else sent:
-        size = line.piece or len(data) or 1
+    seconds_per_byte = _BITS_PER_BYTE / baud if faults.piece else 0.0
+    for due, data in _bursts(faults.burst, sent) if faults.burst else sent:
+        size = faults.piece or len(data) or 1
         for begin in range(0, len(data), size):
-            yield due + begin * (_BITS_PER_BYTE / baud if line.piece else 0.0), data[begin:begin + size]
+            yield due + begin * seconds_per_byte, data[begin:begin + size]
 
 
-def _bursts(interval: float, sent: Iterable[tuple[float, bytes]]) -> Iterator[tuple[float, bytes]]:
-    """Gather what is sent until the end of each interval; the last bytes of one that nothing follows come at its end as well."""
+def _bursts(interval: float,
+            sent: Iterable[tuple[float, bytes]]) -> Iterator[tuple[float, bytes]]:
+    """Gather what is sent in each interval; it comes at the end of the interval."""
     end, gathered = 0.0, b''
     for due, data in sent:
         own_end = interval * ceil(due / interval - _ROUNDING)

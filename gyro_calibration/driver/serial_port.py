@@ -66,7 +66,8 @@ class SerialPort:
         """
         self.close()
         try:
-            self._port = serial.Serial(self.path, self.baud, timeout=self._timeout, write_timeout=1.0, exclusive=True)
+            self._port = serial.Serial(self.path, self.baud, timeout=self._timeout,
+                                       write_timeout=1.0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             raise PortError(f'cannot open {self.path}: {_reason(error)}') from error
 
@@ -94,7 +95,9 @@ class SerialPort:
 
     def set_baud(self, baud: int) -> None:
         """
-        Change the speed of the open port, and drop what came before; the device does not see it opened anew.
+        Change the speed of the open port, and drop what came before.
+
+        The device does not see it opened anew.
 
         Raises
         ------
@@ -111,7 +114,7 @@ class SerialPort:
             port.close()
 
     def _read(self, port: serial.Serial) -> bytes:
-        # Without pyserial's own read, which gives the first byte alone and needs two more calls for the rest.
+        # pyserial's own read gives the first byte alone, and needs two more calls for the rest
         if not select.select([port], [], [], self._timeout)[0]:
             return b''
         data = os.read(port.fileno(), 65536)
@@ -135,7 +138,7 @@ def _change_speed(port: serial.Serial, baud: int) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    """Return why a port failed, and what to do about it; pyserial hides some error numbers in the cause."""
+    """Return why a port failed, and a remedy; pyserial hides some error numbers in the cause."""
     cause: BaseException | None = error
     while cause is not None:
         number = getattr(cause, 'errno', None) or next(iter(cause.args), None)

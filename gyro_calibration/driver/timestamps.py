@@ -1,55 +1,69 @@
 """
-Stamps for samples: when each was sent, from when the pieces came in which many arrive at once.
+Clocks: when each sample was sent, and one axis of time where a clock is set.
 
-Samples arrive late, by a USB adapter that holds bytes for 16 ms, or by a host that is busy, but never early. So the time of a sample is a
-line over its number, and the line is the one under all arrivals of the last 20 s with the least sum of distances [1]_.
-The number is the device's own sequence, or its time, or what was counted. What was lost without a trace shows, too: since then all
-samples are late by whole periods. What was counted too often shows at the next arrival, which is early.
+`SampleClock` stamps samples. They arrive late, because a USB adapter holds bytes for 16 ms or the
+host is busy, but never early. So the time of a sample is a straight line over its number: the line
+under all arrivals of the last 20 s with the least sum of distances [1]_. The number is the
+sequence of the device, or its time, or a count. Samples lost without a trace show as well: all
+samples since are late by whole periods. Samples counted twice show at the next arrival, which is
+early.
 
-No clock is read here: whoever reads the port says when.
+`ClockSteps` detects clocks that are set. A computer without a battery begins in the wrong year and
+is set by months when it finds a time server; then stamps jump, and nothing else has happened.
+`NodeTime` gives stamps of such a clock, `HostClock` and `MessageClock` take them to an even axis.
+
+No clock is read here, except by `steady`: who reads the port or a topic says when.
 
 References
 ----------
-.. [1] Moon, Skelly, Towsley: Estimation and removal of clock skew from network delay measurements, INFOCOM 1999.
+.. [1] Moon, Skelly, Towsley: Estimation and removal of clock skew from network delay
+   measurements, INFOCOM 1999.
 
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.messages import NSEC_PER_SEC
 
 _Point = tuple[float, float]
 
-_LEAST_STEP = 1e-6  # s; what double precision can still tell apart in seconds since 1970
-_WINDOW = 20.0  # s; long enough for the least lateness of 200 arrivals, short enough for a clock that drifts with its temperature
-_BLOCKS = 32  # at least so many in a full window, and twice as many at most
+_LEAST_STEP = 1e-6  # s; what double precision resolves in seconds since 1970
+_WINDOW = 20.0  # s; holds the least delay of 200 arrivals; a warming clock drifts little in it
+_BLOCKS = 32  # fewest in a full window; twice as many are the most
 _SETTLED = 2.0  # s; a younger line does not know the period well enough to miss samples by it
 _SLEW = (0.2, 1.0)  # s; in which stamps follow the line, before and after it has settled
-_HOLD = 0.3  # s; for so long all arrivals must be late before samples count as lost: a host that stalls has caught up by then
-_LONG = 1.5  # s; after which it counts how late they are, and not only by how much that has changed
+_HOLD = 0.3  # s; arrivals must be late for this long to prove a loss: a stalled host catches up
+_LONG = 1.5  # s; after which the lateness itself counts, not only its change
 _CHANCE = 1e-6  # that as many arrivals are late without any loss
-_WINDOWS = 64  # of `_HOLD` each, over which it is learned whether the lateness sweeps slowly
+_WINDOWS = 64  # of `_HOLD` each, over which a slow sweep of the lateness is learned
 _SWEEPING = 0.2  # of those windows; by chance alone it is a few
-_MEMORY = 256  # arrivals, over which it is learned how many are late without any loss
+_MEMORY = 256  # arrivals, over which the share of late ones without any loss is learned
 _JITTER_TIME = 10.0  # s; over which jitter is averaged
 _DRIFT = 2e-5  # by which the clock of a device may become faster while counts are in doubt
-_FINEST = 0.5e-3  # s; a host that wakes up later than it used to is no proof of lost samples below this
-_STRANGE = 0.02  # s; above the 16 ms of a burst: where a sequence shows what is lost, no sample is early or always late by more
+_FINEST = 0.5e-3  # s; a host that wakes up later than before is no proof of a loss below this
+_OUTLYING = 0.02  # s; above the 16 ms of a burst: with a sequence, no sample is off by more
 _LARGEST_JUMP = 3.0  # s; beyond it the time of the device does not continue
-_SET = 0.1  # s; a clock that differs by more was set
+_SET = 0.1  # s; a clock that differs by more was set, and was not slewed
+_MIXED = 10.0  # s; after a clock was set, stamps of before and after it may come for this long
+_TOGETHER = 0.05  # s; clocks that are read with more between them are not read at one time
 _FOLLOWING = 2.0  # s; in which the difference of two clocks is followed
+_BACK, _AHEAD = 1.0, 10.0  # s; a message may be late, and a recording be played faster
 
 
 class LowerLine:
     """
     The line under points that may lie too high, with the least sum of distances.
 
-    Of each block of time only the lowest point is kept, and of those the edge of their lower hull that spans their mean is the line.
-    Blocks grow with the time that the points span, up to 20 s altogether; what is older is forgotten.
+    Of each block of time only the lowest point is kept. The line is the edge of their lower hull
+    that spans their mean. Blocks grow with the time that the points span, up to 20 s altogether;
+    older points are dropped.
 
     Parameters
     ----------
@@ -87,26 +101,28 @@ class LowerLine:
         self._fit()
 
     def shift(self, since: float, by: float) -> None:
-        """Move the points from a height on to the right; to the left they push away what is then no longer left of them."""
+        """Move the points from a height on along x, and drop those that they overtake."""
         moved = [(x + by, y) for x, y in self._points if y >= since]
         first = moved[0][0] if moved else math.inf
         self._points = [(x, y) for x, y in self._points if y < since and x < first] + moved
 
     def _limit(self) -> None:
-        """Merge blocks in pairs while they are short, and forget the oldest when they are not."""
+        """Merge blocks in pairs while they are short, and drop the oldest when they are not."""
         if len(self._points) <= 2 * _BLOCKS:
             return
         if self._length >= _WINDOW / 2 / _BLOCKS:
             del self._points[0]
             return
         pairs = zip(self._points[0::2], [*self._points[1::2], self._points[-1]], strict=False)
-        self._points = [min(pair, key=lambda point: point[1] - self.slope * point[0]) for pair in pairs]
+        self._points = [min(pair, key=lambda point: point[1] - self.slope * point[0])
+                        for pair in pairs]
         self._length = max(2.0 * self._length, self.span() / _BLOCKS)
 
     def _fit(self) -> None:
         hull = _lower_hull(self._points)
         middle = sum(x for x, _ in self._points) / len(self._points)
-        left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle), (hull[-1], None))
+        left, right = next((edge for edge in pairwise(hull) if edge[1][0] >= middle),
+                           (hull[-1], None))
         self._anchor = left
         if right is not None and right[1] > left[1]:
             self.slope = (right[1] - left[1]) / (right[0] - left[0])
@@ -116,7 +132,8 @@ def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
     """Return the corners of the lower convex hull of points in the order of x."""
     hull: list[_Point] = []
     for x, y in points:
-        while hull and (hull[-1][0] >= x or len(hull) > 1 and _is_above(hull[-1], hull[-2], (x, y))):
+        while hull and (hull[-1][0] >= x
+                        or len(hull) > 1 and _is_above(hull[-1], hull[-2], (x, y))):
             hull.pop()
         hull.append((x, y))
     return hull
@@ -124,19 +141,23 @@ def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
 
 def _is_above(point: _Point, left: _Point, right: _Point) -> bool:
     """Tell whether a point is on or above the line from left to right."""
-    return (point[1] - left[1]) * (right[0] - left[0]) >= (right[1] - left[1]) * (point[0] - left[0])
+    height, rise = point[1] - left[1], right[1] - left[1]
+    return height * (right[0] - left[0]) >= rise * (point[0] - left[0])
 
 
 class _Numbers:
     """
-    How far each sample is from the one before, in nominal periods: by sequence, by time, or by counting.
+    How far each sample is from the one before, in nominal periods.
+
+    By the sequence of the device, by its time, or by counting.
 
     Attributes
     ----------
     size : float
         How far a sample is from the next on average.
     unit : int
-        By so many samples, or a multiple, the number may be wrong; 0 where the time of the device leaves no doubt.
+        By this many samples, or a multiple, the number may be wrong; 0 where the device gives
+        its time.
 
     """
 
@@ -144,12 +165,12 @@ class _Numbers:
         self._rate, self._modulus = rate, modulus
         self._sequence: int | None = None
         self._time: float | None = None
-        self._strange: float | None = None
-        self.forget()
+        self._outlier: float | None = None
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         self.size, self.unit, self._unevenness = 1.0, 1, 0.0
-        self._sequence = self._time = self._strange = None
+        self._sequence = self._time = self._outlier = None
 
     def step(self, sample: Sample) -> tuple[float, int]:
         """Return how far it is to this sample, and how many were lost before it."""
@@ -166,7 +187,7 @@ class _Numbers:
         if last is None:
             return 1, 0
         advance = (sequence - last) % self._modulus or self._modulus
-        # Missing is counted from damaged bytes, so it is right to a few, which tells how often the sequence has wrapped.
+        # Missing is counted from damaged bytes, to a few: enough for how often it wrapped.
         advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
         return advance, advance - 1
 
@@ -174,18 +195,19 @@ class _Numbers:
         self.unit = 0
         elapsed = self._elapsed(time)
         if elapsed is None:
-            self._time = time if self._time is None else self._time + self.size * (1 + missing) / self._rate
-            return self.size * (1 + missing), missing
-        self._time, self._strange = time, None
+            advance = self.size * (1 + missing)
+            self._time = time if self._time is None else self._time + advance / self._rate
+            return advance, missing
+        self._time, self._outlier = time, None
         advance = elapsed * self._rate
         return advance, max(missing, self._lost(advance))
 
     def _elapsed(self, time: float) -> float | None:
-        """Return the time since the last sample, if it may be; one damaged time is none, but two that belong together are."""
-        for last in (self._time, self._strange):
+        """Return the time since the last sample, s; None where only this one time says so."""
+        for last in (self._time, self._outlier):
             if last is not None and _LEAST_STEP <= time - last <= _LARGEST_JUMP:
                 return time - last
-        self._strange = time
+        self._outlier = time
         return None
 
     def _lost(self, advance: float) -> int:
@@ -196,7 +218,7 @@ class _Numbers:
         if steps <= 2.5:
             self.size += 0.05 * (advance - self.size)
             self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
-        # Times that are coarse against the period tell nothing of single samples.
+        # Times that are coarse against the period do not show single samples.
         return round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
 
 
@@ -204,9 +226,10 @@ class _Lateness:
     """
     Whether samples have been late for so long that some must be lost.
 
-    Where bursts come nearly as often as samples, or a multiple, the lateness grows slowly to a period and falls to nothing. So it counts
-    by how much the least lateness has stepped up; the lateness itself counts only when it has lasted for longer. Where it is seen to sweep
-    so, a step to one period is a sample that has slipped into the next burst, and no loss.
+    Where bursts come nearly as often as samples, or a multiple, the lateness grows slowly to a
+    period and falls to zero. So the step of the least lateness counts; the lateness itself counts
+    only when it has lasted for longer. Where it sweeps like this, a step to one period is a sample
+    that has slipped into the next burst, and no loss.
 
     """
 
@@ -216,20 +239,28 @@ class _Lateness:
         self._in_time = math.inf  # the last arrival that was not
         self._least_in_time, self._least_before, self._window = math.inf, math.inf, -math.inf
         self._sweeping = 0.0  # part of the windows in which no arrival was in time by half
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        self.since, self.step, self._least, self._count, self._number, self._arrival = None, 0.0, math.inf, 0, 0.0, 0.0
+    def reset(self) -> None:
+        self.since, self.step, self._least = None, 0.0, math.inf
+        self._count, self._number, self._arrival = 0, 0.0, 0.0
 
-    def is_proven(self, lateness: float, bound: float, number: float, arrival: float, period: float) -> bool:
-        """Take one arrival, and tell whether for long enough now all are late by more than the bound: by `step`, since `since`."""
+    def is_proven(self, lateness: float, bound: float, number: float, arrival: float,
+                  period: float) -> bool:
+        """
+        Take one arrival; tell whether for long enough all are late by more than the bound.
+
+        They are late by `step`, since `since`.
+
+        """
         if lateness <= bound:
             self._is_in_time(lateness, bound, arrival)
             return False
-        # What was late before a silence tells nothing of what was lost in it.
+        # Lateness before a silence does not show what was lost in it.
         if self.since is None or arrival - self._arrival > max(0.5 * _HOLD, 3.0 * period):
             self.since, self._number, self._count, self._least = arrival, number, 0, math.inf
-        self._least, self._count, self._arrival = min(self._least, lateness), self._count + 1, arrival
+        self._least, self._arrival = min(self._least, lateness), arrival
+        self._count += 1
         needed = math.log(_CHANCE) / math.log1p(-min(max(self._usual, 0.02), 0.99))
         lasts = arrival - self.since
         before = 0.0 if lasts > _LONG else max(0.0, min(self._least_in_time, self._least_before))
@@ -238,22 +269,24 @@ class _Lateness:
         return lasts >= _HOLD and self._count >= needed and self.step > bound and not is_slip
 
     def is_no_loss(self, number: float, arrival: float, slope: float) -> bool:
-        """Tell whether samples have become slower altogether, or are later than the time since the last that was in time."""
+        """Tell whether samples became slower, or later than the time since the last in time."""
         assert self.since is not None
         grows = (number - self._number) * slope < 0.5 * (arrival - self.since)
         return grows or self._least > self.since - self._in_time + _HOLD
 
     def _is_in_time(self, lateness: float, bound: float, arrival: float) -> None:
         self._learn()
-        self.forget()
+        self.reset()
         self._in_time = arrival
         if arrival - self._window > _HOLD:
-            self._sweeping += ((0.5 * bound < self._least_in_time < math.inf) - self._sweeping) / _WINDOWS
-            self._window, self._least_before, self._least_in_time = arrival, self._least_in_time, math.inf
+            is_late = 0.5 * bound < self._least_in_time < math.inf
+            self._sweeping += (is_late - self._sweeping) / _WINDOWS
+            self._window, self._least_before = arrival, self._least_in_time
+            self._least_in_time = math.inf
         self._least_in_time = min(self._least_in_time, lateness)
 
     def _learn(self) -> None:
-        """Learn from one arrival in time, and from those before it that were late without any loss."""
+        """Learn from one arrival in time, and from the late ones before it without any loss."""
         self._usual *= (1.0 - 1.0 / _MEMORY) ** self._count
         self._usual += (1.0 - self._usual) / _MEMORY
 
@@ -262,13 +295,9 @@ class SampleClock:
     """
     Gives each sample its stamp; stamps increase strictly.
 
-    By the line under all arrivals, see `LowerLine`, whose corrections are slewed and never jump. A stamp jumps only where it turns out
-    later that samples were lost. The gyro's nominal rate is used for the first piece only: its clock is 2 to 3 % off from unit to unit.
-
-    By the device, the first sample has the time at which it came, and from there the intervals of the device are trusted; so a recording
-    can be replayed faster than it was made. A sample without a time is a usual interval after the one before. After a jump of the
-    device's time it begins anew, but never before the last stamp. Do not use it for hours with a device whose clock drifts: nothing ties
-    it to the time of the host.
+    Corrections by the line, see `LowerLine`, are slewed. A stamp jumps only where later arrivals
+    show that samples were lost. The nominal rate of the gyro is used for the first piece only: its
+    clock is 2 to 3 % off from unit to unit.
 
     Parameters
     ----------
@@ -276,32 +305,29 @@ class SampleClock:
         Nominal samples per second.
     modulus : int
         At which `Sample.sequence` begins anew; 0 for a device without one.
-    use_device_time : bool
     after : float
         All stamps are later than this, the last one of another clock.
 
     Attributes
     ----------
     lost : int
-        Samples lost so far while the port was open: missing in the sequence or in the time of the device, or damaged, or shown by all that
-        came since to be late.
+        Samples lost so far while the port was open: missing in the sequence or in the time of the
+        device, or damaged, or shown by the lateness of all samples since.
     period : float
         Seconds from one sample to the next, as fitted.
     jitter_before, jitter_after : float
-        Seconds, root mean square over the last ten: how late samples arrive, and how far stamps are from the line.
+        Root mean square over the last ten seconds, s: how late samples arrive, and how far stamps
+        are from the line.
 
     """
 
-    def __init__(self, rate: float, modulus: int = 0, use_device_time: bool = False, after: float = -math.inf):
-        self._use_device_time = use_device_time
+    def __init__(self, rate: float, modulus: int = 0, after: float = -math.inf):
         self._numbers = _Numbers(rate, modulus)
-        self._lateness, self._strangeness = _Lateness(), _Lateness()
+        self._lateness, self._outlying = _Lateness(), _Lateness()
         self._line = LowerLine(1.0 / rate)
         self._number, self._slew = 0.0, 0.0
         self._doubtful, self._doubtful_since, self._just_lost = 0, 0.0, 0
         self._last, self._arrival, self._before = after, -math.inf, -math.inf
-        self._device_time: float | None = None
-        self._offset = 0.0
         self._squares: tuple[float, ...] = (0.0, 0.0)
         self.lost = 0
 
@@ -326,8 +352,8 @@ class SampleClock:
         return math.sqrt(self._squares[1])
 
     def interrupt(self) -> None:
-        """Forget where the samples stood, as when the port was lost; what did not come meanwhile does not count as lost."""
-        self._numbers.forget()
+        """Begin a new line, as after the port was lost; that time does not count as lost."""
+        self._numbers.reset()
         self._begin_anew()
 
     def stamp(self, samples: Sequence[Sample], arrival: float) -> list[float]:
@@ -343,9 +369,6 @@ class SampleClock:
         """
         if not samples:
             return []
-        if self._use_device_time and (self._device_time is not None or samples[0].time is not None):
-            self._count(samples, arrival)
-            return [self._follow_device(sample, arrival) for sample in samples]
         self._before, self._arrival = self._arrival, max(arrival, self._arrival)
         arrival = self._arrival
         numbers = self._count(samples, arrival)
@@ -353,7 +376,8 @@ class SampleClock:
         if shift:
             numbers = [number + shift for number in numbers]
         self._fit(numbers[-1], arrival)
-        return self._increasing([self._line.at(number) + self._slew for number in numbers], arrival)
+        stamps = [self._line.at(number) + self._slew for number in numbers]
+        return self._increasing(stamps, arrival)
 
     def _count(self, samples: Sequence[Sample], arrival: float) -> list[float]:
         number, before = self._number, self.lost
@@ -370,23 +394,25 @@ class SampleClock:
         return numbers
 
     def _evidence(self, number: float, arrival: float) -> int:
-        """Return by how much the numbers are wrong, as the arrivals show; the count of what was lost is then corrected."""
+        """Correct the count of lost samples by the arrivals; return by how much it was wrong."""
         if not self.is_settled:
             return 0
         unit, lateness = self._numbers.unit, arrival - self._line.at(number)
         bound = max((unit or 1) * self.period, _FINEST)
         if lateness < -0.5 * bound:
             return self._counted_too_often(unit, lateness)
-        if unit and self._lateness.is_proven(lateness, 0.75 * bound, number, arrival, self.period):
+        late = lateness, 0.75 * bound, number, arrival, self.period
+        if unit and self._lateness.is_proven(*late):
             return self._lost_without_trace(unit, number, arrival)
         if unit > 1 and self._was_restarted(lateness, 0.75 * bound, number, arrival):
             self._begin_anew()
         return 0
 
     def _was_restarted(self, lateness: float, bound: float, number: float, arrival: float) -> bool:
-        """Tell whether the sequence began anew: since then samples are early or late by less than a wrap, and always by the same."""
-        least = max(3.0 * self.period, _STRANGE)
-        return lateness < -least or lateness < bound and self._strangeness.is_proven(lateness, least, number, arrival, self.period)
+        """Tell whether the sequence began anew: since then all are off by the same part of it."""
+        least = max(3.0 * self.period, _OUTLYING)
+        return lateness < -least or lateness < bound and self._outlying.is_proven(
+            lateness, least, number, arrival, self.period)
 
     def _counted_too_often(self, unit: int, lateness: float) -> int:
         excess = unit and unit * round(-lateness / (unit * self.period))
@@ -403,7 +429,7 @@ class SampleClock:
         lost = unit * math.floor(late.step / (unit * self.period) + 0.25)
         assert late.since is not None
         since, is_no_loss = late.since, late.is_no_loss(number, arrival, self._line.slope)
-        late.forget()
+        late.reset()
         if is_no_loss:
             self._begin_anew()
             return 0
@@ -418,8 +444,8 @@ class SampleClock:
 
     def _begin_anew(self) -> None:
         self._line = LowerLine(self._line.slope)
-        self._lateness.forget()
-        self._strangeness.forget()
+        self._lateness.reset()
+        self._outlying.reset()
         self._slew, self._doubtful = 0.0, 0
 
     def _fit(self, number: float, arrival: float) -> None:
@@ -432,9 +458,11 @@ class SampleClock:
         self._slew = min(slew, arrival - line.at(number))
 
     def _lowest(self, number: float, arrival: float) -> float:
-        """Return how low a point may be: after a count in doubt, nearly the line, until it is seen whether all are early since then."""
-        in_doubt = self.is_settled and self._doubtful and self._numbers.unit and arrival - self._doubtful_since < _HOLD
-        return self._line.at(number) - _DRIFT * (arrival - self._before) if in_doubt else -math.inf
+        """Return how low a point may be: nearly the line, for a while after a count in doubt."""
+        in_doubt = self.is_settled and self._doubtful and self._numbers.unit
+        if in_doubt and arrival - self._doubtful_since < _HOLD:
+            return self._line.at(number) - _DRIFT * (arrival - self._before)
+        return -math.inf
 
     def _increasing(self, stamps: list[float], arrival: float) -> list[float]:
         self._measure(stamps, arrival)
@@ -447,42 +475,210 @@ class SampleClock:
     def _measure(self, stamps: list[float], arrival: float) -> None:
         first, last = (arrival - stamp + self._slew for stamp in (stamps[0], stamps[-1]))
         weight = min(1.0, len(stamps) * self.period / _JITTER_TIME)
-        now = (first * first + first * last + last * last) / 3.0, self._slew * self._slew  # the mean square of what is spread evenly
-        self._squares = tuple(old + weight * (new - old) for old, new in zip(self._squares, now, strict=True))
-
-    def _follow_device(self, sample: Sample, arrival: float) -> float:
-        time = sample.time
-        if time is None:  # as of a damaged line
-            self._last += max(self.period * (1 + sample.missing), _LEAST_STEP)
-            return self._last
-        continues = self._device_time is not None and 0.0 <= time - self._device_time <= _LARGEST_JUMP
-        self._device_time = time
-        if not continues:
-            self._offset = max(arrival, self._last + _LEAST_STEP) - time
-        # Not the last stamp plus an interval, which would add up the rounding of seconds since 1970.
-        self._last = max(time + self._offset, self._last + _LEAST_STEP)
-        return self._last
+        # the mean square of lateness that is spread evenly
+        now = (first * first + first * last + last * last) / 3.0, self._slew * self._slew
+        self._squares = tuple(old + weight * (new - old)
+                              for old, new in zip(self._squares, now, strict=True))
 
 
-class ClockDifference:
-    """From a clock that never goes back to one that people set: its difference is followed slowly, and at once where the clock was set."""
+def steady() -> float:
+    """Return seconds that nobody sets; they include the sleep of the host, where it is known."""
+    return time.clock_gettime(_STEADY)
+
+
+_STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
+
+
+def read_together(
+    even: Callable[[], float], other: Callable[[], float],
+) -> tuple[float, float] | None:
+    """Return what two clocks say at one time, s; None where the program was held up in between."""
+    before, value = even(), other()
+    after = even()
+    return (0.5 * (before + after), value) if after - before <= _TOGETHER else None
+
+
+class ClockSteps:
+    """
+    Detects a clock that is set, by what it says beside a steady one.
+
+    Parameters
+    ----------
+    ahead, behind : float
+        By more than this, s, a clock that runs does not change against the steady one.
+    back : float
+        By more than this, s, it does not go back.
+
+    Attributes
+    ----------
+    count : int
+        How often the clock was set.
+    last : float
+        By how much it was set the last time, s.
+
+    """
+
+    def __init__(self, ahead: float = _SET, behind: float = _SET, back: float = _SET):
+        self.count, self.last = 0, 0.0
+        self._ahead, self._behind, self._back = ahead, behind, back
+        self._even = self._other = math.nan
+
+    def step(self, even: float, other: float) -> float:
+        """Return by how much the clock was set since the last `watch`, s; 0 where it was not."""
+        interval = other - self._other
+        step = interval - (even - self._even)
+        was_set = step > self._ahead or step < -self._behind or interval < -self._back
+        return step if was_set else 0.0
+
+    def watch(self, even: float, other: float) -> float:
+        """Take what both clocks say at one time, s, and return what `step` does."""
+        step = self.step(even, other)
+        self._even, self._other = even, other
+        if step:
+            self.count, self.last = self.count + 1, step
+        return step
+
+
+class NodeTime:
+    """
+    From a steady clock to that of a node, which may be set or follow a simulation.
+
+    The difference is followed slowly, and at once where the clock was set.
+
+    Attributes
+    ----------
+    steps : ClockSteps
+
+    """
 
     def __init__(self) -> None:
+        self.steps = ClockSteps()
         self._difference = math.nan
-        self._steady, self._other, self._last = -math.inf, -math.inf, -math.inf
+        self._even, self._node, self._last = -math.inf, -math.inf, -math.inf
 
-    def follow(self, steady: float, other: float) -> None:
-        """Take what both clocks say at one time, in seconds."""
-        elapsed, was_set_back = steady - self._steady, other < self._other
-        self._steady, self._other = steady, other
-        difference = other - steady
-        if abs(difference - self._difference) <= _SET:
-            difference = self._difference + min(1.0, elapsed / _FOLLOWING) * (difference - self._difference)
-        elif was_set_back:
+    def watch(self, even: float, node: float) -> float:
+        """Take what both clocks say at one time, s; return by how much the node's was set."""
+        elapsed, was_set_back = even - self._even, node < self._node
+        self._even, self._node = even, node
+        step = self.steps.watch(even, node)
+        error = node - even - self._difference
+        if not step and abs(error) <= _SET:
+            self._difference += min(1.0, elapsed / _FOLLOWING) * error
+            return 0.0
+        if was_set_back:
             self._last = -math.inf
-        self._difference = difference
+        self._difference = node - even
+        return step
 
-    def other(self, stamp: float) -> float:
-        """Return what the other clock says at a time of the steady one; it increases strictly, unless the other clock was set back."""
+    def of(self, stamp: float) -> float:
+        """Return what the node's clock says at a time; stamps increase until it is set back."""
         self._last = max(stamp + self._difference, self._last + _LEAST_STEP)
         return self._last
+
+
+@dataclass
+class _Step:
+    """A step of the clock, s, when it was seen on the steady clock, and if stamps showed it."""
+
+    size: float
+    seen: float
+    shown: bool = False
+
+
+class HostClock:
+    """
+    Takes stamps to one axis of time, s, whatever is done to the clock of the host.
+
+    A jump of the stamps counts as none if that clock has just made the same one against the
+    steady clock.
+
+    Attributes
+    ----------
+    steps : ClockSteps
+
+    """
+
+    def __init__(self) -> None:
+        self.steps = ClockSteps()
+        self._offset = 0.0
+        self._recent: list[_Step] = []
+
+    def watch(self, even: float, date: float) -> float:
+        """Take what both clocks say at one time, s; return by how much the date was set."""
+        if self._recent and even - self._recent[0].seen > _MIXED:
+            del self._recent[0]
+        step = self.steps.watch(even, date)
+        if step:
+            self._recent.append(_Step(step, even))
+        return step
+
+    def of_sample(self, stamp: float, before: float, usual: float) -> float:
+        """
+        Return the time of a sample.
+
+        Parameters
+        ----------
+        stamp : float
+            Seconds.
+        before : float
+            Time of the sample before it, s; -inf for the first, which shows no step of the clock.
+        usual : float
+            Interval, s; inf while it is not known.
+
+        """
+        if before == -math.inf:
+            for step in self._recent:
+                step.shown = True
+        interval = stamp - self._offset - before
+        unshown = [step for step in self._recent if not step.shown]
+        found = min(unshown, key=lambda step: abs(interval - step.size), default=None)
+        if found is None or not abs(interval - found.size) < 0.5 * abs(interval):
+            return stamp - self._offset
+        found.shown = True
+        left = interval - found.size
+        least = usual if usual < math.inf else 0.0
+        bridged = left if left > 0.5 * least else least
+        self._offset += interval - bridged
+        return before + bridged
+
+    def of_other(self, stamp: float, sample: float) -> float:
+        """Return the time of what came beside samples, s; it may be of before or after a step."""
+        there = stamp - self._offset
+        shifts = [sign * step.size for step in self._recent for sign in (1.0, -1.0)]
+        return min((there, *(there + shift for shift in shifts)),
+                   key=lambda each: abs(each - sample))
+
+
+class MessageClock:
+    """
+    Lets stamps of messages go on by the time of receiving where their clock was set.
+
+    Any topic may be the first to show it, and the others follow by the same step; a message that
+    is still under way then has a stamp of the old clock.
+
+    Attributes
+    ----------
+    count : int
+        How often the clock was set.
+
+    """
+
+    def __init__(self) -> None:
+        self.count, self._offset = 0, 0
+        self._topics: dict[str, tuple[ClockSteps, int, int, int]] = {}
+
+    def time(self, topic: str, stamp: int, received: int) -> int:
+        """Return a stamp by the clock as it was when the recording began; all in ns."""
+        first = ClockSteps(_AHEAD, math.inf, _BACK), stamp + self._offset, received, self._offset
+        steps, last, arrival, offset = self._topics.get(topic, first)
+        even = received / NSEC_PER_SEC
+        known = (each for each in (self._offset, offset)
+                 if not steps.step(even, (stamp + each) / NSEC_PER_SEC))
+        found = next(known, None)
+        if found is None:
+            self.count += 1
+            found = self._offset = last + received - arrival - stamp
+        if stamp + found >= last:
+            steps.watch(even, (stamp + found) / NSEC_PER_SEC)
+            self._topics[topic] = steps, stamp + found, received, found
+        return stamp + found

@@ -33,12 +33,13 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
-from gyro_calibration.driver.host_clock import steady
+from gyro_calibration.driver.timestamps import steady
+from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import REST, Drive
 from gyro_calibration.ros.compensation_report import CompensationReport, calibration_status
 from gyro_calibration.ros.diagnostics import OK, Diagnostics, Report, status_array
-from gyro_calibration.ros.pipeline import NSEC_PER_SEC, PARAMETERS, Output, Pipeline
+from gyro_calibration.ros.pipeline import PARAMETERS, Output, Pipeline
 from gyro_calibration.ros.runner import (
     LATCHED_QOS,
     answer_later,

@@ -1,23 +1,21 @@
-"""What the driver says of its gyro in the diagnostics."""
+"""What the driver reports of its gyro in the diagnostics."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator
-
-from diagnostic_msgs.msg import DiagnosticStatus
+from collections.abc import Callable, Iterable, Iterator
 
 from gyro_calibration.driver.connection import Connection, Counts
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.ros.diagnostics import Report
+from gyro_calibration.ros.diagnostics import ERROR, OK, WARN, Report
 
-_LEAST_TIME = 0.5  # s; over less a rate says nothing
+_LEAST_TIME = 0.5  # s; a rate over less is not meaningful
+_OPENING = {'opening': 'opening the port', 'listening': 'listening for a protocol'}
 
 
 class DriverReport:
     """
-    Judges how a connection does, once a second.
+    Judges the state of a connection, once a second.
 
     Parameters
     ----------
@@ -25,27 +23,43 @@ class DriverReport:
     port : str
         As it was given.
     settings : Settings
+    clock : callable
+        Returns seconds that nobody sets.
+
+    Attributes
+    ----------
+    event : str
+        What happened last, in a sentence.
 
     """
 
-    def __init__(self, connection: Connection, port: str, settings: Settings):
+    def __init__(self, connection: Connection, port: str, settings: Settings,
+                 clock: Callable[[], float]):
         self._connection, self._port, self._settings = connection, port, settings
-        self._last, self._last_time = Counts(), time.monotonic()
+        self._clock, self._last, self._last_time = clock, Counts(), clock()
         self._rate = 0.0
         self._grown: dict[str, int] = {}
+        self._clock_steps, self.event = '0', ''
+        self._steps = 0
         self._temperature: float | None = None
         self._health: dict[str, float] = {}
 
-    def see(self, samples: Iterable[Sample]) -> None:
-        """Keep what the gyro says of itself; may be called from another thread."""
+    def add(self, samples: Iterable[Sample]) -> None:
+        """Keep what the gyro reports of itself; may be called from another thread."""
         for sample in samples:
             if sample.health:
                 self._health = {**self._health, **sample.health}
             if sample.temperature is not None:
                 self._temperature = sample.temperature
 
-    def forget(self) -> None:
-        """Forget what the gyro said of itself, when it says no more; may be called from another thread."""
+    def add_clock_step(self, step: float) -> None:
+        """Count a step of the clock of the stamps, s."""
+        self._steps += 1
+        self._clock_steps = f'{self._steps}, last by {step:+.1f} s'
+        self.event = f'the clock of this computer was set by {step:+.1f} s; the stamps follow it'
+
+    def clear(self) -> None:
+        """Drop what the gyro reported of itself, as it is silent; from any thread."""
         self._temperature, self._health = None, {}
 
     def make(self) -> Report:
@@ -53,18 +67,22 @@ class DriverReport:
         counts = self._count()
         return *self._judge(), {
             **self._of_the_port(),
-            'rate in Hz': f'{self._rate:.1f}',
-            **{name.replace('_', ' '): count for name, count in vars(counts).items()},
+            **vars(counts),
+            'rate_hz': f'{self._rate:.1f}',
+            'longest_gap_s': f'{self._connection.longest_gap:.3f}',
+            'clock_steps': self._clock_steps,
             **self._of_the_clock(),
             **self._of_the_gyro(),
+            'last_event': self.event,
         }
 
     def _count(self) -> Counts:
         """Return the counts, and keep by how much they have grown in the last second."""
-        counts, now = self._connection.counts(), time.monotonic()
+        counts, now = self._connection.counts(), self._clock()
         elapsed = now - self._last_time
         if elapsed >= _LEAST_TIME:
-            self._grown = {name: count - getattr(self._last, name) for name, count in vars(counts).items()}
+            self._grown = {name: count - getattr(self._last, name)
+                           for name, count in vars(counts).items()}
             self._rate = self._grown.pop('samples') / elapsed
             self._last, self._last_time = counts, now
         return counts
@@ -72,26 +90,31 @@ class DriverReport:
     def _judge(self) -> tuple[bytes, str]:
         state = self._connection.state
         if state.name == 'failed':
-            return DiagnosticStatus.ERROR, state.problem
+            return ERROR, state.problem
         if state.name != 'reading':
-            return DiagnosticStatus.WARN, {'opening': 'opening the port', 'listening': 'listening for a protocol'}[state.name]
+            return WARN, _OPENING[state.name]
+        warnings = list(self._losses())
         protocol, clock = self._connection.protocol, self._connection.clock
-        known = () if protocol is None or clock is None else (*self._ill_health(protocol), *self._wrong_rate(protocol, clock))
-        warnings = [*self._losses(), *known]
-        return (DiagnosticStatus.WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (DiagnosticStatus.OK, 'samples come')
+        if protocol is not None and clock is not None:
+            warnings += [*self._ill_health(protocol), *self._wrong_rate(protocol, clock)]
+        return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
+            OK, 'samples come')
 
-    def _losses(self) -> list[str]:
-        worst = ', '.join(f'{name.replace("_", " ")} {count}' for name, count in self._grown.items() if count > 0)
-        return [f'in the last second there were: {worst}'] if worst else []
+    def _losses(self) -> Iterator[str]:
+        worst = ', '.join(f'{name.replace("_", " ")} {count}'
+                          for name, count in self._grown.items() if count > 0)
+        if worst:
+            yield f'in the last second there were: {worst}'
 
     def _ill_health(self, protocol: Protocol) -> Iterator[str]:
         for name, (low, high) in protocol.good.items():
             value = self._health.get(name)
             if value is not None and not low <= value <= high:
-                yield f'{name} is {value:.4g}, but should be from {low:g} to {high:g}: check the supply, then have the gyro checked'
+                yield (f'{name} is {value:.4g}, but should be from {low:g} to {high:g}: check the '
+                       'supply, then have the gyro checked')
 
     def _wrong_rate(self, protocol: Protocol, clock: SampleClock) -> Iterator[str]:
-        """Yield a warning where rates are wrong by the factor of the interval, since the gyro sends angles."""
+        """Yield a warning where rates are wrong by the factor of the interval."""
         warning = protocol.wrong_rate(self._settings, clock.period) if clock.is_settled else ''
         if warning:
             yield warning
@@ -104,11 +127,11 @@ class DriverReport:
             'state': connection.state.name,
             'protocol': connection.protocol.name if connection.protocol else '',
             'baud': connection.baud,
-            'heard': connection.heard,
+            'detected': connection.detected,
             'reopened': max(0, connection.openings - 1),
-            'waiting in s': f'{connection.state.waiting:.1f}',
-            'waited in s': f'{connection.waited:.1f}',
-            'last error': connection.last_error,
+            'waiting_s': f'{connection.state.waiting:.1f}',
+            'waited_s': f'{connection.waited:.1f}',
+            'last_error': connection.last_error,
         }
 
     def _of_the_clock(self) -> dict[str, str]:
@@ -116,13 +139,13 @@ class DriverReport:
         if clock is None or protocol is None:
             return {}
         return {
-            'period in ms': f'{1e3 * clock.period:.6g}',
-            'nominal period in ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
-            'jitter before in ms': f'{1e3 * clock.jitter_before:.3g}',
-            'jitter after in ms': f'{1e3 * clock.jitter_after:.3g}',
+            'period_ms': f'{1e3 * clock.period:.6g}',
+            'nominal_period_ms': f'{1e3 / protocol.nominal_rate(self._settings):.6g}',
+            'jitter_before_ms': f'{1e3 * clock.jitter_before:.3g}',
+            'jitter_after_ms': f'{1e3 * clock.jitter_after:.3g}',
         }
 
     def _of_the_gyro(self) -> dict[str, str]:
-        last = self._temperature  # which the other thread may forget meanwhile
+        last = self._temperature  # which the other thread may drop meanwhile
         temperature = {} if last is None else {'temperature_degc': f'{last:.2f}'}
         return temperature | {name: f'{value:.4g}' for name, value in self._health.items()}

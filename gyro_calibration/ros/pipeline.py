@@ -19,10 +19,11 @@ from typing import NamedTuple
 
 from gyro_calibration.assumptions import Assumptions
 from gyro_calibration.bias_table import Prior
-from gyro_calibration.driver.host_clock import Stamps as HostClock
+from gyro_calibration.driver.timestamps import HostClock, read_together
 from gyro_calibration.heading import Threshold
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import DEGREE
+from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import BLIND, REST, STANDING_TIME, CalibrationSession
@@ -88,11 +89,6 @@ _LOOKED_BACK = 0.5
 _SIGMAS = 4.0
 #: Stamps that jump back twice within this time, s, are those of several publishers.
 _INTERLEAVED = 1.0
-#: Clocks that are read with more between them are not read at one time, s.
-_TOGETHER = 0.05
-
-
-NSEC_PER_SEC = 10 ** 9
 
 
 class Output(NamedTuple):
@@ -226,12 +222,12 @@ class Pipeline:
     def _look_at_host_clock(self) -> None:
         """Take dates that the clock of the host gave before it was set for those after it."""
         clock, journal = self._clock, self.journal
-        now, date = clock.steady(), clock.date()
-        if clock.steady() - now > _TOGETHER or not (step := self._host.watch(now, date)):
+        read = read_together(clock.steady, clock.date)
+        if not read or not (step := self._host.watch(*read)):
             return
         journal.event = (f'the clock of this computer was set by {step:+.1f} s; the heading goes '
                          'on')
-        journal.clock_steps = f'{self._host.steps}, last by {step:+.1f} s'
+        journal.clock_steps = f'{self._host.steps.count}, last by {step:+.1f} s'
         self.estimator.clock_was_set(step)
         if self.store.written is not None:
             self.store.written += step

@@ -23,7 +23,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.log import LogError
+from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.ros.runner import call_every
 from gyro_calibration.storage import Message
 
@@ -69,7 +71,7 @@ class RecorderNode(Node):
         self.taken = 0
         self._everything, self._take = everything, take
         self._subscriptions_of: dict[str, tuple] = {}
-        self._begin = time.time_ns() - time.monotonic_ns()
+        self._begin = time.time_ns() - round(steady() * NSEC_PER_SEC)
         self.look()
         call_every(self, _LOOK_INTERVAL, self.look)
 
@@ -106,10 +108,10 @@ class RecorderNode(Node):
         self._subscriptions_of[topic] = offered, subscription
 
     def _taker(self, topic: str, kind: str, definition: str) -> Callable[[bytes], None]:
-        # By the monotonic clock: the time of receiving must not jump where somebody sets the clock.
+        # By the steady clock: the time of receiving must not jump where somebody sets the clock.
         def take(data: bytes) -> None:
             self.taken += 1
-            self._take(Message(topic, kind, self._begin + time.monotonic_ns(), bytes(data)), definition)
+            self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC), bytes(data)), definition)
         return take
 
 

@@ -1,8 +1,11 @@
 """
-Numbers parted by commas, one sample a line: how any gyro comes from a microcontroller of one's own.
+Numbers separated by commas, one sample a line: any gyro behind a microcontroller.
 
-The columns are named by `Settings.columns` in the words of the log format. An empty or ``nan`` temperature, time, acceleration or supply is
-one that is not known; a line without a finite output is discarded, as is a header.
+The columns are named by `Settings.columns` in the words of the log format. An empty or ``nan``
+temperature, time, acceleration or supply is not known. An output that is ``nan`` or ``inf``, or
+beyond 2000 deg/s where no full scale is set, is refused: a gyro that turns faster does not come
+this way, but a line that lost its decimal point does. A line without an output is discarded, as is
+a header.
 
 """
 
@@ -25,6 +28,7 @@ from gyro_calibration.driver.protocols.protocol import (
 )
 
 _NUMBER = re.compile(NUMBER)
+_NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
 _UNKNOWN = (b'', b'nan')
 
 
@@ -34,7 +38,8 @@ def _check(settings: Settings) -> None:
     if counts and settings.sensitivity is None:
         raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the rad/s of one count')
     if not counts and settings.sensitivity is not None:
-        raise ValueError('sensitivity is set, but columns hold no gyro_counts: name the column gyro_counts, or leave sensitivity out')
+        raise ValueError('sensitivity is set, but columns hold no gyro_counts: name the column '
+                         'gyro_counts, or leave sensitivity out')
 
 
 def _parse(line: bytes, settings: Settings) -> Reading | None:
@@ -47,9 +52,18 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
 
 def _reading(fields: dict[str, bytes]) -> Reading:
     name = next(name for name in GYRO_COLUMNS if name in fields)
-    temperature, time, force, supply = (_known(fields.get(column, b'')) for column in KNOWN_COLUMNS)
+    known = (_known(fields.get(column, b'')) for column in KNOWN_COLUMNS)
+    temperature, time, force, supply = known
     health = {} if supply is None else {'supply_v': supply}
-    return Reading(_number(fields[name]) * GYRO_COLUMNS[name], True, temperature, time, None, force, health)
+    value = _output(fields[name]) * GYRO_COLUMNS[name]
+    return Reading(value, True, temperature, time, None, force, health)
+
+
+def _output(text: bytes) -> float:
+    """Return an output, which may be one that the decoder refuses."""
+    if _NUMBER.fullmatch(text) or _NOT_FINITE.fullmatch(text):
+        return float(text)
+    raise ValueError('not a number')
 
 
 def _known(text: bytes) -> float | None:
@@ -69,24 +83,27 @@ def _write(reading: Written, settings: Settings) -> bytes:
 
 def _field(name: str, reading: Written) -> bytes:
     if name in KNOWN_COLUMNS:
-        values = reading.temperature, reading.time, reading.specific_force, reading.health.get('supply_v')
+        values = (reading.temperature, reading.time, reading.specific_force,
+                  reading.health.get('supply_v'))
         value = values[KNOWN_COLUMNS.index(name)]
         return b'nan' if value is None else b'%.6f' % value
     if name == 'gyro_counts':
         return b'%d' % round(reading.value)
-    return b'%.9g' % (reading.value / GYRO_COLUMNS[name]) if name in GYRO_COLUMNS else b'0'
+    if name in GYRO_COLUMNS:
+        return b'%.9g' % (reading.value / GYRO_COLUMNS[name])
+    return b'0'
 
 
 CSV = Protocol(
     name='csv',
-    description='numbers parted by commas, columns named by a parameter',
+    description='numbers separated by commas, columns named by a parameter',
     baud=115200,
     rate=100.0,
     sensitivity=1.0,
     splitter=partial(LineSplitter, 1024),
     parser=stateless(_parse),
     writer=stateless(_write),
-    awakening=b'\r\n',
-    is_timed=True,
+    full_scale=math.radians(2000.0),
+    preamble=b'\r\n',
     check=_check,
 )

@@ -82,6 +82,7 @@ KVH_1750 = Protocol(
     parser=stateless(_parse),
     writer=stateless(_write),
     full_scale=math.radians(500.0),  # the input range is 490 deg/s
+    noise_density=math.radians(1.0 / 3600.0),  # data sheets: 1 deg/h/√Hz for the 1725, others less
     increments=True,
     modulus=_MODULUS,
     check=lambda settings: None,

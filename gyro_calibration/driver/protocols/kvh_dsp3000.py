@@ -42,5 +42,6 @@ KVH_DSP3000 = Protocol(
     writer=stateless(_write),
     invert=True,
     full_scale=math.radians(500.0),
+    noise_density=math.radians(4.0 / 3600.0),  # data sheet: 4 deg/h/√Hz, 0.067 deg/√h
     startup=b'RRR',
 )

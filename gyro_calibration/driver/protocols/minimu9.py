@@ -39,4 +39,5 @@ MINIMU9 = Protocol(
     parser=stateless(_parse),
     writer=stateless(_write),
     largest_count=0x8000,
+    noise_density=math.radians(0.03),  # data sheet of the L3G4200D
 )

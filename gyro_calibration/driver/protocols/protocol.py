@@ -1,9 +1,10 @@
 """
-What every wire format shares: the records, and the decoder that turns bytes into samples and counts what it threw away.
+What every wire format shares: the records, and the decoder that turns bytes into samples.
 
-A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`lines`, `frames`), a parser that makes a `Reading` of a
-frame, and a function back. A reading is in the unit of the device; sign, sensitivity and full scale are applied here, for all formats
-alike, and so is the count of what was lost before a sample.
+A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`lines`, `frames`), a
+parser that makes a `Reading` of a frame, and a function back. A reading is in the unit of the
+device; sign, sensitivity and full scale are applied here, for all formats alike, and so are the
+counts of what was discarded, refused and lost.
 
 """
 
@@ -25,31 +26,36 @@ GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts':
 KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
 """Columns of the log format that may stand beside it."""
 
+ASSUMED_NOISE = math.radians(0.5)
+"""rad/s, standard deviation of one sample of a gyro whose data sheet is not known."""
+
+_TEMPERATURES = -100.0, 300.0  # degC; beyond them no sensor of a gyro reports
 _MOST_DEVIATION = 0.05  # of the sample rate; the clocks of gyros are 2 to 3 % off
 
 
 @dataclass(frozen=True)
 class Sample:
     """
-    What a gyro said once.
+    One sample of a gyro.
 
     Attributes
     ----------
     output : float
         rad/s, counter-clockwise positive.
     temperature : float or None
-        degC; None where the device says none with this sample.
+        degC; None where the device sends none with this sample.
     time : float or None
         Seconds, by the clock of the device.
     sequence : int or None
         Count of the device, modulo `Protocol.modulus`.
     missing : int
-        So many samples seem to be lost directly before this one: damaged, called invalid by the device, or beyond full scale. The bytes
-        tell no more than that; a sequence, or the time that passed, knows better.
+        Samples that seem to be lost directly before this one: damaged, called invalid by the
+        device, or refused. A sequence, or the time that passed, knows better.
     specific_force : float or None
         m/s², along the input axis.
     health : mapping of str to float
-        What else the device says of itself with this sample, by names with their units: ``supply_v``, ``source_current_a``.
+        What else the device reports of itself with this sample, by names with their units:
+        ``supply_v``, ``source_current_a``.
 
     """
 
@@ -65,7 +71,7 @@ class Sample:
 @dataclass(frozen=True)
 class Settings:
     """
-    How a gyro is wired and scaled; None stands for what its protocol says.
+    How a gyro is wired and scaled; None stands for the value of its protocol.
 
     Attributes
     ----------
@@ -76,13 +82,15 @@ class Settings:
     axis : str
         ``'x'``, ``'y'`` or ``'z'``: the one to read of a gyro with three.
     columns : tuple of str
-        Of the protocol ``csv``, in the words of the log format; columns with other names are skipped.
+        Of the protocol ``csv``, in the words of the log format; columns with other names are
+        skipped.
     full_scale : float or None
-        rad/s; what is beyond it is thrown away, since the device cannot mean it.
+        rad/s; samples beyond it are refused, since the device cannot mean them.
     increments : bool or None
         Whether the device is set to send the angle since its last sample in place of the rate.
     sample_rate : float or None
-        Hz, that the device is set to; an increment divided by the interval of this rate is the rate of turn.
+        Hz, that the device is set to; an increment divided by the interval of this rate is the
+        rate of turn.
 
     Raises
     ------
@@ -102,7 +110,8 @@ class Settings:
         for name in ('sensitivity', 'full_scale', 'sample_rate'):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f'{name} is {value}, but must be above 0; for a gyro that counts the other way set invert')
+                raise ValueError(f'{name} is {value}, but must be above 0; for a gyro that counts '
+                                 'the other way set invert')
         if self.axis not in ('x', 'y', 'z'):
             raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
         object.__setattr__(self, 'columns', tuple(self.columns))
@@ -111,18 +120,22 @@ class Settings:
 
 def _check_columns(columns: tuple[str, ...]) -> None:
     if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
-        raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be {", ".join(GYRO_COLUMNS)}')
+        raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be '
+                         f'{", ".join(GYRO_COLUMNS)}')
     for name in KNOWN_COLUMNS:
         if columns.count(name) > 1:
-            raise ValueError(f'columns are {", ".join(columns)}, but {name} may stand there only once')
+            raise ValueError(f'columns are {", ".join(columns)}, but {name} may stand there only '
+                             'once')
 
 
 @dataclass(frozen=True)
 class Reading:
     """
-    What one frame holds: the value in the unit of the device and in its own sense of rotation, and whether the device stands by it.
+    What one frame holds.
 
-    A frame without a value, None, is in order, but is none of a rate. The rest is as in `Sample`.
+    The value is in the unit of the device and in its own sense of rotation, with whether the
+    device calls it valid. A frame without a value, None, is in order, but is none of a rate. The
+    rest is as in `Sample`.
 
     """
 
@@ -144,7 +157,7 @@ class Written(Reading):
 
 
 Parse = Callable[[bytes], 'Reading | None']
-"""Makes a reading of a frame, or None of one that is none; may remember what the frames directly before said."""
+"""Makes a reading of a frame, or None of one that is none; may remember the frames before."""
 
 Write = Callable[[Written], bytes]
 """Makes the bytes of a reading; may remember the readings before."""
@@ -153,9 +166,13 @@ Given = TypeVar('Given')
 Made = TypeVar('Made')
 
 
-def stateless(make: Callable[[Given, Settings], Made]) -> Callable[[Settings], Callable[[Given], Made]]:
+def stateless(
+    make: Callable[[Given, Settings], Made],
+) -> Callable[[Settings], Callable[[Given], Made]]:
     """
-    Return the `Protocol.parser` or `Protocol.writer` of a format whose frames each stand for themselves, from ``make(given, settings)``.
+    Return the `Protocol.parser` or `Protocol.writer` of a format, from ``make(given, settings)``.
+
+    Each of its frames stands for itself.
 
     """
     return lambda settings: lambda given: make(given, settings)
@@ -169,7 +186,7 @@ class Frame(NamedTuple):
 
 
 class Splitter(Interface):
-    """Finds frames in bytes that come in any pieces; holds no more than one frame back, and counts the bytes that belong to none."""
+    """Finds frames in bytes that come in any pieces; holds back no more than one frame."""
 
     discarded_bytes: int
 
@@ -177,7 +194,7 @@ class Splitter(Interface):
         """Return the frames that these bytes complete."""
 
     def reset(self) -> None:
-        """Forget the frame that has begun: the next bytes do not continue it."""
+        """Drop the frame that has begun: the next bytes do not continue it."""
 
 
 def check_rates(settings: Settings) -> None:
@@ -204,7 +221,8 @@ def check_counts(settings: Settings) -> None:
     """
     check_rates(settings)
     if settings.sensitivity is None:
-        raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s of one count, which its data sheet gives')
+        raise ValueError('sensitivity is not set, but this gyro sends counts: set it to the rad/s '
+                         'of one count, which its data sheet gives')
 
 
 @dataclass(frozen=True)
@@ -229,18 +247,19 @@ class Protocol:
         ``writer(settings)`` returns what writes the frames of one device, see `Write` and `stateless`.
     invert : bool
         Whether the device counts clockwise turns positive.
-    full_scale : float or None
+    full_scale : float
         rad/s.
     largest_count : int or None
-        Of a device that counts; its full scale is so many times the sensitivity.
+        Of a device that counts; its full scale is then this many times the sensitivity.
+    noise_density : float or None
+        White noise of the rate, rad/s/√Hz, where the data sheet of the gyro is known.
     increments : bool
         Whether the device sends angles since its last sample, if nothing else is set.
     startup : bytes
         What makes the device send.
-    awakening : bytes
-        What the emulated device sends first, so that its first sample is not taken for the rest of a line.
-    is_timed : bool
-        Whether samples may carry the time of the device, in a column ``time_s``.
+    preamble : bytes
+        What the emulated device sends first, so that its first sample is not taken for the rest
+        of a line.
     modulus : int
         At which the sequence of the device begins anew; 0 where it has none.
     good : mapping of str to (float, float)
@@ -259,12 +278,12 @@ class Protocol:
     parser: Callable[[Settings], Parse]
     writer: Callable[[Settings], Write]
     invert: bool = False
-    full_scale: float | None = None
+    full_scale: float = math.radians(2000.0)
     largest_count: int | None = None
+    noise_density: float | None = None
     increments: bool = False
     startup: bytes = b''
-    awakening: bytes = b''
-    is_timed: bool = False
+    preamble: bytes = b''
     modulus: int = 0
     good: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     check: Callable[[Settings], None] = check_rates
@@ -282,7 +301,7 @@ class Protocol:
 
     def encoder(self, settings: Settings | None = None) -> Callable[..., bytes]:
         """
-        Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends, whether it stands by the sample or not.
+        Return ``encode(sample, valid=True)`` of one device, which gives the bytes that it sends.
 
         Beyond full scale it saturates.
 
@@ -298,7 +317,8 @@ class Protocol:
         def encode(sample: Sample, valid: bool = True) -> bytes:
             value = min(max(sample.output, -limit), limit) / factor
             temperature, force = _finite(sample.temperature), _finite(sample.specific_force)
-            return write(Written(value, valid, temperature, sample.time, sample.sequence or 0, force, sample.health))
+            return write(Written(value, valid, temperature, sample.time, sample.sequence or 0,
+                                 force, sample.health))
 
         return encode
 
@@ -313,38 +333,43 @@ class Protocol:
         """
         return self.encoder(settings)(sample, valid)
 
-    def gives_time(self, settings: Settings) -> bool:
-        """Return whether samples carry the time of the device."""
-        return self.is_timed and 'time_s' in settings.columns
-
     def nominal_rate(self, settings: Settings) -> float:
-        """Return the samples per second, as set or as the format says."""
+        """Return the samples per second, as set or of the format."""
         return settings.sample_rate or self.rate
 
     def sends_angles(self, settings: Settings) -> bool:
-        """Return whether the device sends angles since its last sample, as set or as the format says."""
+        """Return whether the device sends angles since its last sample, as set or by default."""
         return self.increments if settings.increments is None else settings.increments
 
     def wrong_rate(self, settings: Settings, period: float) -> str:
-        """Return a warning where rates are wrong by the factor of the interval, since angles come at another period, s; else nothing."""
+        """Return a warning where angles come at another period, s, than rates are made of."""
         rate = self.nominal_rate(settings)
         if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
             return ''
-        return f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are made rates: set sample_rate'
+        return (f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are made '
+                'rates: set sample_rate')
 
     def factor(self, settings: Settings) -> float:
         """Return the rad/s, counter-clockwise positive, of one unit of the device."""
         invert = self.invert if settings.invert is None else settings.invert
-        factor = (settings.sensitivity or self.sensitivity) * (self.nominal_rate(settings) if self.sends_angles(settings) else 1.0)
+        factor = settings.sensitivity or self.sensitivity
+        if self.sends_angles(settings):
+            factor *= self.nominal_rate(settings)
         return -factor if invert else factor
 
     def limit(self, settings: Settings) -> float:
-        """Return the full scale in rad/s: as set, or that of the device, which for one that counts depends on the sensitivity."""
+        """Return the full scale in rad/s, as set or of the device."""
         if settings.full_scale is not None:
             return settings.full_scale
         if self.largest_count is not None:
             return self.largest_count * (settings.sensitivity or self.sensitivity)
-        return math.inf if self.full_scale is None else self.full_scale
+        return self.full_scale
+
+    def variance(self, settings: Settings) -> float:
+        """Return the assumed variance of one sample, (rad/s)²."""
+        if self.noise_density is None:
+            return ASSUMED_NOISE ** 2
+        return self.noise_density ** 2 * self.nominal_rate(settings)
 
 
 def _finite(value: float | None) -> float | None:
@@ -356,14 +381,17 @@ class Decoder:
     """
     Turns the bytes of one gyro into samples; raises on no input, and holds no more than one frame.
 
-    What a format says in several frames is put together only of frames with nothing lost between them.
+    What a format sends in several frames is joined only if nothing was lost between them. A
+    refused sample is missing before the next one; a refused temperature is left out of its sample.
 
     Attributes
     ----------
     faults : int
         Frames whose value the device itself calls invalid.
-    out_of_range : int
-        Frames with a value beyond full scale, which the device cannot mean.
+    refused_samples : int
+        Frames whose value is not finite, or beyond full scale.
+    refused_temperatures : int
+        Not finite, or beyond -100 to 300 degC.
 
     """
 
@@ -377,8 +405,7 @@ class Decoder:
         self._refused_bytes = 0
         self._garbage, self._skipped, self._length = 0, 0, 0.0
         self._begun = False
-        self.faults = 0
-        self.out_of_range = 0
+        self.faults = self.refused_samples = self.refused_temperatures = 0
 
     @property
     def discarded_bytes(self) -> int:
@@ -391,7 +418,7 @@ class Decoder:
         return [sample for sample in samples if sample is not None]
 
     def reset(self) -> None:
-        """Forget the frame that has begun, as after the port was lost; the counts go on."""
+        """Drop the frame that has begun, as after the port was lost; the counts go on."""
         self._splitter.reset()
         self._parse = self._parser()
         self._garbage, self._skipped, self._begun = 0, 0, False
@@ -411,21 +438,25 @@ class Decoder:
         if not self._is_good(reading, output):
             self._skipped += 1
             return None
-        missing = self._missing(len(frame.data))
-        return Sample(output, reading.temperature, reading.time, reading.sequence, missing, reading.specific_force, reading.health)
+        missing, temperature = self._missing(len(frame.data)), reading.temperature
+        if temperature is not None and not _TEMPERATURES[0] <= temperature <= _TEMPERATURES[1]:
+            self.refused_temperatures += 1
+            temperature = None
+        return Sample(output, temperature, reading.time, reading.sequence, missing,
+                      reading.specific_force, reading.health)
 
     def _is_good(self, reading: Reading, output: float) -> bool:
         if not reading.valid:
             self.faults += 1
             return False
         if not (math.isfinite(output) and abs(output) <= self._limit):
-            self.out_of_range += 1
+            self.refused_samples += 1
             return False
         return True
 
     def _missing(self, length: int) -> int:
-        """Return how many frames the garbage since the last sample was, and those that were skipped; none before the first sample."""
-        self._length = self._length + _LEARNING * (length - self._length) if self._length else float(length)
+        """Return how many frames were garbage or skipped since the last sample; 0 for the first."""
+        self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
         missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
         self._garbage, self._skipped, self._begun = 0, 0, True
         return missing

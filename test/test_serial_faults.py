@@ -5,19 +5,19 @@ import itertools
 import numpy as np
 import pytest
 
-from gyro_calibration.driver.serial_faults import Line, damaged, delivered
+from gyro_calibration.driver.serial_faults import SerialFaults, damaged, delivered
 
 DATA = bytes(range(256)) * 400  # 102400 bytes, each unlike its neighbours
 
 
 def arrived(**faults):
     """Return what arrives of the data."""
-    return damaged(Line(**faults), DATA, np.random.default_rng(1))
+    return damaged(SerialFaults(**faults), DATA, np.random.default_rng(1))
 
 
 def test_a_line_without_faults_changes_nothing_and_asks_no_generator():
-    assert damaged(Line(), DATA, None) == DATA
-    assert not Line(burst=0.016, piece=1).is_random
+    assert damaged(SerialFaults(), DATA, None) == DATA
+    assert not SerialFaults(burst=0.016, piece=1).is_random
 
 
 @pytest.mark.parametrize('fault, sign', [('lost_bytes', -1), ('doubled_bytes', 1)])
@@ -44,21 +44,21 @@ def test_all_can_be_lost():
 
 def test_bursts_hand_over_at_their_ends_and_lose_nothing():
     sent = [(0.001 * number, bytes([number])) for number in range(100)]
-    pieces = list(delivered(Line(burst=0.016), sent, 9600))
+    pieces = list(delivered(SerialFaults(burst=0.016), sent, 9600))
     assert b''.join(data for _, data in pieces) == bytes(range(100))
     assert [time for time, _ in pieces] == pytest.approx([0.016 * number for number in range(8)])
     assert all(0.0 <= time - 0.001 * byte < 0.016 + 1e-9 for time, data in pieces for byte in data)
 
 
 def test_pieces_come_at_the_pace_of_the_line():
-    pieces = list(delivered(Line(piece=1), [(1.0, b'abc')], 9600))
+    pieces = list(delivered(SerialFaults(piece=1), [(1.0, b'abc')], 9600))
     assert [data for _, data in pieces] == [b'a', b'b', b'c']
     assert [time for time, _ in pieces] == pytest.approx([1.0, 1.0 + 10 / 9600, 1.0 + 20 / 9600])
 
 
 def test_a_source_is_not_asked_before_what_it_gave_was_delivered():
     asked = []
-    pieces = delivered(Line(), (asked.append(number) or (float(number), b'x') for number in range(9)), 9600)
+    pieces = delivered(SerialFaults(), (asked.append(number) or (float(number), b'x') for number in range(9)), 9600)
     next(pieces)
     assert asked == [0]
 
@@ -69,4 +69,4 @@ def test_a_source_is_not_asked_before_what_it_gave_was_delivered():
                                           ({'burst': -1.0}, 'burst is -1.0 s'), ({'piece': -1}, 'piece -1')])
 def test_a_line_that_is_not_possible_is_refused(fault, words):
     with pytest.raises(ValueError, match=words):
-        Line(**fault)
+        SerialFaults(**fault)
