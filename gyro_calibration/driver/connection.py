@@ -187,7 +187,7 @@ class _Silence:
 
 class Connection:
     """
-    Gives the samples of a gyro, with stamps, until it is told to stop.
+    Gives the samples of a gyro, with stamps, until it is stopped.
 
     After the port was lost, or no sample came for 2 s (three periods of a gyro that is slower), it
     is opened again after 0.1 s, then after twice as long each time, up to 5 s, until samples come.
@@ -327,7 +327,7 @@ class Connection:
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """
-        Find out at which baud which protocol comes; it remains unknown only when told to stop.
+        Find out at which baud which protocol comes; it stays unknown only after a stop.
 
         The port stays open meanwhile, since opening it restarts many a microcontroller, and one
         that restarts needs some time until it sends.
@@ -389,7 +389,7 @@ class Connection:
 
     def _read(self, port: SerialPort, stop: threading.Event) -> Iterator[Chunk]:
         decoder, clock = self._decoder, self.clock
-        if decoder is None or clock is None:  # told to stop while it still listened
+        if decoder is None or clock is None:  # stopped while it still listened
             return
         silence, counts = _Silence(clock.period, self._now()), self._unusable(decoder)
         while not stop.is_set():

@@ -12,7 +12,7 @@ early.
 is set by months when it finds a time server; then stamps jump, and nothing else has happened.
 `NodeTime` gives stamps of such a clock, `HostClock` and `MessageClock` take them to an even axis.
 
-No clock is read here, except by `steady`: who reads the port or a topic says when.
+No clock is read here, except by `steady`: who reads the port or a topic gives the time.
 
 References
 ----------
@@ -203,7 +203,7 @@ class _Numbers:
         return advance, max(missing, self._lost(advance))
 
     def _elapsed(self, time: float) -> float | None:
-        """Return the time since the last sample, s; None where only this one time says so."""
+        """Return the time since the last sample, s; None where only this one time shows it."""
         for last in (self._time, self._outlier):
             if last is not None and _LEAST_STEP <= time - last <= _LARGEST_JUMP:
                 return time - last
@@ -492,7 +492,7 @@ _STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 def read_together(
     even: Callable[[], float], other: Callable[[], float],
 ) -> tuple[float, float] | None:
-    """Return what two clocks say at one time, s; None where the program was held up in between."""
+    """Return two clocks at one time, s; None where the program was held up in between."""
     before, value = even(), other()
     after = even()
     return (0.5 * (before + after), value) if after - before <= _TOGETHER else None
@@ -500,7 +500,7 @@ def read_together(
 
 class ClockSteps:
     """
-    Detects a clock that is set, by what it says beside a steady one.
+    Detects a clock that is set, by its times beside those of a steady one.
 
     Parameters
     ----------
@@ -531,7 +531,7 @@ class ClockSteps:
         return step if was_set else 0.0
 
     def watch(self, even: float, other: float) -> float:
-        """Take what both clocks say at one time, s, and return what `step` does."""
+        """Take the times of both clocks at one time, s, and return what `step` does."""
         step = self.step(even, other)
         self._even, self._other = even, other
         if step:
@@ -557,7 +557,7 @@ class NodeTime:
         self._even, self._node, self._last = -math.inf, -math.inf, -math.inf
 
     def watch(self, even: float, node: float) -> float:
-        """Take what both clocks say at one time, s; return by how much the node's was set."""
+        """Take the times of both clocks at one time, s; return by how much the node's was set."""
         elapsed, was_set_back = even - self._even, node < self._node
         self._even, self._node = even, node
         step = self.steps.watch(even, node)
@@ -571,7 +571,7 @@ class NodeTime:
         return step
 
     def of(self, stamp: float) -> float:
-        """Return what the node's clock says at a time; stamps increase until it is set back."""
+        """Return a time by the clock of the node; stamps increase until it is set back."""
         self._last = max(stamp + self._difference, self._last + _LEAST_STEP)
         return self._last
 
@@ -604,7 +604,7 @@ class HostClock:
         self._recent: list[_Step] = []
 
     def watch(self, even: float, date: float) -> float:
-        """Take what both clocks say at one time, s; return by how much the date was set."""
+        """Take the times of both clocks at one time, s; return by how much the date was set."""
         if self._recent and even - self._recent[0].seen > _MIXED:
             del self._recent[0]
         step = self.steps.watch(even, date)

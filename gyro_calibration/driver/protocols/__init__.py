@@ -1,5 +1,7 @@
 """
-Wire formats of serial gyros: bytes to samples and back, and which format it is (`listening`). No port, no ROS, no clock.
+Wire formats of serial gyros: bytes to samples and back, and recognizing a format (`listening`).
+
+No port, no ROS, no clock.
 
 >>> decoder = find('kvh_dsp3000').decoder()
 >>> decoder.feed(b'       0.015733   1\\r\\n')
@@ -19,7 +21,8 @@ from gyro_calibration.driver.protocols.protocol import Decoder, Protocol, Sample
 from gyro_calibration.driver.protocols.razor import RAZOR
 from gyro_calibration.driver.protocols.witmotion import WITMOTION
 
-PROTOCOLS = {protocol.name: protocol for protocol in (KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
+PROTOCOLS = {protocol.name: protocol for protocol in (
+    KVH_DSP3000, KVH_1750, KVH_ECORE, FIZOPTIKA, MINIMU9, WITMOTION, RAZOR, CSV)}
 
 __all__ = ['PROTOCOLS', 'Decoder', 'Protocol', 'Sample', 'Settings', 'find']
 

@@ -36,7 +36,8 @@ def _check(settings: Settings) -> None:
     check_rates(settings)
     counts = 'gyro_counts' in settings.columns
     if counts and settings.sensitivity is None:
-        raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the rad/s of one count')
+        raise ValueError('columns hold gyro_counts, but sensitivity is not set: set it to the '
+                         'rad/s of one count')
     if not counts and settings.sensitivity is not None:
         raise ValueError('sensitivity is set, but columns hold no gyro_counts: name the column '
                          'gyro_counts, or leave sensitivity out')

@@ -1,14 +1,15 @@
 """
-Fizoptika fibre-optic gyros with one axis: binary frames of 8 bytes, ``DD low high middle id data sum sum``.
+Fizoptika fibre-optic gyros with one axis: frames of 8 bytes, ``DD low high mid id data sum sum``.
 
-The rate is a signed number of 24 bits in counts, whose meaning differs from unit to unit (27880 counts per deg/s in one). The sum is that
-of the second to the sixth byte, most significant byte first. Each frame holds half of a value about the unit itself: the even numbers
-``id`` have the high byte, the odd ones after them the low byte of a signed number of 16 bits. They are joined only if the two frames
-follow each other with nothing between.
+The rate is a signed number of 24 bits in counts, whose meaning differs from unit to unit (27880
+counts per deg/s in one). The sum is that of the second to the sixth byte, most significant byte
+first. Each frame holds half of a value about the unit itself: the even numbers ``id`` have the
+high byte, the odd ones after them the low byte of a signed number of 16 bits. They are joined only
+if the two frames follow each other with nothing between.
 
-Source: the public decoder `riptide_gyro` of Ohio State University, which names the numbers from 8 to 15 as reserved; its sign extension
-is off by one count and was not taken over. No manual was seen: the sample rate, which is not named anywhere, and the sense of rotation are
-not verified.
+Source: the public decoder `riptide_gyro` of Ohio State University, which names the numbers from 8
+to 15 as reserved; its sign extension is off by one count and was not adopted. No manual was seen:
+the sample rate, which is not given anywhere, and the sense of rotation are not verified.
 
 """
 
@@ -17,10 +18,17 @@ from __future__ import annotations
 from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
-from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, check_counts
+from gyro_calibration.driver.protocols.protocol import (
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    check_counts,
+)
 
 _HEADER = 0xDD
-_VALUES = {  # of the number of the high byte: name, unit of one count, offset, and what an emulated unit says where nothing is given
+# number of the high byte: name, unit of one count, offset, default of an emulated unit
+_VALUES = {
     0: ('temperature', 250.0 / 0x8000, -50.0, 25.0),
     2: ('supply_v', 10.0 / 0x8000, 0.0, 5.0),
     4: ('source_current_a', 0.25 / 0x8000, 0.0, 0.1),
@@ -51,7 +59,9 @@ class _Parser:
         if joined is None:
             return Reading(count)
         name, value = joined
-        return Reading(count, temperature=value) if name == 'temperature' else Reading(count, health={name: value})
+        if name == 'temperature':
+            return Reading(count, temperature=value)
+        return Reading(count, health={name: value})
 
     def _joined(self, number: int, byte: int) -> tuple[str, float] | None:
         if self._number not in _VALUES or number != self._number + 1:
@@ -94,6 +104,7 @@ FIZOPTIKA = Protocol(
     parser=_Parser,
     writer=_Writer,
     largest_count=0x800000,
-    good={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15), 'diagnostic_v': (0.95, 1.05)},
+    good={'supply_v': (4.75, 5.25), 'source_current_a': (0.07, 0.15),
+          'diagnostic_v': (0.95, 1.05)},
     check=check_counts,
 )

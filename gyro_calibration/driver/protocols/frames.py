@@ -10,7 +10,7 @@ from gyro_calibration.driver.protocols.protocol import Frame
 
 class FrameSplitter:
     """
-    Gives frames that look right and pass their check; after garbage it tries again one byte further on.
+    Gives frames that match a pattern and pass their check; after garbage it tries the next byte.
 
     Parameters
     ----------
@@ -51,6 +51,6 @@ class FrameSplitter:
         self._garbage += count
 
     def reset(self) -> None:
-        """Forget the frame that has begun."""
+        """Drop the frame that has begun."""
         self._discard(len(self._tail))
         self._tail, self._garbage = b'', 0

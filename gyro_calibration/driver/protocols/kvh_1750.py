@@ -1,17 +1,20 @@
 """
-KVH 1725, 1750, 1760 and 1775, fibre-optic gyros with up to three axes and accelerometers: binary frames of 36 bytes with a CRC.
+KVH 1725, 1750, 1760 and 1775, fibre-optic gyros with up to three axes: frames of 36 bytes.
 
-After the header FE 81 FF 55 come three rotations and three accelerations in g (32-bit floats), a status, a sequence of 0 to 127, the
-temperature in whole degC and the CRC, all with the most significant byte first. A bit of the status stands for each axis: 0 to 2 for the
-gyros, 4 to 6 for the accelerometers, 1 for valid.
+After the header FE 81 FF 55 come three rotations and three accelerations in g (32-bit floats), a
+status, a sequence of 0 to 127, the temperature in whole degC and the CRC, all with the most
+significant byte first. A bit of the status stands for each axis: 0 to 2 for the gyros, 4 to 6 for
+the accelerometers, 1 for valid.
 
-A rotation is the angle in rad since the last sample, unless the unit was told to send rates (``=ROTFMT,RATE``). Such an angle is divided by
-the interval of the data rate that the unit was told (``=DR``): 1000 Hz, or `Settings.sample_rate`. A turn is positive counter-clockwise,
-seen from the tip of the axis, and the acceleration of an axis that points up is 1 g.
+A rotation is the angle in rad since the last sample, unless the unit is set to send rates
+(``=ROTFMT,RATE``). An angle is divided by the interval of the data rate that the unit is set to
+(``=DR``): 1000 Hz, or `Settings.sample_rate`. A turn is positive counter-clockwise, seen from the
+tip of the axis, and the acceleration of an axis that points up is 1 g.
 
-Source: KVH 1775 IMU interface control document, 56-0298 revision B: format A (tables 5-1, 5-2), status (5-8), CRC (5-9), the example
-(5.2.1), data rates (8.8), senses (section 9); that a new unit sends at 1000 Hz is what public drivers expect. Formats B and C, and
-temperatures in other units, are not read.
+Source: KVH 1775 IMU interface control document, 56-0298 revision B: format A (tables 5-1, 5-2),
+status (5-8), CRC (5-9), the example (5.2.1), data rates (8.8), senses (section 9); that a new unit
+sends at 1000 Hz is what public drivers expect. Formats B and C, and temperatures in other units,
+are not read.
 
 """
 
@@ -23,18 +26,25 @@ import zlib
 from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
-from gyro_calibration.driver.protocols.protocol import STANDARD_GRAVITY, Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    STANDARD_GRAVITY,
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')
 _MODULUS = 128
 _ALL_VALID = 0x77
-_ROOM_TEMPERATURE = 25.0  # degC; what an emulated unit says where none is given
+_ROOM_TEMPERATURE = 25.0  # degC; default of an emulated unit
 _MIRRORED = bytes(int(f'{byte:08b}'[::-1], 2) for byte in range(256))
 
 
 def _checksum(data: bytes) -> bytes:
-    """Return the CRC-32 with polynomial 04C11DB7, which is that of zlib but for the order of the bits and the inversion at the end."""
+    """Return the CRC-32 of zlib with the bits in reverse order and not inverted at the end."""
     mirrored = zlib.crc32(data.translate(_MIRRORED)) ^ 0xFFFFFFFF
     return mirrored.to_bytes(4, 'little').translate(_MIRRORED)
 
@@ -68,7 +78,8 @@ def _write(reading: Written, settings: Settings) -> bytes:
         status &= ~(1 << axis)
     temperature = _ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
     count = min(max(round(temperature), -0x8000), 0x7FFF)
-    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, reading.sequence % _MODULUS, count)
+    sequence = reading.sequence % _MODULUS
+    frame = _FRAME.pack(_HEADER, *rotation, *acceleration, status, sequence, count)
     return frame + _checksum(frame)
 
 
@@ -82,7 +93,7 @@ KVH_1750 = Protocol(
     parser=stateless(_parse),
     writer=stateless(_write),
     full_scale=math.radians(500.0),  # the input range is 490 deg/s
-    noise_density=math.radians(1.0 / 3600.0),  # data sheets: 1 deg/h/√Hz for the 1725, others less
+    noise_density=math.radians(1.0 / 3600.0),  # 1 deg/h/√Hz for the 1725, others less
     increments=True,
     modulus=_MODULUS,
     check=lambda settings: None,

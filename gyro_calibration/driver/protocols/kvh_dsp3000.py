@@ -1,12 +1,14 @@
 """
-KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1`` with the rate in deg/s and 1 for valid.
+KVH DSP-3000, a fibre-optic gyro with one axis: lines like ``       0.015733   1``.
 
-The rate is positive clockwise, seen from above. The unit's clock is 2 to 3 % off from unit to unit, so its samples must never be
-integrated with the nominal interval. The letter R, sent three times, asks for rates instead of increments or integrated angles.
+They hold the rate in deg/s and 1 for valid. The rate is positive clockwise, seen from above. The
+clock is 2 to 3 % off from unit to unit, so samples must never be integrated with the nominal
+interval. The letter R, sent three times, asks for rates in place of increments or angles.
 
-Source: KVH DSP-3000 technical manual, 54-0215 revision C, section 2, for the unit with the asynchronous interface of 100 Hz (part
-02-1222-01); that of 1000 Hz (02-1222-07) sends binary and is not read here. The linearity is given up to 375 deg/s, and beyond 500 deg/s
-the output is unreliable, whatever the valid bit says (table 2).
+Source: KVH DSP-3000 technical manual, 54-0215 revision C, section 2, for the unit with the
+asynchronous interface of 100 Hz (part 02-1222-01); that of 1000 Hz (02-1222-07) sends binary and
+is not read here. The linearity is given up to 375 deg/s, and beyond 500 deg/s the output is
+unreliable, whatever the valid bit is (table 2).
 
 """
 
@@ -17,7 +19,13 @@ import re
 from functools import partial
 
 from gyro_calibration.driver.protocols.lines import LineSplitter
-from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
 

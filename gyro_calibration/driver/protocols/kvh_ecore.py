@@ -1,9 +1,11 @@
 """
-KVH E-Core 2000 family, a fibre-optic gyro with one axis: binary frames of 8 bytes, bit 7 set in the first one only.
+KVH E-Core 2000 family, fibre-optic gyros with one axis: frames of 8 bytes.
 
-The 56 low bits, most significant first, make seven bytes m[0] to m[6]. They add up to 0 modulo 256, and m[5], m[6] are the rate, a
-signed 16-bit number; what m[1] to m[4] hold is not known. One count is 0.00183 deg/s in a unit for 60 deg/s and half of that in a unit
-for 30 deg/s. The RD2100 is assumed to speak alike. Baud and sense of rotation were inferred, not read in a manual.
+Bit 7 is set in the first byte only. The 56 low bits, most significant first, make seven bytes m[0]
+to m[6]. They add up to 0 modulo 256, and m[5], m[6] are the rate, a signed 16-bit number; the
+meaning of m[1] to m[4] is not known. One count is 0.00183 deg/s in a unit for 60 deg/s and half of
+that in a unit for 30 deg/s. The RD2100 is assumed to have the same format. Baud and sense of
+rotation were inferred, not read in a manual.
 
 """
 
@@ -13,7 +15,13 @@ import math
 from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
-from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _COUNT = math.radians(0.00183)
 

@@ -13,13 +13,13 @@ class LineSplitter:
     """
     Gives whole lines without their ends, and no empty ones.
 
-    A port is opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``: so the first line is thrown away, unless it begins
-    as only whole lines do.
+    A port is opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``: so the first
+    line is discarded, unless it begins as only whole lines do.
 
     Parameters
     ----------
     longest : int
-        Bytes; a longer line is thrown away, so that an endless one does not fill the memory.
+        Bytes; a longer line is discarded, so that an endless one does not fill the memory.
     beginnings : tuple of bytes
         With what only a whole line begins.
 
@@ -43,7 +43,7 @@ class LineSplitter:
         return whole
 
     def reset(self) -> None:
-        """Forget the line that has begun."""
+        """Drop the line that has begun."""
         self._discard(len(self._tail))
         self._tail, self._garbage, self._begun, self._too_long = b'', 0, False, False
 
@@ -52,7 +52,8 @@ class LineSplitter:
         return Frame(line, garbage)
 
     def _is_whole(self, line: bytes) -> bool:
-        good = not self._too_long and len(line) <= self._longest and (self._begun or line.startswith(self._beginnings))
+        good = not self._too_long and len(line) <= self._longest
+        good = good and (self._begun or line.startswith(self._beginnings))
         self._begun, self._too_long = True, False
         if not good:
             self._discard(len(line))

@@ -1,7 +1,8 @@
 """
-Tell which gyro speaks from what it says: which wire format explains the bytes that came.
+Recognize the wire format that explains the bytes that came.
 
-A line is listened to at each of `BAUDS` in turn, until `recognize` names a protocol. At a wrong baud the bytes are in no format.
+A line is read at each of `BAUDS` in turn, until `recognize` names a protocol. At a wrong baud the
+bytes are in no format.
 
 """
 
@@ -15,12 +16,12 @@ from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
 from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
 
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
-"""Bits per second to try in this order: first what gyros send when they are new, then what else some can be set to."""
+"""Bits per second to try in this order: first those of new gyros, then others that some can do."""
 
-_LONGEST = 8192  # bytes that are looked at, the last ones; so a growing buffer costs the same each time
+_LONGEST = 8192  # last bytes that are looked at, so that a growing buffer costs no more
 _FRAMES = 3  # fewer may be chance
 _ENOUGH = 0.5  # of the bytes; a line may lose or damage the rest
-_ALL = 0.95  # of the bytes, where frames are always the same: at a wrong baud, zeros may pass for a frame with a weak check
+_ALL = 0.95  # of the bytes, where all frames are the same: zeros may pass a weak check
 _NEARLY = 0.8  # of what the best format explains: another that explains so much is as likely
 _NUMBERS = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
 
@@ -28,15 +29,16 @@ _NUMBERS = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
 @dataclass(frozen=True)
 class Recognition:
     """
-    What was heard.
+    The format of some bytes.
 
     Attributes
     ----------
     protocol : Protocol or None
-        The format of the bytes, or None if there are too few of them, or none explains them, or two do.
+        None if there are too few bytes, or none explains them, or two do.
     explained : float
-        The share of the bytes that are frames of the best format, 0 to 1; the rest of a frame at the beginning does not count. Where
-        the columns do not fit, the share of the lines that have as many numbers as most.
+        The share of the bytes that are frames of the best format, 0 to 1; the rest of a frame at
+        the beginning does not count. Where the columns do not fit, the share of the lines that
+        have as many numbers as most.
     frames : int
         How many frames that are.
     runner_up : Protocol or None
@@ -65,7 +67,7 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     """
     Return which format explains the bytes, of which the last 8192 are looked at.
 
-    The settings need not suffice for the format that is found: its `Protocol.check` says what else must be set.
+    The settings need not suffice for the format that is found; see its `Protocol.check`.
 
     Parameters
     ----------
@@ -76,14 +78,18 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
 
     """
     settings, data = settings or Settings(), data[-_LONGEST:]
-    scores = sorted((_score(protocol, settings, data) for protocol in PROTOCOLS.values()), key=lambda score: -score.explained)
-    best, second = scores[:2]
+    scores = [_score(protocol, settings, data) for protocol in PROTOCOLS.values()]
+    best, second = sorted(scores, key=lambda score: -score.explained)[:2]
     runner_up = second if second.explained else None
     rivals = runner_up is not None and second.explained >= _NEARLY * best.explained
     enough = _ENOUGH if best.distinct >= _FRAMES else _ALL
-    found = best.frames >= _FRAMES and best.explained >= enough and not rivals
-    explained, words = _found(best, runner_up, data) if found else _not_found(best, second if rivals else None, data, settings)
-    return Recognition(best.protocol if found else None, explained, best.frames, runner_up.protocol if runner_up else None, words)
+    if best.frames >= _FRAMES and best.explained >= enough and not rivals:
+        protocol, (explained, words) = best.protocol, _found(best, runner_up, data)
+    else:
+        rival = second if rivals else None
+        protocol, (explained, words) = None, _not_found(best, rival, data, settings)
+    other = runner_up.protocol if runner_up else None
+    return Recognition(protocol, explained, best.frames, other, words)
 
 
 def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
@@ -95,18 +101,25 @@ def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
     known = sum(len(frame.data) for frame in good)
     unknown = splitter.discarded_bytes + sum(len(frame.data) for frame in frames) - known
     begun = min(frames[0].garbage, max(len(frame.data) for frame in good))
-    return _Score(protocol, known / (known + unknown - begun), len(good), len({frame.data for frame in good}))
+    distinct = len({frame.data for frame in good})
+    return _Score(protocol, known / (known + unknown - begun), len(good), distinct)
 
 
 def _found(best: _Score, runner_up: _Score | None, data: bytes) -> tuple[float, str]:
-    second = f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}' if runner_up else ''
-    return best.explained, f'{best.protocol.name} explains {best.explained:.0%} of {len(data)} bytes, in {best.frames} frames{second}'
+    words = (f'{best.protocol.name} explains {best.explained:.0%} of {len(data)} bytes, in '
+             f'{best.frames} frames')
+    if runner_up:
+        words += f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}'
+    return best.explained, words
 
 
-def _not_found(best: _Score, rival: _Score | None, data: bytes, settings: Settings) -> tuple[float, str]:
+def _not_found(best: _Score, rival: _Score | None, data: bytes,
+               settings: Settings) -> tuple[float, str]:
     count, share = _numbers_of_a_line(data)
     if not rival and count not in (0, len(settings.columns)):
-        return share, f'lines of {count} numbers came, but columns names {len(settings.columns)}: name all columns in their order'
+        named = len(settings.columns)
+        return share, (f'lines of {count} numbers came, but columns names {named}: name all '
+                       'columns in their order')
     return best.explained, _why_not(best, rival, data)
 
 
@@ -114,16 +127,20 @@ def _why_not(best: _Score, rival: _Score | None, data: bytes) -> str:
     if not data:
         return 'nothing came: check the power and the wires of the gyro'
     if rival:
-        return f'the bytes may be {best.protocol.name} or {rival.protocol.name}: set protocol to the one it is'
+        return (f'the bytes may be {best.protocol.name} or {rival.protocol.name}: set protocol to '
+                'the one it is')
+    came = f'{len(data)} bytes came'
     if best.frames:
-        return f'{len(data)} bytes came, too few of which are frames of {best.protocol.name} to be sure: listen longer, or set protocol'
-    return f'{len(data)} bytes came, but no format explains them: try another baud, or set protocol'
+        return (f'{came}, too few of which are frames of {best.protocol.name} to be sure: listen '
+                'longer, or set protocol')
+    return f'{came}, but no format explains them: try another baud, or set protocol'
 
 
 def _numbers_of_a_line(data: bytes) -> tuple[int, float]:
-    """Return how many numbers most lines have, or 0 where most lines are something else, and which share of the lines these are."""
+    """Return how many numbers most lines have, 0 where most have none, and their share."""
     lines = [frame.data for frame in LineSplitter(1024).feed(data)]
-    counts = Counter(line.count(b',') + 1 if _NUMBERS.fullmatch(line.strip()) else 0 for line in lines)
+    counts = Counter(line.count(b',') + 1 if _NUMBERS.fullmatch(line.strip()) else 0
+                     for line in lines)
     if len(lines) < _FRAMES:
         return 0, 0.0
     count, times = counts.most_common(1)[0]

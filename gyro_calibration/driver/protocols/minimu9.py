@@ -1,8 +1,9 @@
 """
-Pololu MinIMU-9 with its AHRS firmware: lines like ``!ANG:0.10,-0.20,90.00,AN:1,2,3,...`` with raw counts of gyro, accelerometer, compass.
+Pololu MinIMU-9 with its AHRS firmware: lines like ``!ANG:0.10,-0.20,90.00,AN:1,2,3,...``.
 
-One count of the gyro is 0.07 deg/s in the range of 2000 deg/s that the firmware sets, 0.0175 at 500 and 0.00875 at 250 (data sheet of
-the L3G4200D, typical). A line without ``AN`` holds no rate, so it is discarded.
+They hold raw counts of gyro, accelerometer and compass. One count of the gyro is 0.07 deg/s in the
+range of 2000 deg/s that the firmware sets, 0.0175 at 500 and 0.00875 at 250 (data sheet of the
+L3G4200D, typical). A line without ``AN`` holds no rate, so it is discarded.
 
 """
 
@@ -13,7 +14,13 @@ import re
 from functools import partial
 
 from gyro_calibration.driver.protocols.lines import LineSplitter
-from gyro_calibration.driver.protocols.protocol import Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _COUNT = math.radians(0.07)
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')
@@ -25,7 +32,8 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    counts = [min(max(round(reading.value), -0x8000), 0x7FFF) if axis == settings.axis else 0 for axis in 'xyz']
+    count = min(max(round(reading.value), -0x8000), 0x7FFF)
+    counts = [count if axis == settings.axis else 0 for axis in 'xyz']
     return b'!ANG:0.00,0.00,0.00,AN:%d,%d,%d,0,0,0,0,0,0\r\n' % tuple(counts)
 
 

@@ -21,7 +21,7 @@ STANDARD_GRAVITY = 9.80665
 """m/s²; what devices call one g."""
 
 GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts': 1.0}
-"""Columns of the log format that hold the output, and what their unit is in rad/s, or in counts."""
+"""Columns of the log format that hold the output, with their unit in rad/s, or in counts."""
 
 KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
 """Columns of the log format that may stand beside it."""
@@ -150,7 +150,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Written(Reading):
-    """A reading that a device writes: it has a value, and a sequence that counts from 0 on and never wraps."""
+    """A reading that a device writes: it has a value, and a sequence from 0 on without wraps."""
 
     value: float
     sequence: int = 0
@@ -207,12 +207,13 @@ def check_rates(settings: Settings) -> None:
 
     """
     if settings.increments:
-        raise ValueError('increments is set, but this gyro sends rates, not angles: leave increments out')
+        raise ValueError('increments is set, but this gyro sends rates, not angles: leave '
+                         'increments out')
 
 
 def check_counts(settings: Settings) -> None:
     """
-    Accept the settings of a device that sends rates as counts, which mean something else in each unit.
+    Accept the settings of a device that sends rates as counts, whose size differs by unit.
 
     Raises
     ------
@@ -242,9 +243,11 @@ class Protocol:
     splitter : callable
         Returns a new `Splitter`.
     parser : callable
-        ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and `stateless`.
+        ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and
+        `stateless`.
     writer : callable
-        ``writer(settings)`` returns what writes the frames of one device, see `Write` and `stateless`.
+        ``writer(settings)`` returns what writes the frames of one device, see `Write` and
+        `stateless`.
     invert : bool
         Whether the device counts clockwise turns positive.
     full_scale : float
@@ -322,7 +325,8 @@ class Protocol:
 
         return encode
 
-    def encode(self, sample: Sample, settings: Settings | None = None, valid: bool = True) -> bytes:
+    def encode(self, sample: Sample, settings: Settings | None = None,
+               valid: bool = True) -> bytes:
         """
         Return what a device, just turned on, sends for a sample; see `encoder`.
 
@@ -346,8 +350,8 @@ class Protocol:
         rate = self.nominal_rate(settings)
         if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
             return ''
-        return (f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are made '
-                'rates: set sample_rate')
+        return (f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are '
+                'made rates: set sample_rate')
 
     def factor(self, settings: Settings) -> float:
         """Return the rad/s, counter-clockwise positive, of one unit of the device."""
@@ -455,7 +459,7 @@ class Decoder:
         return True
 
     def _missing(self, length: int) -> int:
-        """Return how many frames were garbage or skipped since the last sample; 0 for the first."""
+        """Return how many frames were discarded or skipped before a sample; 0 for the first."""
         self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
         missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
         self._garbage, self._skipped, self._begun = 0, 0, True

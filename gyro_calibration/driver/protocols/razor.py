@@ -1,13 +1,15 @@
 """
-Razor AHRS firmware (SparkFun 9DoF Razor IMU, Sensor Stick, OpenLog Artemis): lines ``#YPRAG=`` with nine numbers parted by commas.
+Razor AHRS firmware (SparkFun 9DoF Razor IMU, Sensor Stick, OpenLog Artemis): lines ``#YPRAG=``.
 
-They hold yaw, pitch and roll, the accelerations and the rates about x, y and z. The rates are in rad/s, with two decimals: 0.01 rad/s is
-0.57 deg/s, which is coarse. The accelerations are in 1/256 g and negated, so that the axis that points down has 256. The firmware's axes
-point forward, right and down; here they are turned to forward, left and up (REP-103), so that y and z change their sign. ``#ox`` asks for
-these lines, and ``#o1`` for a stream of them.
+Their nine numbers are yaw, pitch and roll, the accelerations and the rates about x, y and z. The
+rates are in rad/s, with two decimals: 0.01 rad/s is 0.57 deg/s, which is coarse. The accelerations
+are in 1/256 g and negated, so that the axis that points down has 256. The axes of the firmware
+point forward, right and down; here they are turned to forward, left and up (REP-103), so that y
+and z change their sign. ``#ox`` asks for these lines, and ``#o1`` for a stream of them.
 
-Source: the comments of the firmware and the driver in `razor_imu_9dof` 1.3.0 (file Razor_AHRS.ino, on axes and serial commands; node
-imu_node.py). Older firmware may send counts: set the sensitivity then.
+Source: the comments of the firmware and the driver in `razor_imu_9dof` 1.3.0 (file Razor_AHRS.ino,
+on axes and serial commands; node imu_node.py). Older firmware may send counts: set the sensitivity
+then.
 
 """
 
@@ -18,10 +20,18 @@ import re
 from functools import partial
 
 from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
-from gyro_calibration.driver.protocols.protocol import STANDARD_GRAVITY, Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    STANDARD_GRAVITY,
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
-_ANGLES = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')  # what the firmware sends when it is not asked for more
+# what the firmware sends when it is not asked for more
+_ANGLES = re.compile(rb'#YPR=' + NUMBER + rb'(?:,' + NUMBER + rb'){2} *')
 _FORCE = STANDARD_GRAVITY / 256.0
 _TURNED = {'x': 1.0, 'y': -1.0, 'z': -1.0}  # from forward, right, down to forward, left, up
 
@@ -33,13 +43,16 @@ def _parse(line: bytes, settings: Settings) -> Reading | None:
     axis, turned = 'xyz'.index(settings.axis), _TURNED[settings.axis]
     numbers = match[1].split(b',')
     force = -turned * float(numbers[3 + axis]) * _FORCE
-    return Reading(turned * float(numbers[6 + axis]), specific_force=force if math.isfinite(force) else None)
+    return Reading(turned * float(numbers[6 + axis]),
+                   specific_force=force if math.isfinite(force) else None)
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    turned, force = _TURNED[settings.axis], STANDARD_GRAVITY if reading.specific_force is None else reading.specific_force
-    values = [(-turned * force / _FORCE, turned * reading.value) if axis == settings.axis else (0.0, 0.0) for axis in 'xyz']
-    accelerations, rates = zip(*values, strict=True)
+    turned, force = _TURNED[settings.axis], reading.specific_force
+    force = STANDARD_GRAVITY if force is None else force
+    accelerations, rates = [0.0] * 3, [0.0] * 3
+    axis = 'xyz'.index(settings.axis)
+    accelerations[axis], rates[axis] = -turned * force / _FORCE, turned * reading.value
     return b'#YPRAG=0.00,0.00,0.00,%.2f,%.2f,%.2f,%.2f,%.2f,%.2f\r\n' % (*accelerations, *rates)
 
 
@@ -52,6 +65,7 @@ RAZOR = Protocol(
     splitter=partial(LineSplitter, 256, (b'#',)),
     parser=stateless(_parse),
     writer=stateless(_write),
-    full_scale=40.0,  # a hair above the 16 bits of an ITG-3200, 0.06957 deg/s each, which is the widest range of the gyros in use
+    # just above the 16 bits of an ITG-3200, 0.06957 deg/s each, the widest range of these gyros
+    full_scale=40.0,
     startup=b'#ox#o1',
 )

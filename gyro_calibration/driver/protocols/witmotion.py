@@ -1,12 +1,14 @@
 """
-WitMotion modules (WT901 and its kin): binary frames of 11 bytes, ``55 type`` and four signed 16-bit numbers, low byte first, and a sum.
+WitMotion modules (WT901 and similar): frames of 11 bytes, ``55 type``, four numbers and a sum.
 
-Frames 52 hold the rates about x, y and z, 2000 deg/s at 32768, and the temperature in hundredths of a degC. Frames 51, which come directly
-before, hold the accelerations, 16 g at 32768. Others (time, angle, field and more) are passed over. The sum is the low byte of the sum of
-the ten bytes before.
+The numbers are signed, with 16 bits, low byte first. Frames 52 hold the rates about x, y and z,
+2000 deg/s at 32768, and the temperature in hundredths of a degC. Frames 51, which come directly
+before, hold the accelerations, 16 g at 32768. Others (time, angle, field and more) are skipped.
+The sum is the low byte of the sum of the ten bytes before.
 
-Source: WT901 data sheet v20-0702, sections 5.1.2 and 5.1.3. Older modules (BWT61CL data sheet v20-0630) have the temperature as
-count/340 + 36.53 degC, which is not told apart here; whether a module that lies flat says +1 g was not verified.
+Source: WT901 data sheet v20-0702, sections 5.1.2 and 5.1.3. Older modules (BWT61CL data sheet
+v20-0630) have the temperature as count/340 + 36.53 degC, which is not distinguished here; whether
+a module that lies flat reports +1 g was not verified.
 
 """
 
@@ -17,13 +19,20 @@ import struct
 from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
-from gyro_calibration.driver.protocols.protocol import STANDARD_GRAVITY, Protocol, Reading, Settings, Written, stateless
+from gyro_calibration.driver.protocols.protocol import (
+    STANDARD_GRAVITY,
+    Protocol,
+    Reading,
+    Settings,
+    Written,
+    stateless,
+)
 
 _COUNT = math.radians(2000.0) / 0x8000
 _FORCE = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count
 _ACCELERATION, _RATE = 0x51, 0x52
 _NUMBERS = struct.Struct('<2x4h')
-_ROOM_TEMPERATURE = 25.0  # degC; what an emulated module says where none is given
+_ROOM_TEMPERATURE = 25.0  # degC; default of an emulated module
 
 
 def _is_intact(frame: bytes) -> bool:
@@ -48,16 +57,18 @@ class _Parser:
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    temperature = 100.0 * (_ROOM_TEMPERATURE if reading.temperature is None else reading.temperature)
-    rate = _frame(_RATE, reading.value, temperature, settings.axis)
+    degrees = _ROOM_TEMPERATURE if reading.temperature is None else reading.temperature
+    rate = _frame(_RATE, reading.value, 100.0 * degrees, settings.axis)
     if reading.specific_force is None:
         return rate
-    return _frame(_ACCELERATION, reading.specific_force / _FORCE, temperature, settings.axis) + rate
+    force = reading.specific_force / _FORCE
+    return _frame(_ACCELERATION, force, 100.0 * degrees, settings.axis) + rate
 
 
 def _frame(kind: int, value: float, temperature: float, axis: str) -> bytes:
     numbers = [value if each == axis else 0.0 for each in 'xyz'] + [temperature]
-    frame = bytes([0x55, kind]) + struct.pack('<4h', *(min(max(round(number), -0x8000), 0x7FFF) for number in numbers))
+    counts = [min(max(round(number), -0x8000), 0x7FFF) for number in numbers]
+    frame = bytes([0x55, kind]) + struct.pack('<4h', *counts)
     return frame + bytes([sum(frame) & 0xFF])
 
 
