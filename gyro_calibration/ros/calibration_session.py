@@ -1,5 +1,5 @@
 """
-Calibrations on a robot, without rclpy: what a run collects, who may drive meanwhile, what it gives.
+Calibrations on a robot, without rclpy: what a run collects, who drives, and what it gives.
 
 Samples, odometry and commands go in with the time of the steady clock; commands come out through
 `send`. Every guard of a drive looks at the steady clock, whatever ROS time does. A run ends with
@@ -23,7 +23,14 @@ import numpy as np
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import DEGREE, Array, DataRefused
 from gyro_calibration.model import SelfCalibration
-from gyro_calibration.motion import CALIBRATION, Motion, MotionError, from_headings, from_rates, read_motion
+from gyro_calibration.motion import (
+    CALIBRATION,
+    Motion,
+    MotionError,
+    from_headings,
+    from_rates,
+    read_motion,
+)
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros.clock import Clock
 from gyro_calibration.ros.health_monitor import HealthMonitor, changed
@@ -241,8 +248,9 @@ class Drive:
             np.linspace(0.0, self._motion.duration, 1000))).max())
         if max(self.command_lateness, self.sample_lateness) * fastest <= limits.residual:
             return ''
-        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s late '
-                f'and samples up to {self.sample_lateness:.2f} s; give it less to do and run again')
+        return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s '
+                f'late and samples up to {self.sample_lateness:.2f} s; give it less to do and '
+                'run again')
 
 
 STANDING_TIME = ('ROS time stands still: start or resume the simulation that publishes /clock, or '

@@ -171,8 +171,8 @@ class CompensationNode(Node):
         imu.header.stamp.sec, imu.header.stamp.nanosec = sec, nanosec
         imu.angular_velocity.z = found.rate
         xx, xy, _, yx, yy, *_ = imu.angular_velocity_covariance.tolist()
-        x, y, acceleration = imu.angular_velocity.x, imu.angular_velocity.y, imu.linear_acceleration
-        if not math.isfinite(x + y + xx + xy + yx + yy):
+        acceleration = imu.linear_acceleration
+        if not math.isfinite(imu.angular_velocity.x + imu.angular_velocity.y + xx + xy + yx + yy):
             imu.angular_velocity.x = imu.angular_velocity.y = xy = yx = 0.0
             xx = yy = UNMEASURED_VARIANCE
         elif not (xx or yy):  # all zeros: not known

@@ -47,24 +47,26 @@ class CompensationReport:
     def _judge(self, growing: set[str]) -> tuple[bytes, str]:
         pipeline = self._pipeline
         silent = self._clock.steady() - pipeline.journal.received
-        if error := pipeline.store.problem or pipeline.conflict:
+        if error := pipeline.store.problem or pipeline.conflict or pipeline.several:
             return ERROR, error
         if pipeline.ros_time.standing > max(BLIND, 1.0):
             return ERROR, STANDING_TIME
         if silent > 1.0 and 'repeated_stamps' in growing:
             return ERROR, pipeline.journal.event
         if silent > 1.0:
-            why = pipeline.journal.event if 'refused_samples' in growing else 'is the driver running?'
+            refused = 'refused_samples' in growing
+            why = pipeline.journal.event if refused else 'is the driver running?'
             return ERROR, f'no samples on imu/data_raw for {silent:.0f} s: {why}'
         if 'rebuilt' in growing:
             return ERROR, pipeline.journal.event
-        warnings = [*self._counted(growing), *_temperature(pipeline.estimator), *(
-            f'the model needs the {channel.replace("_", " ")}, which no message brings; that '
-            'effect is left out'
-            for channel in pipeline.estimator.missing(pipeline.journal.channels)), *(text for text in (
-                pipeline.session.warning, pipeline.store.hint, pipeline.store.shared_hint,
-                pipeline.monitor.bias_alarm, pipeline.monitor.noise_alarm,
-                pipeline.estimator.sentence, pipeline.store.table_hint) if text)]
+        estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
+        missing = [f'the model needs the {channel.replace("_", " ")}, which no message brings; '
+                   'that effect is left out'
+                   for channel in estimator.missing(pipeline.journal.channels)]
+        others = (pipeline.session.warning, store.hint, store.shared_hint, monitor.bias_alarm,
+                  monitor.noise_alarm, estimator.sentence, store.table_hint)
+        warnings = [*self._counted(growing), *_temperature(estimator), *missing,
+                    *filter(None, others)]
         if warnings:
             return WARN, warnings[0]
         tracked = pipeline.estimator.tracker.slowest_noticed > 0.0

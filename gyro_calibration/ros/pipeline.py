@@ -153,6 +153,7 @@ class Pipeline:
     values : the parameters of the node
     store, estimator, monitor, wheels, session, journal, ros_time : its parts
     conflict : why the samples cannot be used, in a sentence; ''
+    several : the same for publishers that are there, of which perhaps one alone sends; ''
 
     """
 
@@ -189,7 +190,7 @@ class Pipeline:
         self._delay = round(NSEC_PER_SEC * store.model.true_time(0.0))
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
-        self._several, self._switches = '', 0
+        self.several, self._switches = '', 0
         self._good = 0.0, 0.0, 0.0
         self._recent: deque[tuple[float, float]] = deque()
 
@@ -278,7 +279,7 @@ class Pipeline:
         counts['samples'] += 1
         if stamp < self._newest:
             self._see_jump(now)
-        if self._several:
+        if self.several:
             self._look_for_switch(stamp)
         self._newest = stamp
         if self.conflict:
@@ -376,13 +377,13 @@ class Pipeline:
 
     def publishers(self, names: Sequence[str]) -> None:
         """Take the nodes that publish the samples, a few times a second."""
-        self._several = '' if len(names) < 2 else (
+        self.several = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), whose '
             'samples cannot be told apart: give each gyro a topic of its own')
-        if not self._several:
+        if not self.several:
             self._switches = 0
         if self._switches > 1:
-            self._refuse_all(self._several)
+            self._refuse_all(self.several)
         elif not self._jumps or self._clock.steady() - self._jumps[-1] > _INTERLEAVED:
             self.conflict = ''
         if not self.conflict and not self._switches:
@@ -401,15 +402,15 @@ class Pipeline:
         if not 2.0 * (stamp - self._newest) > NSEC_PER_SEC * self.estimator.tracker.intervals.usual:
             self._switches += 1
         if self._switches > 1:
-            self._refuse_all(self._several)
+            self._refuse_all(self.several)
 
     def obstacle(self) -> str:
         """Return why the robot must not be driven now; '' where nothing stands against it."""
         now = self._clock.steady()
         if self.ros_time.look(self._clock) > BLIND:
             return STANDING_TIME
-        if self.conflict:
-            return self.conflict
+        if conflict := self.conflict or self.several:
+            return conflict
         if not self._recent or now - self.journal.received > 1.0:
             return 'no sample comes on imu/data_raw: look at the gyro and its driver'
         if self.wheels.moving(now):
@@ -436,7 +437,9 @@ class Pipeline:
     def watch(self, receivers: int) -> None:
         """Look whether time and samples go on; to be called several times a second."""
         standing = self.ros_time.look(self._clock) > BLIND
-        self.session.watch(self.values, receivers, standing, self.conflict)
+        # A robot is not driven by samples that may be those of another gyro in a moment.
+        conflict = self.conflict or (self.several if self.session.drives else '')
+        self.session.watch(self.values, receivers, standing, conflict)
 
     def learn(self, ending: bool = False) -> None:
         """Let the bias table learn from rests; to be called once a second, and at the end."""
