@@ -142,9 +142,10 @@ class Stage:
         texts = {name: str(value).lower() if isinstance(value, bool) else value
                  for name, value in given.items()}
         command += [word for name, text in texts.items() for word in ('-p', f'{name}:={text}')]
-        log = self._closing.enter_context((self._folder / 'node.txt').open('wb'))  # noqa: SIM115
-        self.process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, cwd=self._tree,
-                                        env={**os.environ, 'PYTHONPATH': str(self._tree)})
+        with open(self._folder / 'node.txt', 'wb') as log:
+            self.process = subprocess.Popen(
+                command, stdout=log, stderr=log, start_new_session=True, cwd=self._tree,
+                env={**os.environ, 'PYTHONPATH': str(self._tree)})
         self._closing.callback(end, self.process)
         self.wait(lambda: len(self._heard) > 200, 30.0, 'imu/data')
 
