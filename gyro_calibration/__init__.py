@@ -13,8 +13,9 @@ Reading order: `log`, `messages`, `storage`, `recording`, `stamps`, `effects`, `
 `noise_grid`, `model`, `settings_file`, `model_file`, `motion`, `simulation`, `compensation`,
 `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`, `assumptions`, `heading_estimator`,
 `log_compensation`, `likelihood`, `doubt`, `mishap`, `self_calibration`, `whole_turns`, `plan`;
-then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`, `selection`, `encoder`,
-`turn`, `diagnosis`, `reproduction`; then the folders `driver`, on the robot `ros`, and `cli`.
+then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`, `selection`,
+`course_over_ground`, `encoder`, `turn`, `diagnosis`, `reproduction`; then the folders `driver`, on
+the robot `ros`, and `cli`.
 
 """
 

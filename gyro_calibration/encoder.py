@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.fft import dct
 
+from gyro_calibration.course_over_ground import fit_course, is_course
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
@@ -104,17 +105,19 @@ class EncoderCalibration:
     remarks: tuple[str, ...]
 
 
-def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None = None,
-                      limits: Limits | None = None) -> EncoderCalibration:
+def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None = None,
+                      limits: Limits | None = None, technology: str = 'mems') -> EncoderCalibration:
     """
     Find scale factor error and bias from a log with a reference heading.
 
     Parameters
     ----------
     log : with time, output and reference heading; samples without a number count as lost
-    method : 'likelihood', or 'rate' for the regression of the encoder's rate on the gyro
+    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the encoder's rate on the gyro; None for
+        'course' where the reference is one, else 'likelihood'
     noise : of the gyro, if it is known; goes into the model
     limits : what is believed
+    technology : of the gyro, one of `course_over_ground.PRIORS`; decides with 'course' what a drive leaves open
 
     Raises
     ------
@@ -123,6 +126,9 @@ def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None 
     """
     limits = limits or Limits(time_offset=LARGEST_TIME_OFFSET)
     time, output, motion = _pair(log)
+    method = method or ('course' if is_course(time, output, motion) else 'likelihood')
+    if method == 'course':
+        return _on_course(log, time, output, motion, noise, technology)
     _refuse_motion(motion, limits)
     refuse_dead(output)
     fit = METHODS[method](time, output, motion, limits)
@@ -134,6 +140,20 @@ def calibrate_encoder(log: Log, method: str = 'likelihood', noise: Noise | None 
     _refuse_uncertain(fit, limits)
     model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
     return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit, method))
+
+
+def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Noise | None, technology: str) -> EncoderCalibration:
+    """Calibrate against a course over ground."""
+    _refuse_length(motion)
+    refuse_dead(output)
+    fit = fit_course(time, output, motion, technology)
+    compensated = (output - fit.bias) / (1.0 + fit.scale_factor_error)
+    before, after = (_residual(time - fit.time_offset, rate, motion) for rate in (output, compensated))
+    drift = _drift(motion.time, after.heading, noise or Noise())
+    model = _model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
+    remark = (f'what the drive leaves open of scale factor error and bias is drawn towards zero, as of a gyro of the technology '
+              f'{technology} (--technology); the intervals hold that')
+    return EncoderCalibration(model, 'course', fit, drift, motion.time, before, after, _lost(time), (remark,))
 
 
 #: Gyro and encoder on one host are no further apart, s; a swing may look alike half a period later.
@@ -156,11 +176,15 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
     return log.time[heard] - start, log.output[heard], from_headings(log.time[seen], log.reference_heading[seen])
 
 
-def _refuse_motion(motion: Motion, limits: Limits) -> None:
+def _refuse_length(motion: Motion) -> None:
     if motion.duration < 10.0:
         raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: record longer')
     if motion.duration > LONGEST:
         raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; see whether time_s is in s, or give --rate')
+
+
+def _refuse_motion(motion: Motion, limits: Limits) -> None:
+    _refuse_length(motion)
     points = np.arange(0.0, motion.duration, 0.5)
     spread = float(np.std(np.diff(motion.heading_at(points)) / 0.5))
     if spread < limits.rate_spread:

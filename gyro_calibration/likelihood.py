@@ -247,7 +247,7 @@ def _points(motion: Motion, block: float) -> _Points:
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _Points(time, motion.heading_at(time), np.ones(len(time)), np.empty((len(time), 0)))
-    step = _encoder_step(motion.heading)
+    step = encoder_step(motion.heading)
     if not step:
         return _Points(motion.time, motion.heading, np.ones(len(motion.time)), np.empty((len(motion.time), 0)))
     crossings, stands = _crossings(motion, step), _stands(motion, step, block)
@@ -334,7 +334,7 @@ def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
     return residual
 
 
-def _encoder_step(heading: Array) -> float:
+def encoder_step(heading: Array) -> float:
     """Return the step of an encoder's heading, rad, or 0 where the heading is no multiple of one."""
     steps = np.abs(np.diff(heading))
     moved = steps[steps > 1e-9]

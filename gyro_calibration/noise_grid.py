@@ -112,6 +112,27 @@ class SharedNoise:
 
 
 @dataclass(frozen=True)
+class PriorSize:
+    """
+    A value whose normal prior has a standard deviation of unknown size.
+
+    What the data show weakly is then drawn towards the mean of its prior, and what they show
+    clearly is not.
+
+    Attributes
+    ----------
+    name : of the size
+    value : number of the value
+    range : smallest and largest standard deviation, in the unit of the value
+
+    """
+
+    name: str
+    value: int
+    range: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class GridFit:
     """
     What a regression found, averaged over the sizes of the noise.
@@ -287,6 +308,12 @@ class _Regression:
     precision: Array
     banded: Sequence[BandedNoise]
     shared: Sequence[SharedNoise]
+    priors: Sequence[PriorSize]
+
+    @property
+    def parts(self) -> list[BandedNoise | SharedNoise | PriorSize]:
+        """Return all that has a size."""
+        return [*self.banded, *self.shared, *self.priors]
 
     def noise(self, sizes: Iterable[float]) -> Tridiagonal:
         """Return the covariance of the banded noise."""
@@ -300,9 +327,13 @@ class _Regression:
     def precisions(self, sizes: Array) -> Array:
         """Return prior precisions, shape (k, m + q), for sizes of shape (k, parts)."""
         fixed = np.tile(self.precision, (len(sizes), 1))
+        for prior, size in zip(self.priors, sizes[:, len(self.shared) :].T):
+            fixed[:, prior.value] = 1.0 / size**2
         if not self.shared:
             return fixed
-        variance = sizes**2 @ np.array([part.variance for part in self.shared])
+        variance = sizes[:, : len(self.shared)] ** 2 @ np.array(
+            [part.variance for part in self.shared]
+        )
         return np.concatenate([fixed, 1.0 / np.maximum(variance, 1e-300)], axis=1)
 
     def solved(self, noise: Tridiagonal, precisions: Array) -> tuple[Array, Array, Array]:
@@ -346,6 +377,7 @@ def noise_grid(
     prior_deviation: Array | None = None,
     noisy_column: int | None = None,
     wandering: int | None = None,
+    prior_sizes: Sequence[PriorSize] = (),
 ) -> GridFit:
     """
     Estimate values by a likelihood over a grid of the sizes of the noise.
@@ -362,6 +394,7 @@ def noise_grid(
         the parts 'reference' and 'motion'. Its estimate would be too small by the share of the
         noise in it; it is estimated with the column smoothed by what is observed as the instrument
         (errors in variables). None where no column is noisy
+    prior_sizes : values with a prior of unknown size
     wandering : number of the value whose variance holds what the shared noise has `unseen`; None
         where there is none
 
@@ -378,11 +411,10 @@ def noise_grid(
     mean = np.zeros(count) if prior_mean is None else prior_mean
     precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
     together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
-    regression = _Regression(observed - columns @ mean, together, count, precision, banded, shared)
-    axes = [
-        _axis(limits)
-        for limits in [part.range for part in banded] + [part.range for part in shared]
-    ]
+    regression = _Regression(
+        observed - columns @ mean, together, count, precision, banded, shared, prior_sizes
+    )
+    axes = [_axis(part.range) for part in regression.parts]
     for remaining in reversed(range(PASSES)):
         grid = _on_grid(regression, axes)
         weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
@@ -392,7 +424,8 @@ def noise_grid(
                 _refined(axis, grid.sizes[:, place], weights) for place, axis in enumerate(axes)
             ]
     if wandering is not None:
-        grid.covariance[:, wandering, wandering] += grid.sizes[:, len(banded) :] ** 2 @ np.array(
+        of_shared = grid.sizes[:, len(banded) : len(banded) + len(shared)]
+        grid.covariance[:, wandering, wandering] += of_shared**2 @ np.array(
             [part.unseen for part in shared]
         )
     return _averaged(regression, grid, weights, mean, noisy_column)
@@ -400,8 +433,7 @@ def noise_grid(
 
 @dataclass(frozen=True)
 class _Grid:
-    """Sizes, shape (k, parts), log likelihoods, (k,), values, (k, m), and their covariances, (k,
-    m, m)."""
+    """Sizes, shape (k, parts), log likelihoods, values, shape (k, m), and their covariances."""
 
     sizes: Array
     log_likelihood: Array
@@ -457,7 +489,7 @@ def _averaged(
     noise = regression.noise(grid.sizes[best, :banded])
     precisions = regression.precisions(grid.sizes[best : best + 1, banded:])
     _, (all_values,), (inverse,) = regression.solved(noise, precisions)
-    names = [part.name for part in regression.banded] + [part.name for part in regression.shared]
+    names = [part.name for part in regression.parts]
     likely = dict(zip(names, grid.sizes[best].tolist()))
     if noisy_column is not None:
         corrected = _errors_in_variables(

@@ -37,7 +37,7 @@ from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import write_model
 from gyro_calibration.selection import TECHNOLOGIES, Selection, select_effects
 
-METHODS = ('dwells', 'likelihood', 'rate')
+METHODS = ('dwells', 'likelihood', 'course', 'rate')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -46,13 +46,15 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; likelihood: the reference heading itself; '
+                        'course: a course over ground, as of satellites; '
                         'rate: the rate of the reference heading, sample by sample. Default: what the log holds')
     what = parser.add_mutually_exclusive_group()
     what.add_argument('--effects', type=_effects, metavar='NAME,...', help=f'fit these of {", ".join(STEADY)}; default: those that '
                       'the data support')
     what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders instead; default: 3,2')
-    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; decides where effects look alike')
+    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; decides where effects look alike, and what is '
+                        'likely where a course over ground leaves it open (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT', help='of the gyro, kept in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='of the gyro, kept in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the matrix C of Ojeda et al., in deg/s and degC')
@@ -92,12 +94,12 @@ def _read(given: argparse.Namespace) -> tuple[str, Log]:
 
 
 def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
-    """Return the method that was asked for, or the one for what the logs hold."""
+    """Return the method that was asked for, or the one for what the logs hold; '' lets the reference heading decide."""
     if given.method:
         return str(given.method)
     chosen = {effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'} or given.polynomial
     heading_alone = all(log.time is not None and log.reference_rate is None and log.reference_heading is not None for log in logs.values())
-    return 'likelihood' if heading_alone and not chosen else 'dwells'
+    return '' if heading_alone and not chosen else 'dwells'
 
 
 def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
@@ -145,7 +147,7 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         raise UsageError('a reference heading gives bias and scale_factor_error; for other effects, --matrix and --surface use '
                          '--method dwells')
     (path, log), = logs.items()
-    found = calibrate_encoder(log, 'rate' if given.method == 'rate' else 'likelihood')
+    found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)
     if given.picture:
         picture.draw_headings(given.picture, *_headings(log, found))

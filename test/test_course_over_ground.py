@@ -1,0 +1,91 @@
+"""Calibration against a course over ground: late, smoothed, lost, and at times far off."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gyro_calibration.encoder import calibrate_encoder
+from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
+
+DATA = Path(os.environ.get('GYRO_CALIBRATION_DATA', '')) / 'wheeled_drives'
+SCALE, BIAS = 1.01, 0.4 * DEGREE
+
+
+def drive(seed, late=0.5, turning=30.0, follows=1.0, burst=0.0):
+    """Return 3 min at 50 Hz of turns at random, with a course that is late and lost for 20 s."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(9000) / 50.0
+    knots = np.arange(0.0, 185.0, 3.0)
+    rate = np.interp(time, knots, generator.standard_normal(len(knots)) * turning * DEGREE)
+    heading = np.cumsum(rate) / 50.0
+    noise = np.interp(time, np.arange(0.0, 181.0, 1.0), generator.standard_normal(181)) * DEGREE
+    noise += burst * DEGREE * np.sin(time) * ((time > 120.0) & (time < 130.0))
+    course = np.interp(time - late, time, heading) + noise
+    course[(time > 60.0) & (time < 80.0)] = math.nan
+    output = follows * SCALE * rate + BIAS + 0.05 * DEGREE * generator.standard_normal(9000)
+    return Log(time=time, output=output, reference_heading=course)
+
+
+@pytest.mark.parametrize('late', [-0.7, 0.0, 0.75])
+def test_scale_bias_and_delay_are_found(late):
+    found = calibrate_encoder(drive(1, late))
+    deviations = np.sqrt(np.diag(found.fit.covariance))
+    assert found.method == 'course'
+    assert found.fit.time_offset == pytest.approx(-late, abs=0.05)
+    assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=3.0 * deviations[0])
+    assert found.fit.bias == pytest.approx(BIAS, abs=3.0 * deviations[1])
+    assert deviations[0] < 0.01 and deviations[1] < 0.03 * DEGREE
+
+
+def test_a_burst_of_bad_fixes_does_not_move_the_bias():
+    clean, bad = (calibrate_encoder(drive(2, burst=size)).fit for size in (0.0, 30.0))
+    assert abs(clean.bias - bad.bias) < 2.0 * math.sqrt(clean.covariance[1, 1])
+
+
+def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
+    consumer, fibre = (
+        calibrate_encoder(drive(3, turning=0.0), technology=name).fit
+        for name in ('mems', 'closed_loop_fog')
+    )
+    for fit, largest in ((consumer, 0.02), (fibre, 0.001)):
+        assert abs(fit.scale_factor_error) < 0.5 * largest
+        assert math.sqrt(fit.covariance[0, 0]) < 1.1 * largest
+    assert consumer.covariance[0, 0] > 10.0 * fibre.covariance[0, 0]
+
+
+@pytest.mark.parametrize(
+    'follows', [0.0, -1.0, math.pi / 180.0], ids=['alive at rest', 'upside down', 'in rad/s']
+)
+def test_a_gyro_that_does_not_follow_is_refused(follows):
+    with pytest.raises(DataRefused, match='does not follow'):
+        calibrate_encoder(drive(4, follows=follows))
+
+
+def test_another_drives_gyro_is_refused():
+    log, other = drive(5), drive(6)
+    with pytest.raises(DataRefused, match='does not follow'):
+        calibrate_encoder(
+            Log(time=log.time, output=other.output, reference_heading=log.reference_heading)
+        )
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason='GYRO_CALIBRATION_DATA has no wheeled_drives')
+@pytest.mark.parametrize('name', ['wid_03', 'wid_07', 'rc_car_j_unit3'])
+def test_recorded_drives_are_answered(name):
+    fit = calibrate_encoder(read_log(DATA / f'{name}.csv.gz')).fit
+    bias = {'wid_03': 0.0, 'wid_07': 0.0, 'rc_car_j_unit3': -0.20 * DEGREE}[name]
+    assert fit.bias == pytest.approx(bias, abs=0.03 * DEGREE)
+    assert abs(fit.scale_factor_error) < 0.02
+
+
+@pytest.mark.evidence
+def test_intervals_hold_the_truth():
+    held = []
+    for seed in range(60):
+        fit = calibrate_encoder(drive(seed)).fit
+        off = np.array([fit.scale_factor_error - (SCALE - 1.0), fit.bias - BIAS])
+        held.append(np.abs(off) < 1.96 * np.sqrt(np.diag(fit.covariance)))
+    assert (np.mean(held, axis=0) > 0.85).all()
