@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.fft import dct
 
-from gyro_calibration.course_over_ground import fit_course, is_course
+from gyro_calibration.course_over_ground import PRIORS, fit_course, is_course
+from gyro_calibration.doubt import DRIVE
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
@@ -133,11 +134,11 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     refuse_dead(output)
     fit = METHODS[method](time, output, motion, limits)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
-    compensated = (output - fit.bias) / (1.0 + fit.scale_factor_error)
-    before, after = (_residual(time - np.nan_to_num(fit.time_offset), rate, motion) for rate in (output, compensated))
-    drift = _drift(motion.time, after.heading, noise or Noise())
-    fit = replace(fit, covariance=_covariance(fit, drift))
+    drift = _drift(motion.time, _after(time, output, motion, fit).heading, noise or Noise())
+    _refuse_useless(fit.bias, drift.mean, limits.heading)
+    fit = _drawn(replace(fit, covariance=_covariance(fit, drift)), drift.mean, technology)
     _refuse_uncertain(fit, limits)
+    before, after = _residual(time - np.nan_to_num(fit.time_offset), output, motion), _after(time, output, motion, fit)
     model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
     return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit, method))
 
@@ -147,8 +148,7 @@ def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Nois
     _refuse_length(motion)
     refuse_dead(output)
     fit = fit_course(time, output, motion, technology)
-    compensated = (output - fit.bias) / (1.0 + fit.scale_factor_error)
-    before, after = (_residual(time - fit.time_offset, rate, motion) for rate in (output, compensated))
+    before, after = _residual(time - fit.time_offset, output, motion), _after(time, output, motion, fit)
     drift = _drift(motion.time, after.heading, noise or Noise())
     model = _model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
     remark = (f'what the drive leaves open of scale factor error and bias is drawn towards zero, as of a gyro of the technology '
@@ -198,6 +198,13 @@ def _refuse_uncertain(fit: Fit, limits: Limits) -> None:
     if deviation > limits.scale_standard_deviation:
         raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
                           f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often')
+
+
+def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
+    """Refuse a log that shows no bias beyond chance, and could only make a heading worse, by more than a limit, rad, in `DRIVE` s."""
+    if deviation * DRIVE > limit and bias ** 2 < 2.0 * deviation ** 2:
+        raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- {deviation / DEGREE:.3f} deg/s, which says nothing: without it '
+                          'a heading is as good. Turn more slowly, with rests, or for longer')
 
 
 def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -> Fit:
@@ -294,6 +301,34 @@ def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
     return shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(), odds
 
 
+def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
+    """
+    Return the fit with a bias that is drawn towards zero as far as the log leaves it open.
+
+    The prior is normal about zero with a standard deviation that is not known, of any size up to that of the technology. A bias of many
+    standard deviations stays; one that the log hardly shows would only harm a heading. What the bias wanders by is not what the log
+    leaves open of its mean: it draws nothing, and stays in the covariance.
+
+    Parameters
+    ----------
+    fit : with its covariance
+    deviation : of the mean bias over the log, rad/s
+    technology : of the gyro, one of `PRIORS`
+
+    """
+    variance, largest = deviation ** 2, max(PRIORS[technology][1], 3.0 * abs(fit.bias))
+    sizes = (np.geomspace(0.01, 1.0, 40) * largest) ** 2
+    logarithms = 0.5 * np.log(sizes) - 0.5 * (np.log(sizes + variance) + fit.bias ** 2 / (sizes + variance))
+    weights = np.exp(logarithms - logarithms.max())
+    weights /= weights.sum()
+    kept = sizes / (sizes + variance)
+    share = float(weights @ kept)
+    left = share * variance + fit.bias ** 2 * float(weights @ (kept - share) ** 2)
+    gain = fit.covariance[:, 1] / fit.covariance[1, 1]
+    s, b = (fit.scale_factor_error, fit.bias) + gain * (share - 1.0) * fit.bias
+    return replace(fit, scale_factor_error=float(s), bias=float(b), covariance=fit.covariance + (left - variance) * np.outer(gain, gain))
+
+
 def _covariance(fit: Fit, drift: Drift) -> Array:
     """
     Return the covariance of (s, b) by the scatter between pieces of the log, with the drift's variance of the bias.
@@ -318,6 +353,11 @@ def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> 
         return model
     return replace(model, temperature_range=(float(temperature.min()), float(temperature.max())),
                    reference_temperature=float(temperature.mean()))
+
+
+def _after(time: Array, output: Array, motion: Motion, fit: Fit) -> Residual:
+    """Return the residual of what a fit makes of the output."""
+    return _residual(time - np.nan_to_num(fit.time_offset), (output - fit.bias) / (1.0 + fit.scale_factor_error), motion)
 
 
 def _residual(time: Array, rate: Array, motion: Motion) -> Residual:
