@@ -349,16 +349,18 @@ def test_a_base_with_a_time_out_stops_by_itself_where_the_node_is_killed(tmp_pat
 
 def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
-    watch, held = rig.pipeline.watch, []
+    sample, watch, waiting = rig.sample, rig.pipeline.watch, []
 
-    def late(receivers):
-        """Hold the timers up for 0.2 s, 30 times, while samples come."""
-        slot = int(rig.clock.now / 0.2)
-        if slot % 3 and len(held) < 2000:
-            held.append(slot)
-            return
-        watch(receivers)
-    rig.pipeline.watch = late
+    def is_busy():
+        """Hold this process up for 0.2 s of each 0.8 s; what came meanwhile comes then."""
+        return rig.clock.now % 0.8 < 0.2
+
+    def late_sample(*reading):
+        waiting.append(reading)
+        while waiting and not is_busy():
+            sample(*waiting.pop(0))
+
+    rig.sample, rig.pipeline.watch = late_sample, lambda count: is_busy() or watch(count)
     success, message = rig.calibrate()
     assert not success and 'this computer was busy: commands were up to 0.' in message
     assert '(the run shows: ' in message

@@ -198,14 +198,13 @@ class Drive:
         assert run.motion is not None
         self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
         self._begun, self._simulated = clock.steady(), clock.simulated()
-        self._heard, self._suspected, self._due = False, False, math.inf
+        self._heard, self._suspected, self._due = False, False, -math.inf
         self._earliest = math.inf
         self.command_lateness = self.sample_lateness = 0.0
 
     def see_sample(self, time: float) -> None:
         """Measure how much later than the earliest one a sample came."""
-        self._simulated = self._clock.simulated()
-        now = self._clock.steady() if self._simulated is None else self._simulated
+        self._simulated, now = self._clock.simulated(), self._now()
         self._earliest = min(self._earliest, now - time)
         self.sample_lateness = max(self.sample_lateness, now - time - self._earliest)
 
@@ -214,30 +213,41 @@ class Drive:
         self._heard = self._heard or receivers > 0
         return not self._heard
 
-    def command(self, receivers: int, ros_time_stands: bool) -> tuple[float, str]:
-        """Return the rate to command, rad/s, and why the run must end; '' where it goes on."""
+    def fault(self, receivers: int, ros_time_stands: bool) -> str:
+        """Return why the run must end; '' where it goes on."""
         now = self._clock.steady()
         if self.waits(receivers):
-            return 0.0, self._not_received if now - self._begun > DISCOVERY else ''
+            return self._not_received if now - self._begun > DISCOVERY else ''
         if not receivers:
-            return 0.0, self._not_received
+            return self._not_received
         if ros_time_stands:
-            return 0.0, STANDING_TIME
-        if self._due < math.inf:
-            self.command_lateness = max(self.command_lateness, now - self._due)
-        self._due = now + self.INTERVAL
-        silence = now - self._run.received
+            return STANDING_TIME
         # Decided at the second look: after a pause of this process the samples that wait in its
         # queue come after its timers.
-        suspected, self._suspected = self._suspected, silence > self._blind()
-        if self._suspected:
-            return 0.0, (f'no sample came for {silence:.2f} s while the robot was driven: look at '
-                         'the gyro and its driver') if suspected else ''
-        if not self._run.times:
-            return 0.0, ''
-        time, last = self._clock.simulated(), self._simulated
-        since = silence if time is None or last is None else max(time - last, 0.0)
-        return float(self._motion.rate_at(np.array(self._run.elapsed + since))), ''
+        silence = now - self._run.received
+        before, self._suspected = self._suspected, silence > self._blind()
+        return (f'no sample came for {silence:.2f} s while the robot was driven: look at the gyro '
+                'and its driver') if before and self._suspected else ''
+
+    def command(self) -> float | None:
+        """Return the rate to command now, rad/s; None where the last command is young enough."""
+        now = self._now()
+        if now < self._due - 0.5 * self.INTERVAL:
+            return None
+        if self._due > -math.inf:
+            self.command_lateness = max(self.command_lateness, now - self._due)
+        self._due = now + self.INTERVAL
+        if self._suspected or not self._run.times:
+            return 0.0
+        since = self._clock.steady() - self._run.received
+        if self._simulated is not None:
+            since = max(now - self._simulated, 0.0)
+        return float(self._motion.rate_at(np.array(self._run.elapsed + since)))
+
+    def _now(self) -> float:
+        """Return the time of the simulation, where there is one, else of the steady clock, s."""
+        simulated = self._clock.simulated()
+        return self._clock.steady() if simulated is None else simulated
 
     _not_received = ('no other node receives cmd_vel: start what moves the robot, remap cmd_vel '
                      'to its topic, or change cmd_vel_stamped')
@@ -364,6 +374,8 @@ class CalibrationSession:
                 None if estimator.temperature_is_lost else estimator.temperature)
         if (reason := run.over) is not None:
             self.end(reason)
+        elif self._drive:
+            self._command_if_due(self._drive)
 
     def add_odometry(self, time: float, heading: float, rate: float) -> None:
         """Take a heading, rad, and a rate, rad/s, of the odometry."""
@@ -413,17 +425,16 @@ class CalibrationSession:
         run = self.run
         if run is None or run.reason is not None:
             return
+        reason = conflict
         if self._drive:
-            rate, reason = self._drive.command(receivers, ros_time_stands)
+            reason = reason or self._drive.fault(receivers, ros_time_stands)
             if not values.calibration_drive:
                 reason = ('calibration.drive was set to false while the robot was driven: set it '
                           'to true and run again')
-            if reason or conflict:
-                self.end(conflict or reason)
-            else:
-                self._command(rate)
-        elif conflict:
-            self.end(conflict)
+        if reason:
+            self.end(reason)
+        elif self._drive:
+            self._command_if_due(self._drive)
         suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
             self.end(f'no sample came for {SILENCE:g} s: look at the gyro and its driver')
@@ -432,6 +443,11 @@ class CalibrationSession:
         """End a run over which integration began anew."""
         if self.run and self.run.times:
             self.end(f"{reason}: look at the gyro's line and run again")
+
+    def _command_if_due(self, drive: Drive) -> None:
+        """Send the next command, at a sample or at a look: a simulation may be a fast one."""
+        if (rate := drive.command()) is not None:
+            self._command(rate)
 
     def _command(self, rate: float) -> None:
         self._sent.append(rate)
