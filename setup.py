@@ -35,7 +35,7 @@ lint = ['ruff', 'mypy', 'pydocstyle', 'flake8', 'flake8-blind-except', 'flake8-b
         'flake8-import-order', 'flake8-quotes']
 build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-information']
 # launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings
-test = ['pytest<8.4', 'rosbags', *plot, *fuzz, *lint, *build]
+test = ['pytest<8.4', 'rosbags', 'mcap>=1.6', *plot, *fuzz, *lint, *build]
 
 # Executables belong into lib/<package>, where `ros2 run` and launch look; only the command line
 # has to be on the PATH. setup.cfg says so to colcon and to bloom. pip does not read that: it puts
@@ -58,9 +58,8 @@ setup(
     packages=find_packages(include=[name, f'{name}.*']),
     package_data={f'{name}.diagnosis': ['report.html']},
     python_requires='>=3.10,<3.15',
-    # mcap writes recordings, and brings lz4 and zstandard, which compressed ones are read by
-    install_requires=['numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm', 'mcap>=1.6'],
-    extras_require={'ros': ros, 'ros-kilted': wheels(*KILTED), 'plot': plot, 'test': test},
+    install_requires=['numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'],
+    extras_require={'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED), 'plot': plot, 'test': test},
     zip_safe=False,
     entry_points={
         'console_scripts': [

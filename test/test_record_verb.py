@@ -272,7 +272,7 @@ def _begin(log):
     return float(word.partition('time_s from ')[2].split()[0])
 
 
-@pytest.mark.parametrize(('name', 'limit'), [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 60_000)])
+@pytest.mark.parametrize(('name', 'limit'), [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 600_000)])
 def test_a_file_that_may_not_grow_stays_readable(record, tmp_path, name, limit):
     with gyro(tmp_path / 'gyro', 1000.0):
         code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=limit).end()
@@ -290,18 +290,23 @@ def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """Return a folder on a disk of its own, of 64 kB; skip where none may be mounted."""
+    """Return what gives a folder on a disk of its own; skip where none may be mounted."""
     folder = tmp_path / 'small'
     folder.mkdir()
-    mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs', folder], capture_output=True)
-    if mounted.returncode:
-        pytest.skip('this needs the right to mount a small disk')
-    yield folder
-    subprocess.run(['umount', '-l', folder], check=True)
+
+    def mount(kilobytes):
+        command = ['mount', '-t', 'tmpfs', '-o', f'size={kilobytes}k', 'tmpfs', folder]
+        if subprocess.run(command, capture_output=True).returncode:
+            pytest.skip('this needs the right to mount a small disk')
+        return folder
+
+    yield mount
+    subprocess.run(['umount', '-l', folder], capture_output=True)
 
 
-@pytest.mark.parametrize('name', ['a.csv', 'a.mcap'])
-def test_on_a_full_disk_what_was_recorded_stays(record, small_disk, tmp_path, name):
+@pytest.mark.parametrize('name, kilobytes', [('a.csv', 64), ('a.mcap', 600)])
+def test_on_a_full_disk_what_was_recorded_stays(record, small_disk, tmp_path, name, kilobytes):
+    small_disk = small_disk(kilobytes)
     with gyro(tmp_path / 'gyro', 1000.0):
         code, out, error = record(*words_for(tmp_path / 'gyro', small_disk / name)).end()
     log = read(small_disk / name)

@@ -1,7 +1,6 @@
 """What is recorded is in the file, whole piece by whole piece: rows of a log, chunks of MCAP."""
 
 import gzip
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -342,10 +341,3 @@ def test_pieces_of_a_packed_log_are_whole_by_themselves(tmp_path):
     data = Path(tmp_path / 'a.csv.gz').read_bytes()  # not closed yet
     assert gzip.decompress(data).count(b'\n') > 100
     recorder.close()
-
-
-def test_without_the_library_mcap_the_way_out_is_said(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'mcap.writer', None)
-    with pytest.raises(LogError, match=r'pip install mcap; or record into \.csv'):
-        McapRecorder(str(tmp_path / 'a.mcap'), notes)
-    assert not list(tmp_path.iterdir())

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration import __version__
+from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import MessageClock
 from gyro_calibration.gaps import Intervals
@@ -153,28 +154,17 @@ class McapRecorder:
 
     Raises
     ------
-    LogError : the library mcap is missing
     OSError : as `AtomicAppender`
 
     """
 
     def __init__(self, path: str, notes: Notes):
-        try:
-            from mcap.writer import Writer
-        except ImportError:
-            raise LogError('to write .mcap needs the Python package mcap: pip install mcap; or '
-                           'record into .csv') from None
-        self._stream = _Pending(AtomicAppender(path))
-        self._writer = Writer(self._stream, chunk_size=_LARGEST_CHUNK)  # type: ignore[arg-type]
-        self._writer.start(profile='ros2', library=f'gyro_calibration {__version__}')
-        self._notes = notes
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._file, self._writer, self._notes = AtomicAppender(path), McapWriter(), notes
 
     @property
     def size(self) -> int:
         """Bytes in the file."""
-        return self._stream.file.size
+        return self._file.size
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample of a port as messages on the topics of the driver; the stamp is in ns."""
@@ -195,57 +185,33 @@ class McapRecorder:
 
     def add_message(self, message: Message, definition: str) -> None:
         """Write a message with the definition of its kind, as text."""
-        if not self._channels:
-            self._writer.add_metadata(ABOUT, dict(self._notes()))
-        if message.kind not in self._schemas:
-            self._schemas[message.kind] = self._writer.register_schema(
-                message.kind, 'ros2msg', definition.encode())
-        if message.topic not in self._channels:
-            self._channels[message.topic] = self._writer.register_channel(
-                message.topic, 'cdr', self._schemas[message.kind])
-        self._writer.add_message(
-            self._channels[message.topic], message.received, message.data, message.received)
+        self._writer.add(message.topic, message.kind, definition, message.received, message.data)
+        if self._writer.pending > _LARGEST_CHUNK:
+            self.flush()
 
     def flush(self) -> None:
         """Write the piece that is due."""
-        if self._channels:
-            self._writer.flush()
+        if self._writer.pending:
+            head = b'' if self.size else self._writer.begin(
+                f'gyro_calibration {__version__}', ABOUT, self._notes())
+            self._file.append(head + self._writer.chunk())
 
     def close(self) -> None:
         """Write what is left and the closing part; after a full disk, without the index."""
         try:
-            if self._stream.file.is_full:
+            if self._file.is_full:
                 self._close_without_index()
-            elif self._channels:
-                self._writer.finish()
-                self._stream.flush()
+            else:
+                self.flush()
+                if self.size:
+                    self._file.append(self._writer.end())
         finally:
-            self._stream.file.close()
+            self._file.close()
 
     def _close_without_index(self) -> None:
         with suppress(DiskFull):  # no room for these bytes either: a reader finds it torn
             if self.size:
-                self._stream.file.append(MCAP_END)
-
-
-class _Pending:
-    """The file that the library writes to: its pieces wait here until they are whole."""
-
-    def __init__(self, file: AtomicAppender):
-        self.file, self._pieces, self._length = file, list[bytes](), 0
-
-    def write(self, data: bytes) -> None:
-        self._pieces.append(data)
-        self._length += len(data)
-
-    def tell(self) -> int:
-        return self.file.size + self._length
-
-    def flush(self) -> None:
-        data = b''.join(self._pieces)
-        self._pieces.clear()
-        self._length = 0
-        self.file.append(data)
+                self._file.append(MCAP_END)
 
 
 class CsvRecorder:

@@ -382,7 +382,8 @@ class CalibrationSession:
         if self.run:
             self.run.odometry.append((time, heading, rate))
         late = self._clock.steady() - self._stopped
-        if STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
+        alone = self._others < self._stopped
+        if alone and STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
                             'time-out of its base, and look at who else commands it')

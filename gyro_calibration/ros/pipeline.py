@@ -192,7 +192,7 @@ class Pipeline:
         self._newest, self._jumps = 0, deque[float](maxlen=2)
         self.several, self._switches = '', 0
         self._good = 0.0, 0.0, 0.0
-        self._recent: deque[tuple[float, float]] = deque()
+        self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
     # Time
 
@@ -343,6 +343,9 @@ class Pipeline:
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
             return None
+        if estimator.beginnings != self._beginnings:  # another calibration is in use
+            self._beginnings = estimator.beginnings
+            self._recent.clear()
         self._recent.append((time, estimator.corrected))
         while time - self._recent[0][0] > _LOOKED_BACK:
             self._recent.popleft()
