@@ -1,14 +1,16 @@
 """
-Allan deviation of a gyro at rest, and the noise figures in it: what IEEE Std 952, annex C, calls N, B, K, Q and R.
+Allan deviation of a gyro at rest, and its noise figures N, B, K, Q and R (IEEE Std 952, annex C).
 
-A gyro at rest says nothing but its bias and its noise. The Allan variance at the averaging time tau is half the mean square of the
-difference between neighbouring means over tau. It is taken here at every sample (overlapping), and its uncertainty is computed and not
-assumed: second differences of the angle are Gaussian, so that variances and covariances of their mean squares follow from theirs.
+The output of a gyro at rest is its bias and its noise. The Allan variance at the averaging time
+tau is half the mean square of the difference between neighbouring means over tau. It is taken here
+at every sample (overlapping). Its uncertainty is computed: second differences of the angle are
+Gaussian, and the variances and covariances of their mean squares follow from theirs.
 
 Reading order, each imports only from those before it: `angle` (of samples, some of them lost),
-`rest` (what is no gyro at rest), `record` (samples on an even grid); `parts` (of the noise), `covariance` (of Allan variances), `freedom`
-(degrees of it, and bounds), `chart` (the Allan deviation); `octaves` (those that are fitted), `description` (a combination of parts,
-fitted), `ranking` (of all combinations), `figures` (of the likeliest).
+`rest` (refuses what is no gyro at rest), `record` (samples on an even grid); `parts` (of the
+noise), `covariance` (of Allan variances), `freedom` (degrees of it, and bounds), `chart` (the
+Allan deviation); `octaves` (the Allan variances that are fitted), `description` (a combination of
+parts, fitted), `ranking` (of all combinations), `figures` (of the likeliest).
 
 """
 
@@ -17,5 +19,5 @@ from gyro_calibration.allan.figures import Figure, NoiseFit, fit_noise
 from gyro_calibration.allan.parts import PARTS, Part
 from gyro_calibration.allan.record import Record, even_record
 
-__all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record', 'allan_deviation', 'averaging_sizes', 'even_record',
-           'fit_noise']
+__all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',
+           'allan_deviation', 'averaging_sizes', 'even_record', 'fit_noise']

@@ -1,4 +1,4 @@
-"""The angle of rate samples, some of which are lost: nan stands in their place."""
+"""The angle of rate samples; lost samples are nan."""
 
 from __future__ import annotations
 
@@ -10,20 +10,26 @@ from gyro_calibration.stamps import Integers
 
 Truths = NDArray[np.bool_]
 
-#: Fewer samples than this show no noise figure.
+#: The least number of samples for a noise figure.
 FEWEST = 100
 
-#: Share of a window that may be lost samples: it changes the variance of the window's mean by as much at most.
+#: Largest share of lost samples in a window; the variance of its mean changes by at most as much.
 LOST_SHARE = 0.01
 
 
 def refuse_few(count: int, samples: str = 'samples') -> None:
     if count < FEWEST:
-        raise DataRefused(f'{count} {samples}; an Allan deviation wants at least {FEWEST}: record longer')
+        raise DataRefused(f'{count} {samples}; an Allan deviation wants at least {FEWEST}: '
+                          'record longer')
 
 
 def angle_of(rate: Array) -> Array:
-    """Return the angle before each sample and after the last, less the mean rate, in rate units times samples, shape (n + 1,)."""
+    """
+    Return the angle before each sample and after the last, less the mean rate, shape (n + 1,).
+
+    It is in rate units times samples.
+
+    """
     angle = np.empty(len(rate) + 1)
     angle[0] = 0.0
     np.cumsum(filled(rate), out=angle[1:])
@@ -31,7 +37,7 @@ def angle_of(rate: Array) -> Array:
 
 
 def filled(rate: Array) -> Array:
-    """Return the rate less its mean, with each gap filled by the mean of what is about it, five times as long on either side."""
+    """Return the rate less its mean; a gap gets the mean of five times its length on each side."""
     known = np.isfinite(rate)
     values = rate - rate[known].mean()
     if known.all():
@@ -53,11 +59,17 @@ def gaps(known: Truths) -> tuple[Integers, Integers]:
 
 
 def lost_before(rate: Array) -> Integers | None:
-    """Return how many samples are lost before each one, shape (n + 1,), or None if none is."""
+    """Return how many samples are lost before each one, shape (n + 1,), or None without losses."""
     lost = np.isnan(rate)
     return np.concatenate([[0], np.cumsum(lost)]) if lost.any() else None
 
 
 def whole(lost: Integers, size: int, begin: int, end: int, step: int = 1) -> Truths:
-    """Tell which second differences over `size` samples, from `begin` to `end`, miss few enough samples; `lost` as `lost_before` has it."""
-    return lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step] <= LOST_SHARE * 2 * size
+    """
+    Return which second differences over `size` samples, from `begin` to `end`, miss few samples.
+
+    `lost` is the result of `lost_before`.
+
+    """
+    return (lost[begin + 2 * size:end + 2 * size:step] - lost[begin:end:step]
+            <= LOST_SHARE * 2 * size)

@@ -13,20 +13,22 @@ from gyro_calibration.allan.freedom import chi_squared_bounds, degrees_of_freedo
 from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.noise import ALLAN_FLOOR
 
-#: Samples in a block: its few arrays stay in the cache while all averaging times go over it.
+#: Samples in a block: its few arrays stay in the cache for all averaging times.
 _BLOCK = 16384
 
 #: Degrees of freedom of an averaging time, above the rounding of a single second difference.
 _LEAST_FREEDOM = 1.0 - 1e-9
 
-#: Longer products are given to several threads, which costs more than they win.
+#: numpy gives longer products to several threads, which costs more than it saves.
 _PRODUCT = 8192
 
 
 @dataclass(frozen=True)
 class Floor:
     """
-    The lowest point of a chart; at its end, where single points are low by chance, it is the one of the lowest upper bound.
+    The lowest point of a chart, by the upper bound.
+
+    The deviation itself would not do: at the end of the chart single points are low by chance.
 
     Attributes
     ----------
@@ -42,7 +44,7 @@ class Floor:
 
     @property
     def bias_instability(self) -> tuple[float, float, float]:
-        """Return B as IEEE Std 952 reads it off the floor, which is 0.664 B, and its bounds, rad/s."""
+        """Return B, 1 / 0.664 of the floor (IEEE Std 952), and its bounds, rad/s."""
         return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
 
 
@@ -76,7 +78,8 @@ class AllanChart:
     def floor(self) -> Floor:
         """Return the lowest point."""
         lowest = int(np.argmin(self.upper))
-        return Floor(*(float(values[lowest]) for values in (self.time, self.deviation, self.lower, self.upper)))
+        return Floor(*(float(values[lowest])
+                       for values in (self.time, self.deviation, self.lower, self.upper)))
 
     @property
     def time(self) -> Array:
@@ -85,20 +88,23 @@ class AllanChart:
 
 
 def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
-    """Return averaging times in samples, spaced evenly in their logarithm, up to a third of the record."""
+    """Return averaging times in samples, evenly spaced in log, up to a third of the record."""
     decades = math.log10(max(samples // 3, 1))
-    return np.unique(np.round(np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
+    return np.unique(np.round(
+        np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
 
 
-def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array | None = None, progress: Progress = iter) -> AllanChart:
+def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array | None = None,
+                    progress: Progress = iter) -> AllanChart:
     """
-    Return the overlapping Allan deviation of rate samples (IEEE Std 952, C.1; Riley and Howe, NIST SP 1065, eq. 11).
+    Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
     Parameters
     ----------
     rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
     interval : s
-    times : averaging times, s, taken to the nearest whole number of intervals; default: ten a decade, up to a third of the record
+    times : averaging times, s, taken to the nearest whole number of intervals; default: ten a
+        decade, up to a third of the record
     progress : is given the blocks of the record to go through, such as a progress bar
 
     Raises
@@ -114,10 +120,12 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
     freedom = degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
-    # A few windows that fit between gaps, nearly the same ones, tell less than a single one: their deviation has no upper bound.
+    # A few windows that fit between gaps are nearly the same ones and count less than a single
+    # one: their deviation has no upper bound.
     told = freedom >= _LEAST_FREEDOM
     sizes, counts, variance, freedom = sizes[told], counts[told], variance[told], freedom[told]
-    return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom, *chi_squared_bounds(variance, freedom))
+    return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom,
+                      *chi_squared_bounds(variance, freedom))
 
 
 def _sizes(samples: int, interval: float, times: Sequence[float] | Array) -> Integers:
@@ -125,13 +133,14 @@ def _sizes(samples: int, interval: float, times: Sequence[float] | Array) -> Int
     sizes = np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64))
     if not sizes.size or sizes[0] < 1 or 2 * sizes[-1] > samples:
         given = f'{sizes[0] * interval:g} to {sizes[-1] * interval:g} s' if sizes.size else 'none'
-        raise DataRefused(f'averaging times: {given}; wanted at least one sample, {interval:g} s, and at most half the record, '
-                          f'{samples // 2 * interval:g} s: choose others, or record longer')
+        raise DataRefused(f'averaging times: {given}; wanted at least one sample, {interval:g} s, '
+                          f'and at most half the record, {samples // 2 * interval:g} s: '
+                          'choose others, or record longer')
     return sizes
 
 
 def _square_sums(rate: Array, sizes: Integers, progress: Progress) -> tuple[Array, Integers]:
-    """Return the sums of the squared second differences of the angle, in samples, and how many there are."""
+    """Return the sums of the squared second differences of the angle, and their numbers."""
     angle, lost = angle_of(rate), lost_before(rate)
     twice, buffer = 2.0 * angle, np.empty(_BLOCK)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
@@ -143,7 +152,8 @@ def _square_sums(rate: Array, sizes: Integers, progress: Progress) -> tuple[Arra
             block = buffer[:end - begin]
             np.add(angle[begin + 2 * size:end + 2 * size], angle[begin:end], out=block)
             np.subtract(block, twice[begin + size:end + size], out=block)
-            counts[place] += len(block) if lost is None else _leave_out(block, whole(lost, size, begin, end))
+            counts[place] += (len(block) if lost is None
+                              else _leave_out(block, whole(lost, size, begin, end)))
             sums[place] += sum(float(part @ part) for part in (block[:_PRODUCT], block[_PRODUCT:]))
     return sums, counts
 

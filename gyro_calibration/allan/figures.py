@@ -1,4 +1,4 @@
-"""The noise figures of a record: how much there is of each part of the noise, and how sure that is."""
+"""The noise figures of a record: the coefficient of each part of the noise, and its bounds."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from gyro_calibration.allan.ranking import Ranking, rank
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.noise import Noise
 
-#: A slope and its end cannot be seen in fewer.
+#: The least number that shows a slope and its end.
 _FEWEST_OCTAVES = 4
 
 
 @dataclass(frozen=True)
 class Figure:
     """
-    How much there is of one part of the noise.
+    The coefficient of one part of the noise.
 
     Attributes
     ----------
     part : which
     value : its coefficient, in the part's unit; 0 where the record shows none
-    standard_deviation : of the coefficient, if the parts that are seen are all there are; nan where the record shows none
-    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the record shows none, 0 and how much it
-        may hide
+    standard_deviation : of the coefficient, if there are no parts but those that are seen; nan
+        where the record shows none
+    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the
+        record shows none, 0 and the largest coefficient that it can hide
 
     """
 
@@ -54,8 +55,9 @@ class NoiseFit:
     figures : by symbol: N, B, K, Q, R
     chart : the Allan deviations that were fitted, at octaves
     shortest, longest : the averaging times that the fit holds for, s
-    misfit : how much further the Allan deviations are off the sum of the parts than chance allows, as a share of them
-    rivals : the symbols of other combinations of parts that would explain the record nearly as well
+    misfit : by how much more the Allan deviations differ from the sum of the parts than chance
+        allows, as a share of them
+    rivals : the symbols of other combinations of parts that explain the record nearly as well
 
     """
 
@@ -77,20 +79,23 @@ class NoiseFit:
 
     @property
     def floor_reached(self) -> bool:
-        """Tell whether what falls with the averaging time is less than half of the variance, one octave before the end of the chart."""
+        """Return whether N and Q make less than half of the variance, an octave before the end."""
         time = self.chart.time[-2]
-        falling = sum(figure.variance(time) for figure in self.figures.values() if figure.part.slope < 0.0)
+        falling = sum(figure.variance(time) for figure in self.figures.values()
+                      if figure.part.slope < 0.0)
         return bool(falling < 0.5 * self.deviation(time) ** 2)
 
 
 def fit_noise(rate: Array, interval: float) -> NoiseFit:
     """
-    Fit the parts of the noise to the Allan variances at octaves, and keep those that the record shows.
+    Fit the parts of the noise to the Allan variances at octaves, and keep those that are seen.
 
-    The squared coefficients are found by generalized least squares (as in the generalized method of wavelet moments of Guerrier, Skaloud,
-    Stebler and Victoria-Feser, JASA 2013), none of them negative, with the covariance that the fitted noise itself implies. Of all
-    combinations the likeliest is kept, if each further part makes the data likelier by more than chance does. The shortest averaging
-    times are left out until the sum of the parts describes the rest, because the filters of a gyro bend that end.
+    The squared coefficients are found by generalized least squares (as in the generalized method
+    of wavelet moments of Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 2013), none of them
+    negative, with the covariance that the fitted noise itself implies. Of all combinations the
+    likeliest is kept, if each further part makes the data likelier by more than chance does. The
+    shortest averaging times are left out until the sum of the parts describes the rest, because
+    the filters of a gyro bend that end.
 
     Parameters
     ----------
@@ -102,14 +107,19 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
     DataRefused : too few samples, or no sum of the parts describes them
 
     """
-    chart = allan_deviation(rate, interval, 2.0 ** np.arange(max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
+    chart = allan_deviation(rate, interval, 2.0 ** np.arange(
+        max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
     if len(chart.size) < _FEWEST_OCTAVES or not chart.deviation.all():
-        raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the lowest Allan deviation '
-                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted {_FEWEST_OCTAVES} octaves, all above 0: record longer '
-                          'and without losses')
+        raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the '
+                          'lowest Allan deviation '
+                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted '
+                          f'{_FEWEST_OCTAVES} octaves, all above 0: record longer and without '
+                          'losses')
     ranking = rank(Octaves.of(chart))
-    figures = {part.symbol: _in_seconds(_figure(ranking, place), interval) for place, part in enumerate(PARTS)}
-    return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]), ranking.misfit, _rivals(ranking))
+    figures = {part.symbol: _in_seconds(_figure(ranking, place), interval)
+               for place, part in enumerate(PARTS)}
+    return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]),
+                    ranking.misfit, _rivals(ranking))
 
 
 def _figure(ranking: Ranking, place: int) -> Figure:
@@ -117,28 +127,32 @@ def _figure(ranking: Ranking, place: int) -> Figure:
 
 
 def _held(ranking: Ranking, place: int) -> Figure:
-    """Return a figure with bounds that hold whether or not parts are there that the evidence does not suffice for."""
+    """Return a figure with bounds that hold with and without parts of too little evidence."""
     lower, upper = zip(*(each.bounds(place) for each in ranking.tempting if place in each.held))
     value = math.sqrt(ranking.best.squares[place])
-    return Figure(PARTS[place], value, 0.5 * ranking.best.deviation(place) / value, min(lower), max(upper))
+    return Figure(PARTS[place], value, 0.5 * ranking.best.deviation(place) / value,
+                  min(lower), max(upper))
 
 
 def _absent(ranking: Ranking, place: int) -> Figure:
-    """Return how much of a part there can be besides those that are seen."""
+    """Return the largest coefficient of a part beside those that are seen."""
     best = ranking.best
     places = [*(each for each in best.held if each not in (place, BEND_PLACE)), place]
-    estimates = [each.estimate(places) for each in ranking.descriptions if each is best or set(each.held) == set(places)]
+    estimates = [each.estimate(places) for each in ranking.descriptions
+                 if each is best or set(each.held) == set(places)]
     limits = [squares[-1] + 1.96 * deviations[-1] for squares, deviations in estimates]
     limits += [each.bounds(place)[1] ** 2 for each in ranking.rivals if place in each.held]
     return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
 
 
 def _in_seconds(figure: Figure, interval: float) -> Figure:
-    """Return a figure that was found in samples in the part's unit."""
+    """Return a figure that is in samples in the part's unit."""
     unit = interval ** -figure.part.slope
-    return Figure(figure.part, *(value * unit for value in (figure.value, figure.standard_deviation, figure.lower, figure.upper)))
+    return Figure(figure.part, *(value * unit for value in (
+        figure.value, figure.standard_deviation, figure.lower, figure.upper)))
 
 
 def _rivals(ranking: Ranking) -> tuple[str, ...]:
     """Return the symbols of the rivals' parts."""
-    return tuple(sorted({''.join(PARTS[place].symbol for place in each.held if place != BEND_PLACE) for each in ranking.rivals}))
+    return tuple(sorted({''.join(PARTS[place].symbol for place in each.held if place != BEND_PLACE)
+                         for each in ranking.rivals}))

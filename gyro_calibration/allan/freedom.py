@@ -9,25 +9,34 @@ from scipy.special import chdtri
 
 from gyro_calibration.allan.angle import Integers
 from gyro_calibration.allan.covariance import FINE, lag_covariance
-from gyro_calibration.allan.parts import ANGLE_RANDOM_WALK, FLICKER, QUANTIZATION, RATE_RANDOM_WALK, Part
+from gyro_calibration.allan.parts import (
+    ANGLE_RANDOM_WALK,
+    FLICKER,
+    QUANTIZATION,
+    RATE_RANDOM_WALK,
+    Part,
+)
 from gyro_calibration.log import Array
 
 
 def chi_squared_bounds(mean_square: Any, freedom: Any) -> tuple[Any, Any]:
-    """Return the bounds of a root mean square with 95 % confidence, by its distribution (NIST SP 1065, eq. 45)."""
-    lower, upper = (np.sqrt(mean_square * freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    """Return the 95 % bounds of a root mean square (NIST SP 1065, eq. 45)."""
+    lower, upper = (np.sqrt(mean_square * freedom / chdtri(freedom, tail))
+                    for tail in (0.025, 0.975))
     return lower, upper
 
 
 def degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
-    """Return the equivalent degrees of freedom of each Allan variance, for the noise that its slope shows there."""
-    return np.array([_freedom(samples, int(size), part) for size, part in zip(sizes, _parts(sizes, variance))])
+    """Return the equivalent degrees of freedom of Allan variances, by the noise of their slope."""
+    return np.array([_freedom(samples, int(size), part)
+                     for size, part in zip(sizes, _parts(sizes, variance))])
 
 
 def _freedom(samples: int, size: int, part: Part) -> float:
-    """Return (sum of variances)² / sum of covariances² over all second differences (Greenhall and Riley, PTTI 2003)."""
+    """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
     count = samples + 1 - 2 * size
-    stride = 1 if part is QUANTIZATION else max(1, size // FINE)  # white, it is there at single lags only
+    # quantization is white: its covariance is above zero at single lags only
+    stride = 1 if part is QUANTIZATION else max(1, size // FINE)
     lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
     squares = lag_covariance(part, size, size, lags) ** 2 * (count - lags) * stride
     return max(1.0, float(squares[0]) * count / stride / float(2.0 * squares.sum() - squares[0]))
@@ -35,7 +44,7 @@ def _freedom(samples: int, size: int, part: Part) -> float:
 
 def _parts(sizes: Integers, variance: Array) -> list[Part]:
     """
-    Return which random part each Allan variance looks like, by its slope.
+    Return the random part that fits the slope of each Allan variance.
 
     Quantization stands at the short end; a steep fall elsewhere is chance.
 
@@ -48,7 +57,9 @@ def _parts(sizes: Integers, variance: Array) -> list[Part]:
 
 
 def _slopes(sizes: Integers, variance: Array) -> Array:
-    """Return how the Allan variance goes in the logarithmic chart from half to twice each averaging time; -1 where there is no other."""
-    low, high = np.searchsorted(sizes, sizes / 2.0), np.searchsorted(sizes, 2.0 * sizes, side='right') - 1
+    """Return the slope of log Allan variance from half to twice each time; -1 for a lone one."""
+    low, high = (np.searchsorted(sizes, sizes / 2.0),
+                 np.searchsorted(sizes, 2.0 * sizes, side='right') - 1)
     rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
-    return np.where(high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
+    return np.where(high > low,
+                    rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)

@@ -1,4 +1,4 @@
-"""Allan variances at octaves, and what their covariance is made of."""
+"""Allan variances at octaves, and the terms of their covariance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gyro_calibration.log import Array
 @dataclass(frozen=True)
 class Octaves:
     """
-    Allan variances at octaves with what their covariance is made of; all in samples and in units of their own size.
+    Allan variances at octaves and the terms of their covariance, all in samples.
 
     Attributes
     ----------
@@ -33,9 +33,11 @@ class Octaves:
 
     @classmethod
     def of(cls, chart: AllanChart) -> Octaves:
-        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS), -QUANTIZATION.variance(chart.size)])
+        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS),
+                                   -QUANTIZATION.variance(chart.size)])
         scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
-        forms = _forms(chart.samples, tuple(chart.size.tolist())) * np.outer(scarcity, scarcity)[:, :, None, None]
+        forms = (_forms(chart.samples, tuple(chart.size.tolist()))
+                 * np.outer(scarcity, scarcity)[:, :, None, None])
         return cls(chart.deviation ** 2, columns, forms)
 
     def since(self, start: int) -> Octaves:
@@ -43,17 +45,17 @@ class Octaves:
         return Octaves(self.variance[start:], self.columns[start:], self.forms[start:, start:])
 
     def covariance(self, squares: Array) -> Array:
-        """Return the covariance of the variances, shape (n, n), if the squared coefficients are these."""
+        """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
         return np.einsum('ijpq,p,q->ij', self.forms, squares[:BEND_PLACE], squares[:BEND_PLACE])
 
     def model(self, squares: Array) -> Array:
-        """Return the variances that the squared coefficients add up to; above zero, however deep the bend."""
+        """Return the sum of the parts for these squared coefficients, kept above zero."""
         return np.maximum(self.columns @ squares, 1e-3 * self.variance)
 
 
 @lru_cache(maxsize=8)
 def _forms(samples: int, sizes: tuple[int, ...]) -> Array:
-    """Return the covariance of Allan variances as a quadratic form of squared coefficients, shape (n, n, 5, 5)."""
+    """Return the covariances as forms of the squared coefficients, shape (n, n, 5, 5)."""
     forms = np.zeros((len(sizes),) * 2 + (len(PARTS),) * 2)
     for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
         form = covariance_form(samples, sizes[i], sizes[j])

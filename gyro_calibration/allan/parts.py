@@ -1,4 +1,4 @@
-"""The parts of the noise, as IEEE Std 952, C.1, has them."""
+"""The parts of the noise of IEEE Std 952, C.1."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from gyro_calibration.noise import ALLAN_FLOOR
 @dataclass(frozen=True)
 class Part:
     """
-    A part of the noise, by how its Allan variance goes with the averaging time (IEEE Std 952, C.1).
+    A part of the noise, by the slope of its Allan deviation (IEEE Std 952, C.1).
 
     Attributes
     ----------
     name, symbol, unit : as in IEEE Std 952; the unit in SI
     slope : of the Allan deviation in the logarithmic chart
     factor : Allan variance = factor * coefficient² * tau ** (2 slope)
-    covariance : of the angle, for a coefficient of 1, as a function of the time between, up to what second differences do not see
+    covariance : of the angle, for a coefficient of 1, as a function of the time between, up to
+        terms that second differences remove
 
     """
 
@@ -45,10 +46,13 @@ def _flicker_covariance(time: Integers) -> Array:
     return size ** 2 * np.log(np.where(size == 0.0, 1.0, size)) / (2.0 * math.pi)
 
 
-ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0, lambda time: -0.5 * np.abs(time))
+ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
+                         lambda time: -0.5 * np.abs(time))
 FLICKER = Part('flicker', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
-RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0, lambda time: np.abs(time) ** 3 / 12.0)
-QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0, lambda time: (np.asarray(time) == 0.0).astype(float))
+RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
+                        lambda time: np.abs(time) ** 3 / 12.0)
+QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0,
+                    lambda time: (np.asarray(time) == 0.0).astype(float))
 RATE_RAMP = Part('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
 
 PARTS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
@@ -57,5 +61,6 @@ PARTS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
 ANGLE_WALK_PLACE, RATE_WALK_PLACE = PARTS.index(ANGLE_RANDOM_WALK), PARTS.index(RATE_RANDOM_WALK)
 QUANTIZATION_PLACE, RAMP_PLACE = PARTS.index(QUANTIZATION), PARTS.index(RATE_RAMP)
 
-#: Beside the parts: what a filter takes from the variance. Over times beyond its memory that goes as quantization, with the other sign.
+#: Beside the parts: what a filter takes from the variance. Over times beyond the memory of the
+#: filter it has the slope of quantization, with the other sign.
 BEND_PLACE = len(PARTS)

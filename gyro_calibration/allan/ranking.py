@@ -11,20 +11,23 @@ from gyro_calibration.allan.octaves import Octaves
 from gyro_calibration.allan.parts import ANGLE_WALK_PLACE, BEND_PLACE, PARTS, QUANTIZATION_PLACE
 from gyro_calibration.log import DataRefused
 
-#: Shares that the Allan deviations of a gyro may be off the sum of the parts; the smallest that does is taken.
+#: Shares by which the Allan deviations may differ from the sum of the parts; the smallest one that
+#: suffices is taken.
 _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 
-#: A combination that is likelier by this, but not by enough to be believed, widens the bounds.
+#: A combination that is likelier by this, but lacks evidence, widens the bounds.
 _TEMPTING = 1.0
 
 
 def _with_short_end(places: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """Return a combination of parts as it is, with quantization, and with a bend of its angle random walk."""
-    return [places, (*places, QUANTIZATION_PLACE)] + ([(*places, BEND_PLACE)] if ANGLE_WALK_PLACE in places else [])
+    """Return a combination without and with quantization, and with a bend of its random walk."""
+    return [places, (*places, QUANTIZATION_PLACE)] + (
+        [(*places, BEND_PLACE)] if ANGLE_WALK_PLACE in places else [])
 
 
 _COMBINATIONS = [combination for count in range(len(PARTS))
-                 for places in itertools.combinations([place for place in range(len(PARTS)) if place != QUANTIZATION_PLACE], count)
+                 for places in itertools.combinations(
+                     [place for place in range(len(PARTS)) if place != QUANTIZATION_PLACE], count)
                  for combination in _with_short_end(places) if combination]
 
 
@@ -52,19 +55,21 @@ class Ranking:
 
     @property
     def seen(self) -> list[int]:
-        """Return the places of the parts that the best one shows; what is left of quantization after a short end is no figure."""
-        return [place for place in self.best.held if place != BEND_PLACE and (place != QUANTIZATION_PLACE or self.start == 0)]
+        """Return the places of the best's parts; after a bent end quantization is no figure."""
+        return [place for place in self.best.held if place != BEND_PLACE
+                and (place != QUANTIZATION_PLACE or self.start == 0)]
 
     @cached_property
     def rivals(self) -> list[Description]:
-        """Return the combinations of other parts, not more, that are nearly as likely as the best."""
+        """Return the combinations of other parts, not more, that are nearly as likely."""
         best = self.best
-        return [each for each in self.descriptions if each.surprise < best.surprise + RIVAL and len(each.held) <= len(best.held)
+        return [each for each in self.descriptions
+                if each.surprise < best.surprise + RIVAL and len(each.held) <= len(best.held)
                 and not set(each.held) - {BEND_PLACE, QUANTIZATION_PLACE} <= set(best.held)]
 
     @cached_property
     def tempting(self) -> list[Description]:
-        """Return the best combination with those that are likelier, but not by enough to be believed, or hold a rival's parts too."""
+        """Return the best, those that are likelier without evidence, and those with a rival."""
         best = self.best
         both = [{*best.held, *rival.held} for rival in self.rivals]
         return [best, *(each for each in self.descriptions
@@ -73,9 +78,10 @@ class Ranking:
 
 def rank(octaves: Octaves) -> Ranking:
     """
-    Rank all combinations of parts, from the first octave on that chance allows, or else with a misfit.
+    Rank all combinations of parts.
 
-    What bends the short end fades slowly, so that one octave more is left out than chance asks for.
+    The first octave is the earliest one that chance allows; if none is, a misfit is added. The
+    filters that bend the short end fade slowly: one octave more than that is left out.
 
     Raises
     ------
@@ -87,10 +93,12 @@ def rank(octaves: Octaves) -> Ranking:
         ranking = _rank_since(octaves, start, misfit)
         if ranking.best.likely():
             return _rank_since(octaves, start + 1, misfit) if 0 < start < last else ranking
-    raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum of the five kinds of noise: there is '
-                      'something else in the record, such as a swing or a vibration; record again at rest')
+    raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum '
+                      'of the five kinds of noise: there is something else in the record, such as '
+                      'a swing or a vibration; record again at rest')
 
 
 def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
     since = octaves.since(start)
-    return Ranking(start, misfit, tuple(sorted((describe(since, places, misfit) for places in _COMBINATIONS), key=Description.cost)))
+    return Ranking(start, misfit, tuple(sorted(
+        (describe(since, places, misfit) for places in _COMBINATIONS), key=Description.cost)))

@@ -24,7 +24,7 @@ class Record:
     ----------
     rate : rad/s, shape (n,); nan where a sample is lost or left out
     interval : s
-    remarks : what was found on the way, one sentence each
+    remarks : on bursts, lost samples and outliers, one sentence each
 
     """
 
@@ -45,7 +45,8 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
 
     Raises
     ------
-    DataRefused : too few samples, a dead gyro, stamps that belong to no even interval, too much lost, or motion
+    DataRefused : too few samples, a dead gyro, stamps that belong to no even interval, too much
+        lost, or motion
 
     """
     refuse_few(len(output))
@@ -54,7 +55,8 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
     stamps = number_stamps(time)
     rate = np.full(int(stamps.number[-1]) + 1, np.nan)
     rate[stamps.number[known]] = output[known]
-    remarks = [*stamps.said_of_bursts, *_said_of_lost(stamps), *_said_of_left_out(int(np.count_nonzero(~known))),
+    remarks = [*stamps.said_of_bursts, *_said_of_lost(stamps),
+               *_said_of_left_out(int(np.count_nonzero(~known))),
                *leave_out_wild_samples(rate, stamps)]
     refuse_motion(rate, stamps)
     rate = _shortened(rate, stamps.longest_gap)
@@ -63,7 +65,8 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
 
 
 def _said_of_lost(stamps: Stamps) -> list[str]:
-    return [f'{said} Windows with more than {100 * LOST_SHARE:g} % lost are not used.' for said in stamps.said_of_lost]
+    return [f'{said} Windows with more than {100 * LOST_SHARE:g} % lost are not used.'
+            for said in stamps.said_of_lost]
 
 
 def _said_of_left_out(count: int) -> list[str]:
@@ -71,7 +74,7 @@ def _said_of_left_out(count: int) -> list[str]:
 
 
 def _shortened(rate: Array, longest: int) -> Array:
-    """Return the samples with long gaps cut down: no window reaches across them in any case."""
+    """Return the samples with long gaps cut down; no window reaches across them in any case."""
     begins, ends = gaps(np.isfinite(rate))
     kept = np.ones(len(rate), dtype=bool)
     for begin, end in zip(begins + longest, ends):
@@ -82,5 +85,6 @@ def _shortened(rate: Array, longest: int) -> Array:
 def _refuse_tatters(rate: Array) -> None:
     share = float(np.isnan(rate).mean())
     if share > _MOST_LOST:
-        raise DataRefused(f'{100 * share:.0f} % of the samples are lost or without output; wanted at most {100 * _MOST_LOST:.0f} %: '
-                          'record again, or give --rate where the stamps are no use')
+        raise DataRefused(f'{100 * share:.0f} % of the samples are lost or without output; wanted '
+                          f'at most {100 * _MOST_LOST:.0f} %: record again, or give --rate where '
+                          'the stamps are no use')
