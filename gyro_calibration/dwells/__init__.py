@@ -1,16 +1,26 @@
 """
-Dwells: stretches of constant rate, each one row of means, out of which a rate table's calibration is made.
+Dwells: stretches of constant rate, each one row of means, to which a calibration is fitted.
 
-A rate table without time holds them already. In a log in time they are found: where the reference is steady, without the ramps and the
-settling after them.
+The rows of a rate table without time are dwells. In a log in time they are found: where the
+reference is steady, without the ramps and the settling after them.
 
-Reading order, each imports only from those before it: `samples` (of gyro and reference, as far as both are there), `steadiness` (of a
-reference rate), `straightness` (of a reference heading), `cleaning` (of wild and stuck samples), `settling` (what ramps leave behind),
-`stretches` (that are left of a log), `averaging` (of each), `sweeps` (that dwells belong to), `table` (of all dwells).
+Reading order, each imports only from those before it: `samples` (those with gyro and reference),
+`steadiness` (of a reference rate), `straightness` (of a reference heading), `cleaning` (of
+outliers and repeated samples), `settling` (after ramps), `stretches` (of a log that are dwells),
+`averaging` (of each), `sweeps` (to which dwells belong), `table` (of all dwells).
 
 """
 
 from gyro_calibration.dwells.samples import Numbers, listed
-from gyro_calibration.dwells.table import Dwells, Steadiness, dwells, find_dwells, from_table, join, take
+from gyro_calibration.dwells.table import (
+    Dwells,
+    Steadiness,
+    dwells,
+    find_dwells,
+    from_table,
+    join,
+    take,
+)
 
-__all__ = ['Dwells', 'Numbers', 'Steadiness', 'dwells', 'find_dwells', 'from_table', 'join', 'listed', 'take']
+__all__ = ['Dwells', 'Numbers', 'Steadiness', 'dwells', 'find_dwells', 'from_table', 'join',
+           'listed', 'take']

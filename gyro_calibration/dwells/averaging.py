@@ -1,4 +1,4 @@
-"""Averaging: the means of dwells, and how well each is known."""
+"""Averaging: the means of dwells, and their standard deviations."""
 
 from __future__ import annotations
 
@@ -13,45 +13,60 @@ from gyro_calibration.dwells.samples import Numbers, Samples, code_step, duratio
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array
 
-#: A dwell is divided into so many batches, whose scatter gives the deviation of the mean: fewer, where they got shorter than a vibration
-#: of the table, or an answer of the gyro's filter, needs to average out, s.
+#: Number of batches of a dwell, whose scatter gives the deviation of the mean, and the least
+#: duration of each beyond the first four, s: a vibration of the table and the response of the
+#: gyro's filter average out in it.
 _FEWEST_BATCHES, _MOST_BATCHES, _BATCH = 4, 12, 0.75
 
 
 def averaged(samples: Samples, dwells: Sequence[Numbers]) -> tuple[Array, Array, Array]:
-    """Return reference rate, output and the standard deviation of the output of each dwell (Ojeda et al., eq. 6), nan if not known."""
+    """
+    Return reference rate, output and its standard deviation of each dwell (Ojeda et al., eq. 6).
+
+    A standard deviation that is not known is nan.
+
+    """
     durations = np.array([duration(samples.time, rows) for rows in dwells])
     halves = np.array([len(rows) // 2 for rows in dwells])
-    batches = np.clip(np.minimum(durations / _BATCH, halves), _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
+    batches = np.clip(np.minimum(durations / _BATCH, halves),
+                      _FEWEST_BATCHES, _MOST_BATCHES).astype(int)
     average = _average_rates if samples.rate is not None else _average_slopes
     rate, output, variance, blur = average(samples, dwells, batches)
-    # White noise in a mean goes with 1 / duration, so dwells are alike in the product.
+    # White noise in a mean is proportional to 1 / duration, so dwells are alike in the product.
     deviation = np.sqrt(moderated(variance * durations, batches - 1) / durations + blur ** 2)
     return rate, output, np.where(deviation > 0.0, deviation, np.nan)
 
 
-def _average_rates(samples: Samples, dwells: Sequence[Numbers], batches: Numbers) -> tuple[Array, Array, Array, Array]:
-    """Average dwells against a rate: rate, output, the variance of the output against it, and nothing else that blurs it."""
+def _average_rates(samples: Samples, dwells: Sequence[Numbers],
+                   batches: Numbers) -> tuple[Array, Array, Array, Array]:
+    """Average dwells against a rate; return rate, output, its variance, and a blur of zero."""
     assert samples.rate is not None
-    rate, output, errors = ([values[rows] for rows in dwells] for values in (samples.rate, samples.output, samples.error))
-    return _each(np.mean, rate), _each(np.mean, output), _each(_scatter_of_means, errors, batches), np.zeros(len(dwells))
+    rate, output, errors = ([values[rows] for rows in dwells]
+                            for values in (samples.rate, samples.output, samples.error))
+    return (_each(np.mean, rate), _each(np.mean, output),
+            _each(_scatter_of_means, errors, batches), np.zeros(len(dwells)))
 
 
-def _average_slopes(samples: Samples, dwells: Sequence[Numbers], batches: Numbers) -> tuple[Array, Array, Array, Array]:
+def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
+                    batches: Numbers) -> tuple[Array, Array, Array, Array]:
     """
-    Average dwells against a heading: rate, output, the variance of the output, and the deviation that the encoder's steps add.
+    Average dwells against a heading; return rate, output, its variance, and the encoder's blur.
 
-    The rate is the slope of the heading. The output is averaged by the slope of its integral, with the same weights, so that what the
-    table really does besides its steady rate is the same in both.
+    The rate is the slope of the heading. The output is averaged by the slope of its integral, with
+    the same weights, so that what the table does besides its steady rate is the same in both. The
+    blur is the standard deviation that the steps of the encoder add.
 
     """
     assert samples.heading is not None
     step = code_step(samples.heading)
-    time, output, heading = ([values[rows] for rows in dwells] for values in (samples.time, samples.output, samples.heading))
+    time, output, heading = ([values[rows] for rows in dwells]
+                             for values in (samples.time, samples.output, samples.heading))
     turned = list(map(integrate, time, output))
     errors = [angle - samples.scale * reference for angle, reference in zip(turned, heading)]
-    # Both scatters hold too much: what the table does, or the encoder's steps. The smaller one holds less of it.
-    variance = min((_each(_scatter_of_slopes, time, angles, batches) for angles in (turned, errors)), key=np.median)
+    # One scatter holds the motion of the table besides, the other the steps of the encoder. The
+    # smaller one is taken.
+    variance = min((_each(_scatter_of_slopes, time, angles, batches)
+                    for angles in (turned, errors)), key=np.median)
     blur = abs(samples.scale) * np.array([_blur(*each, step) for each in zip(time, heading)])
     return _each(slope, time, heading), _each(slope, time, turned), variance, blur
 
@@ -65,37 +80,40 @@ def _scatter_of_means(error: Array, batches: int) -> float:
 
 
 def _scatter_of_slopes(time: Array, angle: Array, batches: int) -> float:
-    return _variance([slope(*batch) for batch in zip(np.array_split(time, batches), np.array_split(angle, batches))])
+    return _variance([slope(*batch) for batch in zip(np.array_split(time, batches),
+                                                     np.array_split(angle, batches))])
 
 
 def _variance(batches: Sequence[float]) -> float:
-    """Return the variance of the mean of some batches: what is correlated within a batch is counted once."""
+    """Return the variance of the mean of batches; noise may be correlated within a batch."""
     return float(np.var(batches, ddof=1)) / len(batches)
 
 
 def _blur(time: Array, heading: Array, step: float) -> float:
     """
-    Return the standard deviation of a heading's slope that the steps of an ideal encoder cause, rad/s.
+    Return the standard deviation of a heading's slope, due to the steps of an encoder, rad/s.
 
-    Over M steps it is about 0.35 step / (M duration), and below one 0.6 step / duration (by simulation). Each step is seen late by up to
-    a sample, which adds the square root of M over the number of samples. A heading that stays on one step for the whole dwell is a
-    rest: nothing turns that slowly.
+    Over M steps it is about 0.35 step / (M duration), and below one 0.6 step / duration (by
+    simulation). Each step is seen late by up to a sample, which adds the square root of M over the
+    number of samples. A heading that stays on one step for the whole dwell is taken as a rest.
 
     """
     if np.ptp(heading) <= 0.5 * step or step == 0.0:
         return 0.0
     steps = abs(heading[-1] - heading[0]) / step
     samples = len(heading)
-    return step / float(time[-1] - time[0]) * math.hypot(0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
+    return step / float(time[-1] - time[0]) * math.hypot(
+        0.35 / max(steps, 0.6), math.sqrt(min(steps, samples)) / samples)
 
 
 def moderated(variance: Array, freedom: Array) -> Array:
     """
-    Move each of some variances toward what they have in common, the more the less each knows and the more they agree.
+    Move variances toward their common value, by more if they are uncertain or agree.
 
-    A variance out of a dozen batches errs by 40 %; weights made of it would be chance, and the smallest ones would rule the fit.
-    Empirical Bayes with an inverse gamma prior (Smyth 2004, sections 3 and 6.2): the scatter of their logarithms beyond that of
-    chance tells the degrees of freedom of the prior.
+    A variance out of a dozen batches errs by 40 %; weights made of it would be chance, and the
+    smallest ones would dominate the fit. Empirical Bayes with an inverse gamma prior (Smyth 2004,
+    sections 3 and 6.2): the scatter of their logarithms beyond that of chance gives the degrees of
+    freedom of the prior.
 
     Parameters
     ----------
@@ -117,7 +135,7 @@ def moderated(variance: Array, freedom: Array) -> Array:
 
 
 def _inverse_trigamma(value: float) -> float:
-    """Solve trigamma(x) = value by Newton's steps on 1 / trigamma, which is nearly straight (Smyth 2004, appendix)."""
+    """Solve trigamma(x) = value by Newton's method on 1 / trigamma (Smyth 2004, appendix)."""
     x = 0.5 + 1.0 / value
     for _ in range(20):
         x += float(polygamma(1, x) * (1.0 - polygamma(1, x) / value) / polygamma(2, x))

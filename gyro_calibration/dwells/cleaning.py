@@ -1,4 +1,4 @@
-"""Cleaning: wild and stuck samples of a gyro, found in a stretch of steady rate and left out of it."""
+"""Cleaning: outliers and repeated samples of a gyro, left out of a stretch of steady rate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gyro_calibration.dwells.samples import Numbers, Samples, code_step, inside, length, listed, runs, times
+from gyro_calibration.dwells.samples import (
+    Numbers,
+    Samples,
+    code_step,
+    inside,
+    length,
+    listed,
+    runs,
+    times,
+)
 from gyro_calibration.log import Array, Mask
 
 
@@ -21,7 +30,7 @@ class Cleaned(NamedTuple):
 
 
 def clean(samples: Samples, part: slice, limit: float) -> Cleaned:
-    """Part the rows of a stretch; wild is beyond so many robust standard deviations."""
+    """Divide the rows of a stretch; outliers are beyond `limit` robust standard deviations."""
     rows = np.arange(part.start, part.stop)
     stuck = _stuck(samples.output[part])
     moving = rows[~stuck]
@@ -29,27 +38,32 @@ def clean(samples: Samples, part: slice, limit: float) -> Cleaned:
     return Cleaned(moving[~wild], moving[wild], rows[stuck])
 
 
-def left_out(samples: Samples, dwells: Sequence[Numbers], cleaned: Sequence[Cleaned]) -> Iterator[str]:
-    """Say which wild and stuck samples stand within the dwells."""
+def left_out(samples: Samples, dwells: Sequence[Numbers],
+             cleaned: Sequence[Cleaned]) -> Iterator[str]:
+    """Yield remarks on the outliers and repeated samples within the dwells."""
     within = inside(samples, dwells)
     wild = [row for part in cleaned for row in part.wild if within[row]]
     if wild:
-        yield f'wild samples, left out: {len(wild)}, at {listed([f"{samples.time[row]:.2f} s" for row in wild])}'
+        yield (f'wild samples, left out: {len(wild)}, at '
+               f'{listed([f"{samples.time[row]:.2f} s" for row in wild])}')
     stuck = np.zeros(len(within), dtype=bool)
     stuck[[row for part in cleaned for row in part.stuck]] = True
-    places = [f'{samples.time[run.start]:.2f} s ({length(run)} samples)' for run in runs(stuck & within)]
+    places = [f'{samples.time[run.start]:.2f} s ({length(run)} samples)'
+              for run in runs(stuck & within)]
     if places:
-        yield f'the output was stuck {times(len(places))}, at {listed(places)}; the repeats are left out'
+        yield (f'the output was stuck {times(len(places))}, at {listed(places)}; '
+               'the repeats are left out')
 
 
 def _wild(error: Array, limit: float) -> Mask:
-    """Mark single samples far from their neighbours and from the rest: neither a drift nor a vibration of the table is wild."""
+    """Mark single samples far from their neighbours and the median; not drift or vibration."""
     if len(error) < 4:
         return np.zeros(len(error), dtype=bool)
-    # The median of six neighbours resists two wild ones among them.
+    # The median of six neighbours resists two outliers among them.
     edged = np.pad(error, 3, mode='reflect')
-    alone = error - np.median([edged[place:place + len(error)] for place in (0, 1, 2, 4, 5, 6)], axis=0)
-    # An output of few codes agrees with its neighbours mostly: then the code is the measure.
+    alone = error - np.median([edged[place:place + len(error)]
+                               for place in (0, 1, 2, 4, 5, 6)], axis=0)
+    # An output of few codes mostly equals its neighbours; then the limit is in codes.
     least = max(code_step(error), 1e-9)
     return _far(alone, limit, least) & _far(error - np.median(error), limit, least)
 
@@ -59,10 +73,11 @@ def _far(values: Array, limit: float, least: float) -> Mask:
 
 
 def _stuck(output: Array) -> Mask:
-    """Mark the repeats in runs of one value that are longer than the share of this value in the stretch explains."""
+    """Mark the repeats in runs of one value that are too long for its share of the stretch."""
     stuck = np.zeros(len(output), dtype=bool)
     share = np.unique(output, return_counts=True)[1].max() / len(output)
-    # Mostly one value: a gyro of coarse codes at rest, or a simulation without noise. That cannot be told from a stuck one.
+    # Mostly one value: a gyro of coarse codes at rest, or a simulation without noise. It cannot be
+    # distinguished from a gyro that repeats samples.
     if share > 0.9:
         return stuck
     longest = math.log(1e-6 / len(output)) / math.log(share)

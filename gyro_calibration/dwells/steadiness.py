@@ -1,4 +1,4 @@
-"""Steadiness: what a stretch of a log must keep to be a dwell, and where a reference rate keeps it."""
+"""Steadiness: what a stretch of a log must keep to be a dwell, and where a rate keeps it."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ class Steadiness:
 
     Attributes
     ----------
-    duration : at least so long after all cuts, s
-    margin : cut at both ends at least, s; a time offset between gyro and reference stays out of the means
-    rate : the reference, smoothed over the margin, strays at most so far from its middle, rad/s; less where it is quieter
+    duration : least duration after all cuts, s
+    margin : least cut at both ends, s; a time offset between gyro and reference stays out of the
+        means
+    rate : largest deviation of the reference, smoothed over the margin, from its middle, rad/s;
+        less where it is quieter
     relative : and this part of the rate, 1
-    heading : a reference heading strays at most so far from a straight line, besides its steps, rad; less where it is straighter
-    gap : over longer gaps nobody knows what the reference did, s
-    settling : a gyro takes no longer than this to settle, s
+    heading : largest deviation of a reference heading from a straight line, besides its steps,
+        rad; less where it is straighter
+    gap : in longer gaps the reference is taken as unknown, s
+    settling : longest settling time of a gyro, s
     temperature : a dwell that warms by more than this is divided, K
-    wild : a sample this many robust standard deviations from its neighbours, and from the middle of the dwell, is left out
-    share : so much of the log is in dwells at least; a log that swings looks steady now and then, 1
+    wild : a sample this many robust standard deviations from its neighbours, and from the middle
+        of the dwell, is left out
+    share : least share of the log in dwells, 1; a log that swings looks steady now and then
 
     """
 
@@ -48,20 +52,23 @@ class Steadiness:
 def steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
     """Return the stretches whose reference rate is steady."""
     width = max(3, count(time, limits.margin))
-    # A single wild sample of the reference must not break a dwell.
+    # A single outlier of the reference must not break a dwell.
     smooth = uniform_filter1d(median_filter(rate, 5, mode='nearest'), width, mode='nearest')
-    stray = maximum_filter1d(smooth, width, mode='nearest') - minimum_filter1d(smooth, width, mode='nearest')
+    stray = (maximum_filter1d(smooth, width, mode='nearest')
+             - minimum_filter1d(smooth, width, mode='nearest'))
     allowed = float(np.clip(5.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
     calm = stray <= allowed + limits.relative * np.abs(smooth)
-    # The windows of both filters reach over a ramp's end; half of that is given back, the margin stays.
+    # The windows of both filters reach over the end of a ramp; half of that is given back, so that
+    # the margin stays.
     calm = maximum_filter1d(calm, 2 * (width // 2) + 1)
     calm[1:] &= np.diff(time) <= limits.gap
     return [slice(run.start + part.start, run.start + part.stop) for run in runs(calm)
-            for part in _level(uniform_filter1d(smooth[run], 4 * width, mode='nearest'), allowed, limits.relative)]
+            for part in _level(uniform_filter1d(smooth[run], 4 * width, mode='nearest'),
+                               allowed, limits.relative)]
 
 
 def _level(rate: Array, allowed: float, relative: float) -> Iterator[slice]:
-    """Divide a stretch where its rate has wandered off: a slow ramp falls to pieces, too short to be dwells."""
+    """Divide a stretch where its rate drifts: parts of a slow ramp are too short for dwells."""
     start, low, high = 0, math.inf, -math.inf
     for place, value in enumerate(rate.tolist()):
         low, high = min(low, value), max(high, value)

@@ -1,4 +1,4 @@
-"""Straightness: where a reference heading runs along a straight line in time, but for the steps of its encoder."""
+"""Straightness: where a reference heading is a straight line in time, but for encoder steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gyro_calibration.dwells.samples import Numbers, code_step, duration, length
 from gyro_calibration.dwells.steadiness import Steadiness
 from gyro_calibration.log import DEGREE, Array
 
-#: The heading is looked at in blocks, s.
+#: Duration of the blocks in which the heading is averaged, s.
 _BLOCK = 0.1
 
 
@@ -20,9 +20,11 @@ def straight(time: Array, heading: Array, limits: Steadiness) -> list[slice]:
     step = code_step(heading)
     edges, times, headings = _blocks(time, heading)
     tolerance = step + _crookedness(headings, limits.heading)
-    cones = [cone for cone in _cones(times, headings, 2.0 * tolerance, limits.gap) if duration(times, cone) >= 0.5 * limits.duration]
+    cones = [cone for cone in _cones(times, headings, 2.0 * tolerance, limits.gap)
+             if duration(times, cone) >= 0.5 * limits.duration]
     parts = _apart(_walked(times, headings, cone, tolerance, step) for cone in cones)
-    whole = [slice(int(edges[part.start]), int(edges[part.stop])) for part in parts if length(part) > 4]
+    whole = [slice(int(edges[part.start]), int(edges[part.stop]))
+             for part in parts if length(part) > 4]
     return [part for part in whole if _holds_its_slope(time[part], heading[part], step, limits)]
 
 
@@ -30,21 +32,24 @@ def _blocks(time: Array, heading: Array) -> tuple[Numbers, Array, Array]:
     """Return where blocks begin and the last one ends, and their mean times and headings."""
     first = np.unique(np.floor((time - time[0]) / _BLOCK), return_index=True)[1]
     edges = np.append(first, len(time))
-    times, headings = (np.add.reduceat(values, first) / np.diff(edges) for values in (time, heading))
+    times, headings = (np.add.reduceat(values, first) / np.diff(edges)
+                       for values in (time, heading))
     return edges, times, headings
 
 
 def _crookedness(heading: Array, most: float) -> float:
-    """Return by how much the heading strays from a straight line within about a second, mostly, rad; within limits."""
-    # A vibration of the table is not seen over a whole number of its periods, so several lengths are looked at.
+    """Return three times the median deviation from a straight line within 1 s, rad, clipped."""
+    # A vibration of the table cannot be seen over a whole number of its periods, so several
+    # lengths are used.
     reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
-    strays = [np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach])) for reach in reaches]
+    strays = [np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
+              for reach in reaches]
     stray = max((float(np.median(each)) for each in strays), default=math.inf)
     return float(np.clip(3.0 * stray, 0.02 * DEGREE, most))
 
 
 def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[slice]:
-    """Divide a heading, from its start, into the longest stretches that a straight line through their first point meets."""
+    """Divide a heading into the longest stretches that a line through their first point fits."""
     start, low, high = 0, -math.inf, math.inf
     times, headings = time.tolist(), heading.tolist()
     for place in range(1, len(times)):
@@ -58,25 +63,29 @@ def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterato
 
 
 def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: float) -> slice:
-    """Fit a line to the middle of a stretch, walk from there as far as it holds, and step back from the ramps."""
+    """Fit a line to the middle of a stretch, extend it while it holds, and cut the ramps off."""
     fifth = length(cone) // 5
     middle = slice(cone.start + fifth, cone.stop - fifth)
-    # Not beyond as much again at both ends, so that the work does not grow with the square of the log.
+    # At most by its own length at both ends, so that the work is not quadratic in the log.
     first, last = max(0, cone.start - length(cone)), min(len(time), cone.stop + length(cone))
-    line = heading[middle].mean() + slope(time[middle], heading[middle]) * (time[first:last] - time[middle].mean())
+    line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
+        time[first:last] - time[middle].mean())
     stray = np.abs(heading[first:last] - line)
     beyond = np.flatnonzero(stray > tolerance)
     before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
-    begin = 0 if not len(before) else int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step)
-    end = len(stray) if not len(after) else int(after[0]) - _step_back(stray[after[0]:], tolerance, step)
+    begin = (0 if not len(before) else
+             int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step))
+    end = (len(stray) if not len(after) else
+           int(after[0]) - _step_back(stray[after[0]:], tolerance, step))
     return slice(first + begin, first + max(begin, end))
 
 
 def _step_back(stray: Array, tolerance: float, step: float) -> int:
     """
-    Return how many blocks of a ramp hide within the tolerance, from how the heading strays beyond.
+    Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
 
-    On a ramp it strays with the square of time, so the ratio of two strays tells when it began; a short ramp began later.
+    On a ramp the heading deviates with the square of time, so the ratio of two deviations gives
+    its beginning; a short ramp began later.
 
     """
     reach = round(0.5 / _BLOCK)
@@ -87,7 +96,7 @@ def _step_back(stray: Array, tolerance: float, step: float) -> int:
 
 
 def _apart(parts: Iterable[slice]) -> list[slice]:
-    """Keep the longer of two stretches that reach over each other: it knows their line better."""
+    """Keep the longer of two stretches that overlap: its line is more accurate."""
     kept: list[slice] = []
     for part in parts:
         if kept and part.start < kept[-1].stop and length(part) > length(kept[-1]):
@@ -98,10 +107,11 @@ def _apart(parts: Iterable[slice]) -> list[slice]:
 
 
 def _holds_its_slope(time: Array, heading: Array, step: float, limits: Steadiness) -> bool:
-    """Tell whether the quarters of a stretch have one slope: a slow swing is straight for a while, but not steady."""
+    """Return whether the quarters of a stretch have one slope, unlike those of a slow swing."""
     quarters = [quarter for quarter in np.array_split(np.arange(len(time)), 4) if len(quarter) > 2]
     if not quarters:
         return True
     slopes = np.array([slope(time[quarter], heading[quarter]) for quarter in quarters])
     blur = 8.0 * step / (time[-1] - time[0])
-    return bool(np.ptp(slopes) <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)
+    return bool(np.ptp(slopes)
+                <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)

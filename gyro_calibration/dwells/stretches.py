@@ -1,7 +1,8 @@
 """
 Stretches: which rows of a log in time are dwells.
 
-The reference is steady there, and neither ramps, nor the settling after them, nor wild and stuck samples are among them.
+The reference is steady there. Ramps, the settling after them, outliers and repeated samples are
+left out.
 
 """
 
@@ -15,13 +16,21 @@ from typing import NamedTuple
 import numpy as np
 
 from gyro_calibration.dwells.cleaning import clean, left_out
-from gyro_calibration.dwells.samples import FEWEST, Numbers, Samples, duration, missing, slope, usable
+from gyro_calibration.dwells.samples import (
+    FEWEST,
+    Numbers,
+    Samples,
+    duration,
+    missing,
+    slope,
+    usable,
+)
 from gyro_calibration.dwells.settling import settled
 from gyro_calibration.dwells.steadiness import Steadiness, steady
 from gyro_calibration.dwells.straightness import straight
 from gyro_calibration.log import DEGREE, Array, DataRefused, Log
 
-#: The warming of a dwell is seen between so many parts of it.
+#: Number of parts of a dwell between which its warming is taken.
 _PARTS = 12
 
 
@@ -58,7 +67,8 @@ def find_stretches(log: Log, limits: Steadiness) -> Stretches:
     elif not _known(log.reference_heading):
         found = _found(by_rate, limits)
     else:
-        # A rate that was made of a coarse encoder's steps is hardly ever steady; the heading that it was made of may be straight.
+        # A rate that was made of a coarse encoder's steps is seldom steady; the heading behind it
+        # may be straight.
         found, other = _found(by_rate, limits), _found(by_heading, limits)
         found = found if found.duration > 0.9 * other.duration else other
     if found.share < limits.share:
@@ -71,28 +81,35 @@ def _known(reference: Array | None) -> bool:
 
 
 def _not_steady(found: Stretches, limits: Steadiness) -> str:
-    line = '' if found.samples.heading is None else f' and straight to {limits.heading / DEGREE:g} deg'
-    return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{line}, for {limits.duration:g} s at a time beside the '
-            f'settling, in {100.0 * found.share:.0f} % of the log; hold each rate for longer, or use the heading itself with '
+    line = ('' if found.samples.heading is None
+            else f' and straight to {limits.heading / DEGREE:g} deg')
+    return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{line}, for '
+            f'{limits.duration:g} s at a time beside the settling, in {100.0 * found.share:.0f} % '
+            'of the log; hold each rate for longer, or use the heading itself with '
             '--method likelihood')
 
 
 def _little(share: float) -> Iterator[str]:
     if share <= 0.25:
-        yield f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood uses all of it, where there is a heading'
+        yield (f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood uses '
+               'all of it, where there is a heading')
 
 
 def _found(log: Log, limits: Steadiness) -> Stretches:
     """Find the dwells in a log with one reference."""
     samples, lost = usable(log)
-    parts = [part for part in _calm(samples, limits) if duration(samples.time, part) > limits.duration]
+    parts = [part for part in _calm(samples, limits)
+             if duration(samples.time, part) > limits.duration]
     samples = samples._replace(scale=_scale(samples, parts))
     cleaned = [clean(samples, part, limits.wild) for part in parts]
     whole, cut = settled(samples, [part.rows for part in cleaned], limits)
     whole, divided = _divided(samples, whole, limits)
-    rows = [part for part in whole if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
+    rows = [part for part in whole
+            if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
     short = _short(len(whole) - len(rows), limits.duration)
-    return Stretches(samples, rows, (*lost, *short, cut, *divided, *left_out(samples, rows, cleaned), *missing(log, samples, rows)))
+    return Stretches(samples, rows, (*lost, *short, cut, *divided,
+                                     *left_out(samples, rows, cleaned),
+                                     *missing(log, samples, rows)))
 
 
 def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
@@ -103,10 +120,10 @@ def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
 
 
 def _scale(samples: Samples, parts: list[slice]) -> float:
-    """Return roughly how the output goes with the reference: it may run the other way, or count in units of its own."""
+    """Return the rough ratio of output to reference; it may be negative or in other units."""
     rate = np.array([_rate(samples, part) for part in parts])
     output = np.array([np.median(samples.output[part]) for part in parts])
-    # Rests alone tell nothing of it.
+    # Rests alone do not determine it.
     return slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
 
 
@@ -117,14 +134,16 @@ def _rate(samples: Samples, part: slice) -> float:
     return slope(samples.time[part], samples.heading[part])
 
 
-def _divided(samples: Samples, dwells: list[Numbers], limits: Steadiness) -> tuple[list[Numbers], list[str]]:
+def _divided(samples: Samples, dwells: list[Numbers],
+             limits: Steadiness) -> tuple[list[Numbers], list[str]]:
     """Divide the dwells along which the temperature changes, so that its slope can be seen."""
     if samples.temperature is None:
         return dwells, []
     pieces = [_pieces(samples.time[rows], samples.temperature[rows], limits) for rows in dwells]
     parts = [part for rows, number in zip(dwells, pieces) for part in np.array_split(rows, number)]
     more = len(parts) - len(dwells)
-    remark = f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, which makes {more} more'
+    remark = (f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, '
+              f'which makes {more} more')
     return parts, [remark] if more else []
 
 
@@ -132,7 +151,8 @@ def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
     if len(temperature) < 2 * _PARTS:
         return 1
     change = float(np.ptp([part.mean() for part in np.array_split(temperature, _PARTS)]))
-    return max(1, min(math.ceil(change / limits.temperature), int((time[-1] - time[0]) / limits.duration)))
+    return max(1, min(math.ceil(change / limits.temperature),
+                      int((time[-1] - time[0]) / limits.duration)))
 
 
 def _short(number: int, least: float) -> Iterator[str]:

@@ -9,9 +9,9 @@ import numpy as np
 from gyro_calibration.dwells.samples import Numbers
 from gyro_calibration.log import DEGREE, Array
 
-#: Sweeps shorter than this on the whole are no sweeps but chance.
+#: If the median sweep has fewer dwells than this, the order is taken as chance.
 _SHORTEST = 4
-#: Blocks of consecutive dwells, where the order tells no sweeps.
+#: Blocks of consecutive dwells, where the order shows no sweeps.
 _BLOCKS = 9
 
 
@@ -23,10 +23,11 @@ def numbered(names: Sequence[str]) -> Numbers:
 
 def sweeps(rate: Array) -> Numbers:
     """
-    Return the number of the sweep that each dwell belongs to, by the order of the rates, shape (n,).
+    Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
 
-    Tables go through the rates in one direction, or through their sizes with changing sign, with or without a rest between them. Where
-    the order tells nothing, blocks of consecutive dwells stand for sweeps: they are as far apart in time.
+    Tables go through the rates in one direction, or through their sizes with changing sign, with
+    or without a rest between them. Where the order shows no sweeps, blocks of consecutive dwells
+    are taken for sweeps: they are as far apart in time.
 
     """
     turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
@@ -43,15 +44,15 @@ def sweeps(rate: Array) -> Numbers:
 
 
 def _passes(value: Array) -> Numbers:
-    """Number the passes through some values: a new one begins where the direction of travel turns back or the values start anew."""
+    """Number the passes through values: a new one begins where the direction turns back."""
     change = np.diff(value)
-    # Found rates of opposite sign are not of the same size to the last digit.
+    # Rates that were found differ slightly in size if their sign is opposite.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
     numbers = np.zeros(len(value), dtype=int)
     direction = 0.0
     for place, step in enumerate(steps, 1):
         turned = step * direction < 0.0
         numbers[place] = numbers[place - 1] + turned
-        # The jump back to the start of the next pass says nothing about its direction.
+        # The jump back to the start of the next pass does not show its direction.
         direction = 0.0 if turned else direction or step
     return numbers

@@ -1,4 +1,4 @@
-"""Dwells as a table: the rows of a rate table, or what is found in a log in time."""
+"""Dwells as a table: the rows of a rate table, or the dwells that are found in a log in time."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ class Dwells:
     rate : of the reference, rad/s
     output : of the gyro, rad/s
     temperature : degC; None where the log holds none
-    deviation : standard deviation of the mean output against the mean reference, rad/s; nan where it is not known
-    sweep : number of the sweep, or block of time, that a dwell belongs to; what is left out together
-    place : where each dwell stands in its file, for messages
-    remarks : what was found and left out, one sentence each
-    rows : of its log, which each dwell is the mean of
+    deviation : standard deviation of the mean output against the mean reference, rad/s; nan where
+        it is not known
+    sweep : number of the sweep, or block of time, of each dwell; cross-validation leaves a sweep
+        out as a whole
+    place : of each dwell in its file, for messages
+    remarks : on what was found and left out, one sentence each
+    rows : of the log, whose mean each dwell is
 
     """
 
@@ -48,7 +50,7 @@ class Dwells:
 
 def dwells(log: Log, name: str = '') -> Dwells:
     """
-    Return the dwells of a log: the rows of a rate table, or what is found in a log in time.
+    Return the dwells of a log: the rows of a rate table, or stretches of a log in time.
 
     Parameters
     ----------
@@ -72,12 +74,18 @@ def take(dwells: Dwells, which: Mask) -> Dwells:
     temperature = None if dwells.temperature is None else dwells.temperature[which]
     places = tuple(place for place, wanted in zip(dwells.place, which) if wanted)
     rows = tuple(rows for rows, wanted in zip(dwells.rows, which) if wanted)
-    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which], temperature=temperature,
-                   deviation=dwells.deviation[which], sweep=dwells.sweep[which], place=places, rows=rows)
+    return replace(dwells, rate=dwells.rate[which], output=dwells.output[which],
+                   temperature=temperature, deviation=dwells.deviation[which],
+                   sweep=dwells.sweep[which], place=places, rows=rows)
 
 
 def join(parts: Sequence[Dwells]) -> Dwells:
-    """Return the dwells of several logs as one, their sweeps numbered apart; without temperature where one of them has none."""
+    """
+    Return the dwells of several logs as one, with separate sweeps.
+
+    They are without temperature where one of the logs has none.
+
+    """
     if not parts:
         raise DataRefused('no dwells were given; give at least one log')
     first = np.cumsum([0] + [int(part.sweep.max()) + 1 for part in parts])
@@ -85,18 +93,22 @@ def join(parts: Sequence[Dwells]) -> Dwells:
     whole = len(temperatures) == len(parts)
     remarks = sum((part.remarks for part in parts), ())
     if temperatures and not whole:
-        remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, so that of the others is not used',)
-    return Dwells(np.concatenate([part.rate for part in parts]), np.concatenate([part.output for part in parts]),
-                  np.concatenate(temperatures) if whole else None, np.concatenate([part.deviation for part in parts]),
+        remarks += (f'{len(parts) - len(temperatures)} of {len(parts)} logs hold no temperature, '
+                    'so that of the others is not used',)
+    return Dwells(np.concatenate([part.rate for part in parts]),
+                  np.concatenate([part.output for part in parts]),
+                  np.concatenate(temperatures) if whole else None,
+                  np.concatenate([part.deviation for part in parts]),
                   np.concatenate([part.sweep + number for part, number in zip(parts, first)]),
-                  sum((part.place for part in parts), ()), remarks, sum((part.rows for part in parts), ()))
+                  sum((part.place for part in parts), ()), remarks,
+                  sum((part.rows for part in parts), ()))
 
 
 def from_table(log: Log) -> Dwells:
     """
     Return the rows of a rate table.
 
-    The columns `sweep` (any text) and `deviation_dps` (of each mean) are used where the file has them.
+    The columns `sweep` (any text) and `deviation_dps` (of each mean) are used if present.
 
     Raises
     ------
@@ -105,15 +117,18 @@ def from_table(log: Log) -> Dwells:
     """
     output = output_of(log)
     if log.reference_rate is None:
-        raise DataRefused('the rows have no time and no reference rate; a rate table needs the column reference_rate_dps')
+        raise DataRefused('the rows have no time and no reference rate; a rate table needs the '
+                          'column reference_rate_dps')
     good = np.isfinite(output) & np.isfinite(log.reference_rate)
     if not good.any():
-        raise DataRefused(f'none of the {len(output)} rows holds both a gyro output and a reference rate; look at the columns')
+        raise DataRefused(f'none of the {len(output)} rows holds both a gyro output and '
+                          'a reference rate; look at the columns')
     rows = np.flatnonzero(good)
     rate, names = log.reference_rate[rows], log.others.get('sweep')
     sweep = sweeps(rate) if names is None else numbered([names[row] for row in rows])
-    return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows], _told_deviation(log)[rows], sweep,
-                  tuple(f'row {row + 1}' for row in rows), tuple(_lost_rows(good)), tuple(np.split(rows, len(rows))))
+    return Dwells(rate, output[rows], None if log.temperature is None else log.temperature[rows],
+                  _told_deviation(log)[rows], sweep, tuple(f'row {row + 1}' for row in rows),
+                  tuple(_lost_rows(good)), tuple(np.split(rows, len(rows))))
 
 
 def _told_deviation(log: Log) -> Array:
@@ -123,14 +138,16 @@ def _told_deviation(log: Log) -> Array:
     try:
         values = np.array(texts, dtype=float) * DEGREE
     except ValueError as error:
-        raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, or nan where it is not known') from None
+        raise DataRefused(f'column deviation_dps: {error}; wanted deg/s, '
+                          'or nan where it is not known') from None
     return np.where(values > 0.0, values, np.nan)
 
 
 def _lost_rows(good: Mask) -> Iterator[str]:
     lost = np.flatnonzero(~good) + 1
     if len(lost):
-        yield f'{len(lost)} rows without output or reference are left out: {listed([str(row) for row in lost])}'
+        yield (f'{len(lost)} rows without output or reference are left out: '
+               f'{listed([str(row) for row in lost])}')
 
 
 def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
@@ -146,6 +163,9 @@ def find_dwells(log: Log, limits: Steadiness | None = None) -> Dwells:
     rate, output, deviation = averaged(samples, dwells)
     time, temperature = samples.time, samples.temperature
     row = np.searchsorted(np.asarray(log.time), time)
-    return Dwells(rate, output, None if temperature is None else np.array([temperature[rows].mean() for rows in dwells]), deviation,
-                  sweeps(rate), tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells), remarks,
-                  tuple(row[rows] for rows in dwells))
+    return Dwells(rate, output,
+                  None if temperature is None
+                  else np.array([temperature[rows].mean() for rows in dwells]),
+                  deviation, sweeps(rate),
+                  tuple(f'{time[rows[0]]:.1f} to {time[rows[-1]]:.1f} s' for rows in dwells),
+                  remarks, tuple(row[rows] for rows in dwells))
