@@ -1,9 +1,10 @@
 """
-Whether a gyro at rest still is what its model claims: its noise, and its bias.
+Check whether a gyro at rest has the noise and the bias of its model.
 
-Samples are gathered to stretches of `STRETCH` s in which the rate is steady, as it is at rest. In each, the noise is compared with the
-model's by the mean square of differences of neighbouring blocks, and the mean rate with zero. Both tests have a level, so that they alarm
-in vain not more often than was stated.
+Samples are gathered to stretches of `STRETCH` s in which the rate is steady, as it is at rest. In
+each, the noise is compared with the model's by the mean square of differences of neighbouring
+blocks, and the mean rate with zero. The levels of both tests follow from a stated rate of false
+alarms.
 
 """
 
@@ -20,26 +21,30 @@ from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.noise import Noise
 
-#: Length of a stretch, of a part that must be steady, and of a block whose mean is compared with its neighbour's, s.
+#: Length of a stretch, of a part that must be steady, and of a block whose mean is compared with
+#: its neighbour's, s.
 STRETCH, _PART, _BLOCK = 10.0, 1.0, 0.05
 #: Longest interval between samples, s.
 _GAP = 0.5
-#: Noise up to so many times the model's is no misfit, for figures are not better known, and change with age.
+#: Noise up to this many times the model's is accepted: figures are inexact and change with age.
 TOLERANCE = 1.25
-#: Noise down to a part of so much is none either: a gyro that filters its output shows less of it in neighbouring blocks.
+#: Noise down to the model's divided by this is accepted: a gyro that filters its output has less
+#: noise in neighbouring blocks.
 QUIET = 3.0
-#: Parts may vary by so many times the variance that noise explains; with 9 degrees of freedom chance does so once in a million stretches.
+#: Limit of the variance of parts over the one that noise explains; with 9 degrees of freedom
+#: chance exceeds it once in a million stretches.
 _STEADY = 6.0
-#: How often a calibration is said in vain to differ from the one before.
+#: Chance that a calibration is falsely reported to differ from the one before.
 CHANCE = 1e-3
-#: So many stretches in a row decide where nobody promised that the gyro rests, for a robot that goes straight may shake for a while.
+#: Number of stretches in a row that decide where the rest is not announced, since a robot that
+#: goes straight may shake for a while.
 _IN_A_ROW = 3
 
 
 @dataclass(frozen=True)
 class Rest:
     """
-    What one stretch at rest showed.
+    The result of one stretch at rest.
 
     Attributes
     ----------
@@ -47,10 +52,11 @@ class Rest:
     noise_ratio : standard deviation of the noise over the one that the model claims
     noise_fits : whether that is within chance and tolerance
     bias : mean rate, rad/s
-    sigmas : of the mean, in standard deviations of what the model explains; nan where it does not say how well the bias is known
+    sigmas : of the mean, in standard deviations of what the model explains; nan where the model
+        does not give the accuracy of the bias
     bias_fits : whether that is within chance
-    bias_deviation : what the noise of this stretch explains of the mean, rad/s
-    promised : somebody said that the gyro rests
+    bias_deviation : standard deviation of the mean by the noise of this stretch, rad/s
+    promised : whether the rest was announced
 
     """
 
@@ -77,8 +83,9 @@ class HealthMonitor:
 
     Attributes
     ----------
-    standing : a mean below this, rad/s, is rest; one above may be a steady turn, and counts where it comes again and again
-    noise_alarm, bias_alarm : one sentence each, '' while all is well
+    standing : a mean below this, rad/s, is rest; one above may be a steady turn, and counts if it
+        is the same in several stretches
+    noise_alarm, bias_alarm : one sentence each, '' without an alarm
     last : the last stretch at rest, or None
     examined : number of stretches at rest
 
@@ -90,9 +97,9 @@ class HealthMonitor:
 
         Parameters
         ----------
-        noise : what the model claims; without an angle random walk nothing is checked
-        false_alarms : at most so many in an hour at rest, 1/h; 0 checks nothing
-        standing : rad/s, see above
+        noise : of the model; without an angle random walk nothing is checked
+        false_alarms : largest rate of false alarms at rest, 1/h; 0 checks nothing
+        standing : see above, rad/s
 
         """
         self._noise, self.standing = noise, standing
@@ -107,22 +114,28 @@ class HealthMonitor:
 
     @property
     def works(self) -> bool:
-        """Tell whether there is anything to check."""
+        """Return whether there is anything to check."""
         return self._noise.angle_random_walk > 0.0 and self._level > 0.0
 
     def restart(self) -> None:
-        """Forget the samples gathered so far, as after a gap."""
+        """Drop the samples gathered so far, as after a gap."""
         self._gathered = _Gathered()
 
     def recalibrated(self) -> None:
-        """Forget what the bias was, as another calibration is in use."""
+        """Drop the past biases, as another calibration is in use."""
         self.restart()
         self._rests.clear()
         self.bias_alarm = ''
 
     def add(self, time: float, output: float, rate: float) -> bool:
         """
-        Take a sample: its stamp, s, the output, and the rate after model and self-calibration, rad/s.
+        Take a sample.
+
+        Parameters
+        ----------
+        time : stamp, s
+        output : rad/s
+        rate : after model and self-calibration, rad/s
 
         Returns
         -------
@@ -146,17 +159,18 @@ class HealthMonitor:
         ----------
         bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
         age : of that calibration, s
-        promised : somebody said that the gyro rests
+        promised : whether the rest was announced
 
         Returns
         -------
-        what it showed; None where it is not steady, which is no rest
+        the result; None where the rate is not steady, which is no rest
 
         """
         time, output, rate = (np.array(values) for values in vars(self._gathered).values())
         self.restart()
         self._step = min(self._step, step_of(output))
-        rest = examine(time, output, rate, self._noise, self._level, self._step, bias_variance, age, promised)
+        rest = examine(time, output, rate, self._noise, self._level, self._step, bias_variance,
+                       age, promised)
         if rest is not None:
             self.last, self.examined = rest, self.examined + 1
             self._rests = [*self._rests, rest][-_IN_A_ROW:]
@@ -170,40 +184,44 @@ class HealthMonitor:
             self.noise_alarm = _noise_sentence(rest)
         if rest.bias_fits:
             self.bias_alarm = ''
-        elif rest.promised or abs(rest.bias) < self.standing or self._in_a_row('bias_fits') and self._stays():
+        elif (rest.promised or abs(rest.bias) < self.standing
+              or self._in_a_row('bias_fits') and self._stays()):
             self.bias_alarm = _bias_sentence(rest)
 
     def _in_a_row(self, fits: str) -> bool:
-        return len(self._rests) == _IN_A_ROW and not any(getattr(each, fits) for each in self._rests)
+        return (len(self._rests) == _IN_A_ROW
+                and not any(getattr(each, fits) for each in self._rests))
 
     def _stays(self) -> bool:
-        """Tell whether the mean was the same in the last stretches, which a robot that turns does not manage."""
+        """Return whether the mean was the same in the last stretches, unlike that of turns."""
         biases = [each.bias for each in self._rests]
         return max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in self._rests)
 
 
-def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float, step: float = 0.0, bias_variance: float = math.nan,
-            age: float = 0.0, promised: bool = False) -> Rest | None:
+def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
+            step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
+            promised: bool = False) -> Rest | None:
     """
-    Test a stretch of samples against what a model claims of noise and bias.
+    Test a stretch of samples against noise and bias of a model.
 
-    The codes of a gyro that rounds coarsely do not show its noise: the tests allow for what rounding may add or hide.
+    The codes of a gyro that rounds coarsely do not show its noise: the tests allow for what
+    rounding may add or hide.
 
     Parameters
     ----------
     time, output, rate : s and rad/s, shape (n,); the rate is after model and self-calibration
     noise : of the model
-    level : chance of each of the four ways to alarm in vain
-    step : between the codes of the output, rad/s; inf where it never changed, which tells nothing
-    bias_variance, age, promised : as in `Check.examine`
+    level : chance of each of the four false alarms
+    step : between the codes of the output, rad/s; inf where the output never changed
+    bias_variance, age, promised : as in `HealthMonitor.examine`
 
     Returns
     -------
-    what it showed; None where it is not steady, has too few samples, or values that no gyro means
+    the result; None where the rate is not steady, samples are too few, or values are absurd
 
     """
     if max(np.abs(output).max(), np.abs(rate).max()) > LARGEST:
-        return None  # no gyro means that, and its square may be too large for a number
+        return None  # no gyro has such rates, and their squares may overflow
     interval = (time[-1] - time[0]) / (len(time) - 1)
     size = max(1, round(_BLOCK / interval))
     if len(time) < 20 * size or step == math.inf:
@@ -220,12 +238,13 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     too_much = chdtrc(count, count * measured / ((claimed + rounding) * TOLERANCE ** 2)) < level
     too_little = not hidden and chdtr(count, count * measured * QUIET ** 2 / claimed) < level
     return Rest(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
-                *_bias(time, rate, largest * size * interval, noise, level, bias_variance, age, 0.5 * step if hidden else 0.0), promised)
+                *_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
+                       0.5 * step if hidden else 0.0), promised)
 
 
-def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float, bias_variance: float, age: float,
-          unsure: float) -> tuple[float, float, bool, float]:
-    """Return the mean rate, its size in standard deviations, whether it fits, and what the noise explains of it."""
+def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
+          bias_variance: float, age: float, unsure: float) -> tuple[float, float, bool, float]:
+    """Return the mean rate, its number of sigmas, whether it fits, and its deviation by noise."""
     duration, mean = float(time[-1] - time[0]), float(rate.mean())
     of_noise = spectrum / duration + unsure ** 2
     variance = of_noise + noise.wander(age, duration) + bias_variance
@@ -235,7 +254,7 @@ def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
 
 
 def step_of(output: Array) -> float:
-    """Return the step between codes, rad/s: the smallest difference of neighbours that is not zero; inf where there is none."""
+    """Return the smallest difference of neighbours above zero, rad/s; inf where there is none."""
     steps = np.abs(np.diff(output))
     return float(steps[steps > 0.0].min(initial=math.inf))
 
@@ -247,7 +266,7 @@ def _differences(output: Array, size: int) -> Array:
 
 
 def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
-    """Tell whether parts of the stretch differ no more than noise explains."""
+    """Return whether parts of the stretch differ by no more than noise explains."""
     part = ((time - time[0]) / _PART).astype(int)
     count = np.bincount(part)
     means = (np.bincount(part, rate) / np.maximum(count, 1))[count > 0.5 * count.max()]
@@ -255,35 +274,43 @@ def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
     return bool(means.var(ddof=1) <= _STEADY * explained)
 
 
-def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float, level: float = CHANCE) -> str:
+def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float,
+            level: float = CHANCE) -> str:
     """
-    Say whether a calibration differs from the one before by more than both of them and the noise explain; '' where not.
+    Return how a calibration differs from the one before, if noise does not explain it, else ''.
 
     Parameters
     ----------
     before : an infinite variance is of a value that was not known
-    noise : of the model; how far the bias wanders
+    noise : of the model, by which the bias drifts
     age : time between the two, s
-    level : chance to say so in vain
+    level : chance of a false report
 
     """
     if before.covariance is None or after.covariance is None:
         return ''
-    variances = np.diagonal(before.covariance) + np.diagonal(after.covariance) + [0.0, noise.wander(age, STRETCH)]
-    differences = np.array([after.scale_factor_error - before.scale_factor_error, after.bias - before.bias])
+    variances = (np.diagonal(before.covariance) + np.diagonal(after.covariance)
+                 + [0.0, noise.wander(age, STRETCH)])
+    differences = np.array([after.scale_factor_error - before.scale_factor_error,
+                            after.bias - before.bias])
     sigmas = np.abs(differences) / np.sqrt(variances)
-    said = [text for text, size in zip((f'the scale factor error by {100 * differences[0]:.3f} %',
-                                        f'the bias by {differences[1] / DEGREE:.4f} deg/s'), sigmas)
+    said = [text for text, size in zip(
+        (f'the scale factor error by {100 * differences[0]:.3f} %',
+         f'the bias by {differences[1] / DEGREE:.4f} deg/s'), sigmas)
             if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
-    return f'that is more than the model explains: it changed {" and ".join(said)}; if it does so again, diagnose a log' if said else ''
+    return (f'that is more than the model explains: it changed {" and ".join(said)}; '
+            'if it does so again, diagnose a log' if said else '')
 
 
 def _noise_sentence(rest: Rest) -> str:
-    remedy = 'record a log at rest, and run allan or diagnose on it' if rest.noise_ratio > 1.0 else 'look whether the gyro is alive'
+    remedy = ('record a log at rest, and run allan or diagnose on it' if rest.noise_ratio > 1.0
+              else 'look whether the gyro is alive')
     shaken = '' if rest.promised or rest.noise_ratio < 1.0 else ', or the robot shakes'
-    return f'the noise at rest is {rest.noise_ratio:.2f} times what the model claims{shaken}: {remedy}'
+    return (f'the noise at rest is {rest.noise_ratio:.2f} times what the model claims{shaken}: '
+            f'{remedy}')
 
 
 def _bias_sentence(rest: Rest) -> str:
-    return (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, {rest.sigmas:.0f} standard deviations of what the model '
-            'explains: calibrate, and if it comes back, diagnose a log')
+    return (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, {rest.sigmas:.0f} '
+            'standard deviations of what the model explains: calibrate, and if it comes back, '
+            'diagnose a log')

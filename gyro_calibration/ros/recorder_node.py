@@ -1,8 +1,9 @@
 """
-Takes messages from topics as they are, for a recorder.
+Receive messages from topics in serialized form, for a recorder.
 
-Types come from the graph, so that any message whose package is installed can be recorded. A subscription asks for what is offered: a best
-effort publisher is heard, and a reliable one loses nothing. Publishers may come late, go and come again with another quality.
+Types come from the graph, so that any message whose package is installed can be recorded. A
+subscription requests the QoS that is offered: best effort publishers are received, and reliable
+ones lose nothing. Publishers may come late, go and come again with another QoS.
 
 """
 
@@ -29,17 +30,17 @@ from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.ros.runner import call_every
 from gyro_calibration.storage import Message
 
-_DEPTH = 5000  # as SENSOR_QOS: a recorder that is busy for five seconds loses nothing at 1 kHz
-_LAST = 2.0  # s; within it is taken what had come before a recorder was told to stop
-_LOOK_INTERVAL = 0.3  # s; between two looks at the graph
-_LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process by itself
+_DEPTH = 5000  # as SENSOR_QOS: 5 s at 1 kHz are kept while a recorder is busy
+_LAST = 2.0  # s; longest time for taking what had come before a recorder is stopped
+_LOOK_INTERVAL = 0.3  # s; between two queries of the graph
+_LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process
 _LINE = '=' * 80
 _WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
 
 
 class RecorderNode(Node):
     """
-    Subscribes to topics as soon as they are there, and hands over each message with the definition of its kind.
+    Subscribes to topics as they appear, and hands over each message with its definition.
 
     Parameters
     ----------
@@ -52,20 +53,22 @@ class RecorderNode(Node):
     Attributes
     ----------
     topics : tuple of str
-        Those that were asked for, as the graph names them.
+        Those that were asked for, with their full names.
     unknown : dict of str to str
-        Topics whose kind is not installed here, and why they cannot be recorded.
+        Topics whose type is not installed here, and why they cannot be recorded.
     taken : int
-        How many messages were handed over.
+        Number of messages that were handed over.
 
     Raises
     ------
-    LogError : a topic cannot have such a name
+    LogError : a topic name is not valid
 
     """
 
-    def __init__(self, topics: Sequence[str], everything: bool, take: Callable[[Message, str], None], context: rclpy.Context):
-        super().__init__('gyro_calibration_recorder', context=context, start_parameter_services=False, enable_rosout=False)
+    def __init__(self, topics: Sequence[str], everything: bool,
+                 take: Callable[[Message, str], None], context: rclpy.Context):
+        super().__init__('gyro_calibration_recorder', context=context,
+                         start_parameter_services=False, enable_rosout=False)
         self.topics = tuple(_resolved(self, topic) for topic in topics)
         self.unknown: dict[str, str] = {}
         self.taken = 0
@@ -77,11 +80,11 @@ class RecorderNode(Node):
 
     @property
     def missing(self) -> list[str]:
-        """Topics that were asked for, and that nobody publishes so far."""
+        """Return the topics that were asked for and have no publisher so far."""
         return [topic for topic in self.topics if topic not in self._subscriptions_of]
 
     def known(self) -> list[str]:
-        """Return the topics that there are."""
+        """Return the topics in the graph."""
         return sorted(name for name, _ in self.get_topic_names_and_types())
 
     def look(self) -> None:
@@ -104,14 +107,17 @@ class RecorderNode(Node):
         except (ImportError, AttributeError) as error:
             self.unknown[topic] = f'{kind} is not installed here ({error})'
             return
-        subscription = self.create_subscription(load(kind), topic, self._taker(topic, kind, definition), quality, raw=True)
+        subscription = self.create_subscription(load(kind), topic,
+                                                self._taker(topic, kind, definition), quality,
+                                                raw=True)
         self._subscriptions_of[topic] = offered, subscription
 
     def _taker(self, topic: str, kind: str, definition: str) -> Callable[[bytes], None]:
-        # By the steady clock: the time of receiving must not jump where somebody sets the clock.
+        # By the steady clock: the time of receipt must not jump when the clock is set.
         def take(data: bytes) -> None:
             self.taken += 1
-            self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC), bytes(data)), definition)
+            self._take(Message(topic, kind, self._begin + round(steady() * NSEC_PER_SEC),
+                               bytes(data)), definition)
         return take
 
 
@@ -123,14 +129,16 @@ def _resolved(node: Node, topic: str) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Return what rclpy says in an error, without the place in its source."""
+    """Return the text of an error of rclpy, without the place in its source."""
     return str(error).partition(', at /')[0]
 
 
 def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """Return a quality that all publishers can serve, and that keeps what was sent before where all of them keep it."""
-    best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for each in publishers)
-    latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers)
+    """Return a QoS that all publishers can serve; transient local if that of all is."""
+    best_effort = any(each.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+                      for each in publishers)
+    latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                  for each in publishers)
     return QoSProfile(
         depth=_DEPTH,
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
@@ -139,11 +147,12 @@ def _quality(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
 
 def load(kind: str) -> Any:
     """
-    Return the class of a kind such as ``sensor_msgs/msg/Imu``.
+    Return the class of a message type such as ``sensor_msgs/msg/Imu``.
 
     Raises
     ------
-    ImportError : it is no kind of messages; anybody in the graph can name one, and must not choose what else is imported here
+    ImportError : it is no message type; any node in the graph can name one, and must not make this
+        one import other modules
 
     """
     if not re.fullmatch(r'\w+/msg/\w+', kind):
@@ -153,19 +162,20 @@ def load(kind: str) -> Any:
 
 
 def definition_of(kind: str) -> str:
-    """Return the fields of a kind, and then those of all kinds in it, as ROS 2 writes them."""
+    """Return the fields of a type, and then those of all types in it, as ROS 2 writes them."""
     kinds, parts = [kind], []
     for each in kinds:
         fields = load(each).get_fields_and_field_types()
         head = '' if each == kind else f'{_LINE}\nMSG: {each.replace("/msg/", "/")}\n'
         parts.append(head + ''.join(f'{_field(text)} {name}\n' for name, text in fields.items()))
-        inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/') for text in fields.values()]
+        inner = [re.sub(r'^sequence<|[,>\[].*$', '', text).replace('/', '/msg/')
+                 for text in fields.values()]
         kinds += [found for found in dict.fromkeys(inner) if '/' in found and found not in kinds]
     return ''.join(parts)
 
 
 def _field(text: str) -> str:
-    """Return the type of a field as it stands in a definition: of ``sequence<double, 3>``, ``float64[<=3]``."""
+    """Return the type of a field in a definition, ``float64[<=3]`` of ``sequence<double, 3>``."""
     if text.startswith('sequence<'):
         inner, _, most = text.removeprefix('sequence<').removesuffix('>').partition(', ')
         return f'{_field(inner)}[{f"<={most}" if most else ""}]'
@@ -174,20 +184,21 @@ def _field(text: str) -> str:
     return _WORDS.get(word, word) + bracket + length
 
 
-def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Message, str], None], tick: Callable[[RecorderNode], None],
-                  stop: threading.Event) -> None:
+def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Message, str], None],
+                  tick: Callable[[RecorderNode], None], stop: threading.Event) -> None:
     """
-    Hand over the messages of topics until told to stop.
+    Hand over the messages of topics until stopped.
 
     Parameters
     ----------
     topics, everything, take : as for `RecorderNode`
     tick : is called often, with the node
-    stop : is set by whoever wants it to end
+    stop : ends it when set
 
     Raises
     ------
-    LogError : a topic cannot have such a name, or ROS 2 cannot be started, as with an impossible ROS_DOMAIN_ID
+    LogError : a topic name is not valid, or ROS 2 cannot be started, as with an impossible
+        ROS_DOMAIN_ID
 
     """
     context = rclpy.Context()
@@ -210,9 +221,9 @@ def take_messages(topics: Sequence[str], everything: bool, take: Callable[[Messa
 
 
 def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> None:
-    """Hand over what waits in the queues: messages that came before the recorder was told to stop belong to the recording."""
+    """Hand over the messages in the queues, which came before the recorder was stopped."""
     deadline, idle = time.monotonic() + _LAST, 0
-    while idle < 3 and time.monotonic() < deadline:  # now and then it is a timer that is served
+    while idle < 3 and time.monotonic() < deadline:  # a call may also serve a timer
         before = node.taken
         executor.spin_once(timeout_sec=0.0)
         idle = 0 if node.taken > before else idle + 1
@@ -221,8 +232,10 @@ def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> Non
 def _start(context: rclpy.Context) -> None:
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
-        raise LogError(f'ROS_DOMAIN_ID is {domain}, but the largest is {_LARGEST_DOMAIN}; set another')
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but the largest is {_LARGEST_DOMAIN}; '
+                       'set another')
     try:
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:
-        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); set its variables otherwise') from None
+        raise LogError(f'ROS 2 cannot be started ({_reason(error)}); '
+                       'set its variables otherwise') from None

@@ -1,4 +1,4 @@
-"""What a robot keeps in files: the model of its gyro, the last self-calibration, and the biases that rests have shown."""
+"""The state of a robot in files: the gyro model, the last self-calibration, biases at rest."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class StateStore:
     ----------
     model : with its self-calibration; an empty one where it cannot be read
     table : of biases at rest
-    problem : why the rates are uncalibrated, in a sentence; '' where they are not
-    hint : what else is wrong with a file; ''
-    table_hint : what is wrong with the bias table; ''
-    shared_hint : that somebody else has written to a file since; ''
-    written : when the bias table was written last, s since 1970; None before
+    problem : why the rates are uncalibrated, in a sentence; '' where they are calibrated
+    hint : another fault of a file; '' without
+    table_hint : fault of the bias table; '' without
+    shared_hint : that another process has written to a file since; '' without
+    written : time of the last writing of the bias table, s since 1970; None before
 
     """
 
     def __init__(self, model_file: str, calibration_file: Path, bias_file: Path, prior: Prior):
-        """Read them; what is wrong with them is told, and the rest is used. What a killed run left half written is removed."""
+        """Read the files, use those without a fault, and remove what a killed run left behind."""
         for file in (calibration_file, bias_file):
             remove_leftovers(file)
         self._calibration_file, self._bias_file = calibration_file, bias_file
@@ -38,15 +38,18 @@ class StateStore:
         self.table, self.table_hint = BiasTable(self.model, prior), ''
         if not self.problem:
             self.table, self.table_hint = read_bias_table(bias_file, self.model, prior)
-        self.shared_hint, self._seen = '', {file: _version(file) for file in (calibration_file, bias_file)}
+        self.shared_hint, self._seen = '', {file: _version(file)
+                                            for file in (calibration_file, bias_file)}
 
     def look(self) -> None:
-        """Look whether somebody else has written to the files, as another node does that was given the same; to be called now and then."""
+        """Look whether another process has written to the files; to be called now and then."""
         for file, seen in self._seen.items():
             found = _version(file)
             if found is not None and found != seen:
-                self.shared_hint = plain(f'{file} was written by somebody else, and whoever writes next replaces that: give each node a '
-                                    'calibration_file of its own, or restart this one to use what is there')
+                self.shared_hint = plain(
+                    f'{file} was written by somebody else, and whoever writes next replaces that: '
+                    'give each node a calibration_file of its own, or restart this one to use '
+                    'what is there')
 
     def _written(self, file: Path, version: tuple[int, int]) -> None:
         self.shared_hint, self._seen[file] = '', version
@@ -67,22 +70,25 @@ class StateStore:
             self.hint = f'the last self-calibration is not used: {error}'
             return model
         if fault := _fault(stored, model):
-            self.hint = plain(f'the self-calibration in {self._calibration_file} is not used: {fault}; calibrate again')
+            self.hint = plain(f'the self-calibration in {self._calibration_file} is not used: '
+                              f'{fault}; calibrate again')
             return model
         return with_self_calibration(model, stored.self_calibration)
 
     def keep(self, calibration: SelfCalibration) -> str:
-        """Keep a calibration, and return what went wrong with that."""
+        """Store a calibration, and return what went wrong, '' if nothing."""
         self.model, self.hint = with_self_calibration(self.model, calibration), ''
         try:
             self._written(self._calibration_file, write_model(self._calibration_file, self.model))
         except (OSError, ArithmeticError) as error:
-            wanted = remedy(error, self._calibration_file) if isinstance(error, OSError) else 'see whether the rates are right'
-            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): {wanted}, and calibrate again')
+            wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
+                      else 'see whether the rates are right')
+            self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): '
+                              f'{wanted}, and calibrate again')
         return self.hint
 
     def keep_table(self, now: float, ending: bool = False) -> None:
-        """Write the table if it learned something, but seldom, and at the end; `now` in s since 1970."""
+        """Write the table if it is due, and at the end; `now` in s since 1970."""
         if self.problem or not self.table.due(now, ending):
             return
         try:
@@ -91,11 +97,12 @@ class StateStore:
             self._written(self._bias_file, written)
         except OSError as error:
             self.table.not_kept(now)
-            self.table_hint = plain(f'the bias table cannot be written ({reason(error)}): {remedy(error, self._bias_file)}')
+            self.table_hint = plain(f'the bias table cannot be written ({reason(error)}): '
+                                    f'{remedy(error, self._bias_file)}')
 
 
 def _fault(stored: GyroModel, model: GyroModel) -> str:
-    """Return why a stored self-calibration does not belong to a model, as a part of a sentence; '' if it does."""
+    """Return why a stored self-calibration does not fit a model, for a sentence; '' if it does."""
     if stored.self_calibration is None:
         return 'the file holds none, as one that was cut off'
     if not same_effects(stored, model):
@@ -103,7 +110,8 @@ def _fault(stored: GyroModel, model: GyroModel) -> str:
     theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))
     if theirs == ours:
         return ''
-    of = f'the gyro with the serial number {theirs}' if theirs else 'a gyro without a serial number'
+    of = (f'the gyro with the serial number {theirs}' if theirs
+          else 'a gyro without a serial number')
     return f'it belongs to {of}, and the model to {ours or "one without"}'
 
 
