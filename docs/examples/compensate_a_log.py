@@ -3,8 +3,8 @@ Compensate a log by a model, and integrate the heading with its standard deviati
 
     python compensate_a_log.py [OUT.csv]
 
-The log is simulated here, so that the truth is known. With files of your own: ``log = read_log('drive.csv')``, and
-``model = read_model('model.yaml')``.
+The log is simulated here, so that the truth is known. With files of your own:
+``log = read_log('drive.csv')``, and ``model = read_model('model.yaml')``.
 
 """
 
@@ -25,7 +25,8 @@ from gyro_calibration.simulation import simulate
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
 MODEL = GyroModel(
     (Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,)), Term(THERMAL_LAG, (60.0, 1e-4))),
-    covariance=np.diag([1e-4, 5e-4, 5.0, 1e-5]) ** 2,  # of bias, (rad/s)², scale factor error, time constant, s², and lag, (rad/s/K)²
+    # of bias, (rad/s)², scale factor error, time constant, s², and lag, (rad/s/K)²
+    covariance=np.diag([1e-4, 5e-4, 5.0, 1e-5]) ** 2,
     noise=NOISE)
 
 
@@ -33,13 +34,17 @@ def main(path='compensated.csv'):
     temperature = np.linspace(20.0, 45.0, round(100.0 * ROBOT.duration) + 1)
     log = simulate(MODEL, ROBOT, 100.0, np.random.default_rng(1), temperature)
     result, sensitivity = LogCompensation(MODEL).add(log)
-    integrator = BlockIntegrator(Threshold(angle_random_walk=NOISE.angle_random_walk), NOISE, covariance(MODEL))
+    integrator = BlockIntegrator(Threshold(angle_random_walk=NOISE.angle_random_walk), NOISE,
+                                 covariance(MODEL))
     filtered, heading, deviation = integrator.add(log.time, result.rate, sensitivity)
-    write_log(path, log, {'rate_rad_s': filtered, 'heading_rad': heading, 'heading_std_rad': deviation})
+    write_log(path, log, {'rate_rad_s': filtered, 'heading_rad': heading,
+                          'heading_std_rad': deviation})
 
     raw = integrate(log.time, log.output)
-    print(f'After {log.time[-1]:.0f} s the heading is off by {(raw - log.reference_heading)[-1] / DEGREE:.2f} deg as reported, and by '
-          f'{(heading - log.reference_heading)[-1] / DEGREE:.2f} deg (standard deviation {deviation[-1] / DEGREE:.2f}) when compensated.')
+    print(f'After {log.time[-1]:.0f} s the heading is off by '
+          f'{(raw - log.reference_heading)[-1] / DEGREE:.2f} deg as reported, and by '
+          f'{(heading - log.reference_heading)[-1] / DEGREE:.2f} deg '
+          f'(standard deviation {deviation[-1] / DEGREE:.2f}) when compensated.')
 
 
 if __name__ == '__main__':

@@ -1,9 +1,10 @@
 """
-Diagnose a log: hide an effect in a simulated drive, let the diagnosis name it, and compensate another drive by the extended model.
+Diagnose a log of a gyro with a hidden effect, and compensate another log by the extended model.
 
     python diagnose_a_log.py [DIR]
 
-The logs are simulated here, so that the truth is known. With logs of your own: ``diagnose([read_log('drive.csv')], generator, model)``.
+The logs are simulated here, so that the truth is known. With logs of your own:
+``diagnose([read_log('drive.csv')], generator, model)``.
 
 """
 
@@ -26,11 +27,12 @@ from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
 
 NOISE = Noise(angle_random_walk=1.5e-4)
-#: What is believed of the gyro.
+#: The model of the gyro that is in use.
 MODEL = GyroModel((Term(BIAS, (2e-4,)), Term(SCALE_FACTOR_ERROR, (0.01,))), noise=NOISE)
-#: What the gyro is: its element is as warm as the thermometer beside it only after some minutes.
+#: The gyro: its element follows the thermometer beside it only after some minutes.
 TRUE_GYRO = GyroModel((*MODEL.terms, Term(THERMAL_LAG, (120.0, 2e-4))), noise=NOISE)
-DRIVE = turns([(30.0, 0.0), (9.0, 40.0), (20.0, 0.0), (6.0, -60.0), (15.0, 20.0), (40.0, -10.0)] * 8, ramp=1.0)
+DRIVE = turns([(30.0, 0.0), (9.0, 40.0), (20.0, 0.0), (6.0, -60.0), (15.0, 20.0),
+               (40.0, -10.0)] * 8, ramp=1.0)
 
 
 def drive(generator):
@@ -50,7 +52,8 @@ def main(folder='.'):
     other = drive(generator)
     for name, model in (('as it was', MODEL), ('extended', found.model)):
         error = integrate(other.time, compensate_log(model, other)) - other.reference_heading
-        print(f'Another drive, compensated by the model {name}: up to {np.abs(error).max() / DEGREE:.2f} deg off the true heading.')
+        print(f'Another drive, compensated by the model {name}: '
+              f'up to {np.abs(error).max() / DEGREE:.2f} deg off the true heading.')
 
 
 if __name__ == '__main__':

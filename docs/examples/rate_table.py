@@ -1,9 +1,10 @@
 """
-Calibrate a gyro on a rate table over temperature, and see how well the model predicts sweeps that it was not fitted to.
+Calibrate a gyro on a rate table over temperature, and predict sweeps that were left out.
 
     python rate_table.py [MODEL.yaml]
 
-The table is simulated here, so that the truth is known. With one of your own: ``dwells(read_log('table.csv'))``.
+The table is simulated here, so that the truth is known. With one of your own:
+``dwells(read_log('table.csv'))``.
 
 """
 
@@ -19,8 +20,10 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.selection import select_effects
 
-#: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor that falls with temperature.
-TRUE_GYRO = GyroModel((Term(BIAS, (0.01 * DEGREE,)), Term(SINE_RESPONSE, (0.25, 1.0)), Term(SCALE_FACTOR_TEMPERATURE, (35.0, -4e-4))))
+#: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor
+#: that falls with temperature.
+TRUE_GYRO = GyroModel((Term(BIAS, (0.01 * DEGREE,)), Term(SINE_RESPONSE, (0.25, 1.0)),
+                       Term(SCALE_FACTOR_TEMPERATURE, (35.0, -4e-4))))
 SCATTER = 0.02 * DEGREE  # of a dwell's mean, rad/s
 
 
@@ -38,10 +41,12 @@ def main(path='model.yaml'):
     fit = selection.calibration
     for choice in selection.choices:
         print(f'{choice.effect:28}{"taken" if choice.taken else "not taken":10} {choice.reason}')
-    print(f'error {fit.before_rms / DEGREE:.3f} deg/s rms before, {fit.left_out_rms / DEGREE:.3f} in sweeps left out')
+    print(f'error {fit.before_rms / DEGREE:.3f} deg/s rms before, '
+          f'{fit.left_out_rms / DEGREE:.3f} in sweeps left out')
     write_model(path, fit.model)
     compensated = compensate(fit.model, TRUE_GYRO.output(1.5, 30.0), 30.0)
-    print(f'written to {path}; a turn of 1.5 rad/s at 30 degC is reported as {compensated.rate:.5f} rad/s')
+    print(f'written to {path}; a turn of 1.5 rad/s at 30 degC is reported as '
+          f'{compensated.rate:.5f} rad/s')
 
 
 if __name__ == '__main__':

@@ -3,8 +3,8 @@ Find scale factor error and bias from 20 s of known motion, and write them into 
 
     python self_calibrate_a_log.py [MODEL.yaml]
 
-The log is simulated here, so that the truth is known. With a log of your own: ``log = read_log('run.csv')``, and
-``motion = read_motion('profile.csv')``.
+The log is simulated here, so that the truth is known. With a log of your own:
+``log = read_log('run.csv')``, and ``motion = read_motion('profile.csv')``.
 
 """
 

@@ -1,5 +1,7 @@
 """
-Compare the three methods of self-calibration on simulated runs; the numbers are those of docs/self_calibration.md.
+Compare the three methods of self-calibration on simulated runs.
+
+The numbers are those of docs/self_calibration.md.
 
     python three_methods.py [RUNS]
 
@@ -19,21 +21,22 @@ from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.self_calibration import METHODS
 
 #: What Hong and Park (2008) report of the Epson XV-3500.
-GYRO = GyroModel((Term(BIAS, (2.18e-4,)), Term(SCALE_FACTOR_ERROR, (0.0373,))), noise=Noise(7.27e-4, 8.73e-5))
+GYRO = GyroModel((Term(BIAS, (2.18e-4,)), Term(SCALE_FACTOR_ERROR, (0.0373,))),
+                 noise=Noise(7.27e-4, 8.73e-5))
 TRUE = np.array([0.0373, 2.18e-4])
 TIME = np.arange(2001) / 100.0
 LAG = 0.2  # s
 
 
 def encoder(number: int) -> Motion:
-    """Return the motion as an encoder with steps of 0.5 deg sees it at 20 Hz, which begins elsewhere in a step in each run."""
+    """Return the motion by an encoder with steps of 0.5 deg at 20 Hz, from a random start."""
     time, step = np.arange(401) / 20.0, 0.5 * DEGREE
     begin = np.random.default_rng([number, 1]).uniform(0.0, step)
     return from_headings(time, np.round((CALIBRATION.heading_at(time) + begin) / step) * step)
 
 
 def profile(_: int) -> Motion:
-    """Return the profile, which is the same in each run."""
+    """Return the profile; it is the same in each run."""
     return CALIBRATION
 
 
@@ -44,7 +47,7 @@ def lagging() -> Array:
 
 
 def errors(true_rate: Array, reference: Callable[[int], Motion], runs: int) -> dict[str, Array]:
-    """Return the errors of s and b of each method, shape (runs, 2), against the reference of each run."""
+    """Return the errors of s and b of each method against the reference, shape (runs, 2)."""
     found = {name: np.empty((runs, 2)) for name in METHODS}
     for number in range(runs):
         noise = simulate_noise(GYRO.noise, len(TIME), 0.01, np.random.default_rng(number))

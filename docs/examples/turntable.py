@@ -1,10 +1,10 @@
 """
-Find scale factor error and bias without a rate table: on a record player with three speeds, and on a turntable with an encoder.
+Find scale factor error and bias on a record player with three speeds, and with an encoder.
 
     python turntable.py
 
-Both logs are simulated here, so that the truth is known. With logs of your own: ``dwells(read_log('speeds.csv'))`` and
-``calibrate_encoder(read_log('turntable.csv'))``.
+Both logs are simulated here, so that the truth is known. With logs of your own:
+``dwells(read_log('speeds.csv'))`` and ``calibrate_encoder(read_log('turntable.csv'))``.
 
 """
 
@@ -22,33 +22,39 @@ from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
 
-TRUE_GYRO = GyroModel((Term(BIAS, (0.2 * DEGREE,)), Term(SCALE_FACTOR_ERROR, (0.013,))), noise=Noise(angle_random_walk=5e-4))
+TRUE_GYRO = GyroModel((Term(BIAS, (0.2 * DEGREE,)), Term(SCALE_FACTOR_ERROR, (0.013,))),
+                      noise=Noise(angle_random_walk=5e-4))
 #: 0, 33 1/3 and 45 revolutions a minute, each for 30 s.
 RECORD_PLAYER = turns([(30.0, 0.0), (30.0, 200.0), (30.0, 270.0), (30.0, 0.0)], ramp=2.0)
-#: Turned by hand, both ways, not evenly.
-BY_HAND = turns([(4.0, 0.0), (3.0, 60.0), (4.0, -90.0), (3.0, 30.0), (5.0, 80.0), (4.0, -120.0), (5.0, 0.0)] * 4, ramp=1.0)
+#: Turned by hand, both ways, unevenly.
+BY_HAND = turns([(4.0, 0.0), (3.0, 60.0), (4.0, -90.0), (3.0, 30.0), (5.0, 80.0), (4.0, -120.0),
+                 (5.0, 0.0)] * 4, ramp=1.0)
 ENCODER_STEP = 2.0 * DEGREE
 
 
 def say(name, model):
     for term, deviation in zip(model.terms, np.sqrt(np.diag(model.covariance))):
         value, = term.values
-        unit, factor = ('%', 100.0) if term.effect is SCALE_FACTOR_ERROR else ('deg/s', 1.0 / DEGREE)
-        print(f'{name:14} {term.effect.name:20}{value * factor:9.4f} +- {deviation * factor:.4f} {unit}')
+        unit, factor = (('%', 100.0) if term.effect is SCALE_FACTOR_ERROR
+                        else ('deg/s', 1.0 / DEGREE))
+        print(f'{name:14} {term.effect.name:20}{value * factor:9.4f} '
+              f'+- {deviation * factor:.4f} {unit}')
 
 
 def record_player(generator):
-    """Three speeds that are known from the pulley or a strobe: the reference is a rate."""
+    """Calibrate by three speeds, known from the pulley or a strobe: the reference is a rate."""
     log = simulate(TRUE_GYRO, RECORD_PLAYER, 100.0, generator)
     say('record player', fit_effects(dwells(log), [BIAS, SCALE_FACTOR_ERROR]).model)
 
 
 def encoder(generator):
-    """A turntable whose encoder has steps of 2 deg: the reference is a heading, and the gyro integrates beside it."""
+    """Calibrate by an encoder with steps of 2 deg: the reference is a heading."""
     log = simulate(TRUE_GYRO, BY_HAND, 50.0, generator)
-    found = calibrate_encoder(replace(log, reference_heading=np.round(log.reference_heading / ENCODER_STEP) * ENCODER_STEP))
+    found = calibrate_encoder(replace(
+        log, reference_heading=np.round(log.reference_heading / ENCODER_STEP) * ENCODER_STEP))
     say('encoder', found.model)
-    print(f'{"":14} heading error {found.before.rms / DEGREE:.2f} deg rms before, {found.after.rms / DEGREE:.2f} after')
+    print(f'{"":14} heading error {found.before.rms / DEGREE:.2f} deg rms before, '
+          f'{found.after.rms / DEGREE:.2f} after')
 
 
 if __name__ == '__main__':

@@ -1,9 +1,10 @@
 """
-Write the model of a gyro from a calibration that is known as the matrix C of Ojeda, Chung and Borenstein (2000), eq. 11.
+Write a gyro model from the matrix C of Ojeda, Chung and Borenstein (2000), eq. 11.
 
     python write_a_model.py [MODEL.yaml]
 
-The matrix is in deg/s and degC, highest powers first. The numbers are made up: put those of your own gyro in their place.
+The matrix is in deg/s and degC, highest powers first. The numbers are made up: put those of your
+own gyro in their place.
 
 """
 
