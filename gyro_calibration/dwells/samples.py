@@ -14,7 +14,7 @@ from gyro_calibration.stamps import lost_samples
 
 #: Least number of samples of a dwell.
 FEWEST = 8
-#: Values of a reference are lost where it is further apart than this, in usual intervals.
+#: Largest distance of two values of a reference with none lost between them, in usual intervals.
 _LOST = 1.5
 #: Longer intervals than this are not used for the sample rate, s.
 _PAUSE = 1.0

@@ -25,7 +25,7 @@ class Steadiness:
         means
     rate : largest deviation of the reference, smoothed over the margin, from its middle, rad/s;
         less where it is quieter
-    relative : and this part of the rate, 1
+    relative : part of the rate that is added to that, 1
     heading : largest deviation of a reference heading from a straight line, besides its steps,
         rad; less where it is straighter
     gap : in longer gaps the reference is taken as unknown, s
