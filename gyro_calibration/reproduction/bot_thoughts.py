@@ -1,7 +1,7 @@
 """
 Bot Thoughts (blog): gyro calibration on a turntable and on a turntable with an encoder.
 
-Counts, deg/s and per cent, as the source has them; what is computed from rates is in SI until it is put beside them.
+Counts, deg/s and per cent are as in the source; rates are computed in SI and converted.
 
 """
 
@@ -28,11 +28,11 @@ from gyro_calibration.reproduction.finding import (
 from gyro_calibration.self_calibration import fit_rate
 
 TITLE = 'Bot Thoughts: gyro calibration of an L3G4200D (blog)'
-#: Turns a minute of a record player, and the strobe in Hz as it should be and as it was measured.
+#: Turns a minute of a record player, and the nominal and the measured frequency of the strobe, Hz.
 SPEEDS, STROBE, MEASURED_STROBE = (0.0, 100.0 / 3.0, 45.0), 60.0, 59.8
 #: Means at these speeds, counts.
 MEANS = (2.5654, -2854.5, -3857.9)
-#: From the three speeds: counts a deg/s, and deg/s; and the same by the solver on the encoder's rate.
+#: From the three speeds: counts a deg/s, and deg/s; the same by the solver on the encoder's rate.
 SCALE_FACTOR, NULL, SOLVED_SCALE, SOLVED_OFFSET = -14.309, -0.1793, -14.49787, -0.20168
 #: deg/s/K of the data sheet.
 BIAS_TEMPERATURE = 0.04
@@ -42,17 +42,21 @@ ENCODER_STEP, SAMPLE_RATE = 2.0 * DEGREE, 50.0
 #: Of the data sheet: 0.03 deg/s/sqrt(Hz), a one-sided density, which is sqrt(2) N.
 NOISE = Noise(0.03 * DEGREE / math.sqrt(2.0))
 #: Turns by hand at varying rates.
-BY_HAND = turns([(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200), (8, 120), (8, -60), (5, 0)], 1.0)
+BY_HAND = turns([(5, 0), (8, 60), (8, -120), (8, 200), (5, 0), (8, -200), (8, 120), (8, -60),
+                 (5, 0)], 1.0)
 ASSUMED = (
-    'The log of the encoder turntable is not published; 63 s of turning by hand up to 200 deg/s are simulated, with the noise of the '
-    'L3G4200D (0.03 deg/s/sqrt(Hz)), an encoder of 2 deg that begins anywhere in a step, 50 Hz, and a known scale.',
+    'The log of the encoder turntable is not published; 63 s of turning by hand up to 200 deg/s '
+    'are simulated, with the noise of the L3G4200D (0.03 deg/s/sqrt(Hz)), an encoder of 2 deg '
+    'that begins anywhere in a step, 50 Hz, and a known scale.',
 )
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
-    """Work through the blog."""
+def reproduce(generator: np.random.Generator, runs: int = 200,
+              progress: Progress = iter) -> Reproduction:
+    """Reproduce the numbers of the blog."""
     found = np.array([encoder_errors(generator) for _ in progress(range(runs))])
-    return Reproduction(TITLE, ASSUMED, (*_three_speeds(), *_solver(found)), (*_slopes(), *_code(), _strobe(), _method(found)))
+    return Reproduction(TITLE, ASSUMED, (*_three_speeds(), *_solver(found)),
+                        (*_slopes(), *_code(), _strobe(), _method(found)))
 
 
 # three speeds of a record player
@@ -65,11 +69,12 @@ def slopes() -> tuple[float, float]:
 
 
 def line() -> tuple[float, float, float, float]:
-    """Return slope, its 95 % interval either way, the count at rest, and how far the middle point is off, by least squares."""
+    """Return slope, its 95 % interval either way, count at rest, and error of the middle point."""
     rates, means = np.array(SPEEDS) * 6.0, np.array(MEANS)
     fit = linregress(rates, means)
     interval = float(student.ppf(0.975, len(rates) - 2) * fit.stderr)
-    return float(fit.slope), interval, float(fit.intercept), float(means[1] - fit.intercept - fit.slope * rates[1])
+    return (float(fit.slope), interval, float(fit.intercept),
+            float(means[1] - fit.intercept - fit.slope * rates[1]))
 
 
 def _three_speeds() -> list[Comparison]:
@@ -77,17 +82,25 @@ def _three_speeds() -> list[Comparison]:
     return [
         from_own_figures('33 1/3 turns a minute', 'deg/s', 6.0 * SPEEDS[1], '200', 'part 1'),
         from_own_figures('45 turns a minute', 'deg/s', 6.0 * SPEEDS[2], '270', 'part 1'),
-        from_own_figures('slope from 0 to 200 deg/s', 'counts/(deg/s)', first, '-14.285', 'part 1'),
-        from_own_figures('slope from 200 to 270 deg/s', 'counts/(deg/s)', second, '-14.334', 'part 1'),
-        from_own_figures('SF, mean of the slopes', 'counts/(deg/s)', (first + second) / 2.0, '-14.309', 'part 1', 'cut off, not rounded'),
+        from_own_figures('slope from 0 to 200 deg/s', 'counts/(deg/s)', first, '-14.285',
+                         'part 1'),
+        from_own_figures('slope from 200 to 270 deg/s', 'counts/(deg/s)', second, '-14.334',
+                         'part 1'),
+        from_own_figures('SF, mean of the slopes', 'counts/(deg/s)', (first + second) / 2.0,
+                         '-14.309', 'part 1', 'cut off, not rounded'),
         from_own_figures('N', 'deg/s', MEANS[0] / SCALE_FACTOR, '-0.1793', 'part 1'),
-        from_own_figures('strobe at 59.8 Hz', '%', 100.0 * (1.0 - MEASURED_STROBE / STROBE), '0.33', 'part 1'),
-        from_own_figures('solver and turntable differ by', '%', 100.0 * (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2',
+        from_own_figures('strobe at 59.8 Hz', '%', 100.0 * (1.0 - MEASURED_STROBE / STROBE),
+                         '0.33', 'part 1'),
+        from_own_figures('solver and turntable differ by', '%',
+                         100.0 * (1.0 - SCALE_FACTOR / SOLVED_SCALE), '1.30', 'part 2',
                          note="of the solver's scale"),
-        from_own_figures('temperature coefficient', 'deg/h/K', 3600.0 * BIAS_TEMPERATURE, '144', 'temperature'),
-        Comparison('SF, line through three points', 'counts/(deg/s)', slope, note=f'95 %: +- {interval:.2f}, one degree of freedom'),
+        from_own_figures('temperature coefficient', 'deg/h/K', 3600.0 * BIAS_TEMPERATURE, '144',
+                         'temperature'),
+        Comparison('SF, line through three points', 'counts/(deg/s)', slope,
+                   note=f'95 %: +- {interval:.2f}, one degree of freedom'),
         Comparison('N, line through three points', 'deg/s', rest / slope),
-        Comparison('SF of the data sheet, 70 mdeg/s a count', 'counts/(deg/s)', -1.0 / SENSITIVITY),
+        Comparison('SF of the data sheet, 70 mdeg/s a count', 'counts/(deg/s)',
+                   -1.0 / SENSITIVITY),
     ]
 
 
@@ -96,19 +109,27 @@ def _slopes() -> list[Contradiction]:
     rates = np.array(SPEEDS) * 6.0
     null = MEANS[1] - second * rates[1] - MEANS[0]
     return [
-        Contradiction({'first': first, 'second': second, 'percent': 100.0 * (second / first - 1.0), 'off': abs(off / slope),
-                       'null': abs(null / slope), 'kelvin': abs(null / slope) / BIAS_TEMPERATURE,
-                       'speed': (rates[2] - rates[1]) * (1.0 - first / second), 'interval': interval},
-                      'Part 1: the slopes {first:.3f} and {second:.3f} differ by {percent:.2f} %. A strobe that is off changes both '
-                      'alike. It takes a middle point that is {off:.2f} deg/s off a line, or 45 turns a minute off by {speed:.2f} '
-                      'deg/s, or a null that drifted by {null:.2f} deg/s, as {kelvin:.0f} K would do; three points cannot say which, '
-                      'and leave the slope uncertain by {interval:.2f}.'),
-        Contradiction({'mean': (first + second) / 2.0, 'rounded': (round(first, 3) + round(second, 3)) / 2.0},
-                      'Part 1: the mean of the slopes is {mean:.4f}, that of the printed slopes {rounded:.4f}; it is printed as -14.309.'),
-        Contradiction({'wrong': 2.0 * abs(MEANS[0] / SCALE_FACTOR), 'offsets': abs(SOLVED_OFFSET - NULL), 'hour':
-                       3600.0 * abs(SOLVED_OFFSET - NULL)},
-                      'Part 2: the solver subtracts its offset, so the start [-14.309, 0.1793] has the wrong sign, {wrong:.2f} deg/s '
-                      'off; the offset that it finds and N of part 1 differ by {offsets:.3f} deg/s, {hour:.0f} deg/h.'),
+        Contradiction({'first': first, 'second': second, 'percent': 100.0 * (second / first - 1.0),
+                       'off': abs(off / slope), 'null': abs(null / slope),
+                       'kelvin': abs(null / slope) / BIAS_TEMPERATURE,
+                       'speed': (rates[2] - rates[1]) * (1.0 - first / second),
+                       'interval': interval},
+                      'Part 1: the slopes {first:.3f} and {second:.3f} differ by {percent:.2f} %. '
+                      'A strobe that is off changes both alike. It takes a middle point that is '
+                      '{off:.2f} deg/s off a line, or 45 turns a minute off by {speed:.2f} deg/s, '
+                      'or a null that drifted by {null:.2f} deg/s, as {kelvin:.0f} K would do; '
+                      'three points cannot say which, and leave the slope uncertain by '
+                      '{interval:.2f}.'),
+        Contradiction({'mean': (first + second) / 2.0,
+                       'rounded': (round(first, 3) + round(second, 3)) / 2.0},
+                      'Part 1: the mean of the slopes is {mean:.4f}, that of the printed slopes '
+                      '{rounded:.4f}; it is printed as -14.309.'),
+        Contradiction({'wrong': 2.0 * abs(MEANS[0] / SCALE_FACTOR),
+                       'offsets': abs(SOLVED_OFFSET - NULL),
+                       'hour': 3600.0 * abs(SOLVED_OFFSET - NULL)},
+                      'Part 2: the solver subtracts its offset, so the start [-14.309, 0.1793] '
+                      'has the wrong sign, {wrong:.2f} deg/s off; the offset that it finds and N '
+                      'of part 1 differ by {offsets:.3f} deg/s, {hour:.0f} deg/h.'),
     ]
 
 
@@ -125,91 +146,110 @@ def gyro_rate_by_null(count: float) -> float:
 def _code() -> list[Contradiction]:
     unsigned = float(round(MEANS[1]) % 2 ** 32)
     difference = max(abs(gyro_rate(count) - gyro_rate_by_null(count)) for count in MEANS)
-    return [Contradiction({'difference': difference, 'right': gyro_rate(round(MEANS[1])), 'unsigned': gyro_rate(unsigned)},
-                          'Part 1: the two ways to compute the rate agree to {difference:.0e} deg/s. But the function takes an '
-                          'unsigned int, and at 200 deg/s the count is negative: {right:.1f} deg/s becomes {unsigned:.1e} deg/s with '
+    return [Contradiction({'difference': difference, 'right': gyro_rate(round(MEANS[1])),
+                           'unsigned': gyro_rate(unsigned)},
+                          'Part 1: the two ways to compute the rate agree to {difference:.0e} '
+                          'deg/s. But the function takes an unsigned int, and at 200 deg/s the '
+                          'count is negative: {right:.1f} deg/s becomes {unsigned:.1e} deg/s with '
                           '32 bits.')]
 
 
 def _strobe() -> Contradiction:
     off, (first, second) = 100.0 * (1.0 - MEASURED_STROBE / STROBE), slopes()
     corrected = SCALE_FACTOR * STROBE / MEASURED_STROBE
-    numbers = {'off': off, 'slopes': 100.0 * (second / first - 1.0), 'corrected': corrected, 'crystal': 100.0 * 80e-6,
-               'left': 100.0 * (1.0 - corrected / SOLVED_SCALE), 'nominal': 100.0 * (-SENSITIVITY * first - 1.0)}
+    numbers = {'off': off, 'slopes': 100.0 * (second / first - 1.0), 'corrected': corrected,
+               'crystal': 100.0 * 80e-6, 'left': 100.0 * (1.0 - corrected / SOLVED_SCALE),
+               'nominal': 100.0 * (-SENSITIVITY * first - 1.0)}
     return Contradiction(numbers,
-                         'Part 1: a strobe at 59.8 Hz is {off:.2f} % off, as much as the slopes differ ({slopes:.2f} %), while the '
-                         'crystal explains {crystal:.3f} %. Seen at one scale, reference and gyro cannot be told apart: if the strobe '
-                         'was slow, SF is {corrected:.3f} and the solver differs by {left:.2f} %; the first slope alone is the data '
-                         'sheet\'s to {nominal:.3f} %.')
+                         'Part 1: a strobe at 59.8 Hz is {off:.2f} % off, as much as the slopes '
+                         'differ ({slopes:.2f} %), while the crystal explains {crystal:.3f} %. '
+                         'Seen at one scale, reference and gyro cannot be told apart: if the '
+                         'strobe was slow, SF is {corrected:.3f} and the solver differs by '
+                         '{left:.2f} %; the first slope alone is the data sheet\'s to '
+                         '{nominal:.3f} %.')
 
 
 # an encoder of 2 deg
 
 def encoder_log(generator: np.random.Generator, late: float = 0.0) -> tuple[Array, Array, Motion]:
-    """Return time, s, the rates of a gyro without errors but noise, rad/s, and the motion as the encoder sees it."""
+    """Return time, s, rates of a gyro with noise only, rad/s, and the motion by the encoder."""
     time = np.arange(round(BY_HAND.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
-    rate = BY_HAND.rate_at(time - late) + simulate_noise(NOISE, len(time), 1.0 / SAMPLE_RATE, generator)
+    rate = BY_HAND.rate_at(time - late) + simulate_noise(
+        NOISE, len(time), 1.0 / SAMPLE_RATE, generator)
     steps = np.floor(BY_HAND.heading_at(time) / ENCODER_STEP + generator.uniform())
     return time, rate, from_headings(time, steps * ENCODER_STEP)
 
 
 def encoder_errors(generator: np.random.Generator) -> tuple[float, ...]:
     """
-    Return what a run of the encoder turntable gives.
+    Return the errors of one run of the encoder turntable.
 
     Returns
     -------
-    errors of scale, 1, and offset, rad/s, by the solver's way, which is least squares of the encoder's gradient on the gyro; the same by
-    likelihood; the error of scale of a regression the other way round; the largest error of the heading after the solver's way, rad
+    errors of scale, 1, and offset, rad/s, by the method of the solver, which is least squares of
+    the encoder's gradient on the gyro; the same by likelihood; the error of scale of the reverse
+    regression; the largest error of the heading after the method of the solver, rad
 
     """
     time, rate, motion = encoder_log(generator)
     gradient, likely = fit_rate(time, rate, motion), fit_likelihood(time, rate, motion, 0.1)
     reverse = linregress(motion.rate_at(time), rate).slope - 1.0
     heading = integrate(time, rate - gradient.bias) / (1.0 + gradient.scale_factor_error)
-    return (gradient.scale_factor_error, gradient.bias, likely.scale_factor_error, likely.bias, float(reverse),
-            float(np.abs(heading - motion.heading).max()))
+    return (gradient.scale_factor_error, gradient.bias, likely.scale_factor_error, likely.bias,
+            float(reverse), float(np.abs(heading - motion.heading).max()))
 
 
 def _solver(found: Array) -> list[Comparison]:
     means, deviations = found.mean(axis=0), found.std(axis=0, ddof=1)
     return [
-        Comparison("scale by the solver's way on a gyro with this SF", 'counts/(deg/s)', SCALE_FACTOR * (1.0 + means[0]), '-14.49787',
-                   'part 2', 3.0 * abs(SCALE_FACTOR) * deviations[0], 'the way itself does not err so; a scale of encoder, strobe or time'),
-        Comparison("offset by the solver's way on a gyro with this N", 'deg/s', NULL + means[1] / DEGREE, '-0.20168', 'part 2',
+        Comparison("scale by the solver's way on a gyro with this SF", 'counts/(deg/s)',
+                   SCALE_FACTOR * (1.0 + means[0]), '-14.49787', 'part 2',
+                   3.0 * abs(SCALE_FACTOR) * deviations[0],
+                   'the way itself does not err so; a scale of encoder, strobe or time'),
+        Comparison("offset by the solver's way on a gyro with this N", 'deg/s',
+                   NULL + means[1] / DEGREE, '-0.20168', 'part 2',
                    3.0 * deviations[1] / DEGREE, 'nor here; a null of another time'),
         Comparison("error of scale, solver's way: mean", '%', 100.0 * means[0]),
         Comparison("error of scale, solver's way: standard deviation", '%', 100.0 * deviations[0]),
         Comparison('error of scale, likelihood: mean', '%', 100.0 * means[2]),
         Comparison('error of scale, likelihood: standard deviation', '%', 100.0 * deviations[2]),
-        Comparison("error of offset, solver's way: standard deviation", 'deg/s', deviations[1] / DEGREE),
-        Comparison('error of offset, likelihood: standard deviation', 'deg/s', deviations[3] / DEGREE),
-        Comparison("largest error of heading, solver's way", 'deg', means[5] / DEGREE, '< 3', 'part 2', 3.0 * deviations[5] / DEGREE),
+        Comparison("error of offset, solver's way: standard deviation", 'deg/s',
+                   deviations[1] / DEGREE),
+        Comparison('error of offset, likelihood: standard deviation', 'deg/s',
+                   deviations[3] / DEGREE),
+        Comparison("largest error of heading, solver's way", 'deg', means[5] / DEGREE, '< 3',
+                   'part 2', 3.0 * deviations[5] / DEGREE),
     ]
 
 
 def _method(found: Array) -> Contradiction:
     means, deviations = 100.0 * found.mean(axis=0), 100.0 * found.std(axis=0, ddof=1)
-    return Contradiction({'solver': means[0], 'solver_scatter': deviations[0], 'likely': means[2], 'likely_scatter': deviations[2],
-                          'reverse': means[4], 'slow': 100.0 * error_by_increments(CALIBRATION),
-                          'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0), 'late': late_enough()},
-                         'Part 2: the two methods differ by {turntable:.2f} % of the turntable\'s SF. Fitting the gradient of a 2 deg '
-                         'encoder at 50 Hz errs by {solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by {likely:.4f} +- '
-                         '{likely_scatter:.4f} %; the gyro would have to be {late:.2f} s late. The other way round, the gyro fitted to '
-                         'the gradient, the steps of the encoder make it {reverse:.1f} %, and increment by increment on a motion up to '
-                         '45 deg/s {slow:.0f} %.')
+    return Contradiction({'solver': means[0], 'solver_scatter': deviations[0], 'likely': means[2],
+                          'likely_scatter': deviations[2], 'reverse': means[4],
+                          'slow': 100.0 * error_by_increments(CALIBRATION),
+                          'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0),
+                          'late': late_enough()},
+                         'Part 2: the two methods differ by {turntable:.2f} % of the turntable\'s '
+                         'SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
+                         '{solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by '
+                         '{likely:.4f} +- {likely_scatter:.4f} %; the gyro would have to be '
+                         '{late:.2f} s late. The other way round, the gyro fitted to the '
+                         'gradient, the steps of the encoder make it {reverse:.1f} %, and '
+                         'increment by increment on a motion up to 45 deg/s {slow:.0f} %.')
 
 
 def error_by_increments(motion: Motion) -> float:
-    """Return the error of scale, 1, of increments of a gyro without any error, fitted to those of the encoder."""
+    """Return the error of scale, 1, of increments of an ideal gyro, fitted to the encoder's."""
     heading = motion.heading_at(np.arange(round(motion.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE)
-    return float(linregress(np.diff(np.floor(heading / ENCODER_STEP) * ENCODER_STEP), np.diff(heading)).slope) - 1.0
+    return float(linregress(np.diff(np.floor(heading / ENCODER_STEP) * ENCODER_STEP),
+                            np.diff(heading)).slope) - 1.0
 
 
 def late_enough() -> float:
-    """Return how late, s, the gyro must be for the solver's way to differ from the turntable as it does, without noise and steps."""
+    """Return the delay of the gyro, s, that explains the difference of solver and turntable."""
     time = np.arange(round(BY_HAND.duration * SAMPLE_RATE) + 1) / SAMPLE_RATE
 
     def missing(late: float) -> float:
-        return fit_rate(time, BY_HAND.rate_at(time - late), BY_HAND).scale_factor_error - (SOLVED_SCALE / SCALE_FACTOR - 1.0)
+        return fit_rate(time, BY_HAND.rate_at(time - late), BY_HAND).scale_factor_error - (
+            SOLVED_SCALE / SCALE_FACTOR - 1.0)
     return float(brentq(missing, 0.0, 1.0))

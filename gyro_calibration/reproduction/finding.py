@@ -1,4 +1,4 @@
-"""What is found when a source is worked through again: its numbers beside ours, and where it contradicts itself."""
+"""The results of a reproduction: published numbers beside ours, and contradictions."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ class Comparison:
 
     Attributes
     ----------
-    quantity, unit : what it is
+    quantity, unit : of both numbers
     ours : the number that comes out here
-    published : as it is printed, for its last digit says how exact it is; ``< 2`` is a bound, ``~ 10`` an order of magnitude, and where
-        it is empty the source has no such number
-    place : where the source has it
-    uncertainty : how far ours may be from what endless repetition would give
+    published : as it is printed, since its last digit shows its accuracy; ``< 2`` is a bound,
+        ``~ 10`` an order of magnitude, '' means that the source has no such number
+    place : in the source
+    uncertainty : of ours, from the finite number of runs
     why : in a few words, why ours differs, if it does
-    note : in a few words, what to know in any case
-    own_figures : ours follows from other figures of the source alone, so that a difference is a contradiction within it
+    note : in a few words, printed in any case
+    own_figures : whether ours follows from other figures of the source alone, so that a difference
+        is a contradiction within it
 
     """
 
@@ -44,16 +45,17 @@ class Comparison:
 
     @property
     def agrees(self) -> bool:
-        """Tell whether ours is the published number, within its last digit and the uncertainty of ours."""
+        """Return whether ours is the published number, within last digit and uncertainty."""
         if self.published.startswith('<'):
             return self.ours + self.uncertainty < self.value
         if self.published.startswith('~'):
             return self.ours * self.value > 0.0 and round(math.log10(self.ours / self.value)) == 0
-        return abs(self.ours - self.value) <= 0.5 * 10.0 ** -_decimals(self.published) * (1.0 + 1e-9) + self.uncertainty
+        return (abs(self.ours - self.value)
+                <= 0.5 * 10.0 ** -_decimals(self.published) * (1.0 + 1e-9) + self.uncertainty)
 
     @property
     def verdict(self) -> str:
-        """Return what the comparison says; empty where nothing is published."""
+        """Return the result of the comparison; '' where nothing is published."""
         if not self.published:
             return ''
         if self.agrees:
@@ -61,13 +63,14 @@ class Comparison:
         return 'contradicts itself' if self.own_figures else 'differs'
 
     def data(self) -> dict[str, Any]:
-        """Return all that there is to say, by name."""
+        """Return all fields and the verdict, by name."""
         return {**asdict(self), 'verdict': self.verdict}
 
     def cells(self) -> tuple[str, ...]:
         """Return quantity, unit, place, published, ours and verdict as words for people."""
         ours = _rounded(self.ours, self.uncertainty, self.published)
-        verdict = '; '.join(filter(None, [': '.join(filter(None, [self.verdict, '' if self.agrees else self.why])), self.note]))
+        verdict = '; '.join(filter(None, [
+            ': '.join(filter(None, [self.verdict, '' if self.agrees else self.why])), self.note]))
         return self.quantity, self.unit, self.place, self.published or '-', ours, verdict
 
 
@@ -86,7 +89,8 @@ def _decimals(number: str) -> int:
     return len(number.partition('.')[2])
 
 
-def from_own_figures(quantity: str, unit: str, ours: float, published: str, place: str, why: str = '', note: str = '') -> Comparison:
+def from_own_figures(quantity: str, unit: str, ours: float, published: str, place: str,
+                     why: str = '', note: str = '') -> Comparison:
     """Return a comparison of what a source prints with what follows from its other figures."""
     return Comparison(quantity, unit, ours, published, place, why=why, note=note, own_figures=True)
 
@@ -94,11 +98,11 @@ def from_own_figures(quantity: str, unit: str, ours: float, published: str, plac
 @dataclass(frozen=True)
 class Contradiction:
     """
-    What does not hold in a source, shown by numbers that were just computed.
+    A contradiction in a source, shown by computed numbers.
 
     Attributes
     ----------
-    numbers : by name, in the units that the sentence says
+    numbers : by name, in the units of the sentence
     pattern : the sentence, with the numbers' names in braces
 
     """
@@ -119,12 +123,12 @@ class Contradiction:
 @dataclass(frozen=True)
 class Reproduction:
     """
-    What became of a source.
+    The reproduction of a source.
 
     Attributes
     ----------
     title : authors, title and year
-    assumed : what the source does not say and was chosen here, one sentence each
+    assumed : what the source does not state and was chosen here, one sentence each
 
     """
 
@@ -135,5 +139,6 @@ class Reproduction:
 
     def data(self) -> dict[str, Any]:
         """Return everything by name."""
-        return {'title': self.title, 'assumed': list(self.assumed), 'comparisons': [each.data() for each in self.comparisons],
+        return {'title': self.title, 'assumed': list(self.assumed),
+                'comparisons': [each.data() for each in self.comparisons],
                 'contradictions': [each.data() for each in self.contradictions]}

@@ -1,7 +1,8 @@
 """
-Ojeda, Chung and Borenstein, "Precision calibration of fiber-optics gyroscopes for mobile robot navigation", ICRA 2000.
+Ojeda, Chung and Borenstein (2000), rate-table calibration of fibre-optic gyros.
 
-Their numbers stand in their units; what is computed is in SI until it is put beside them.
+Source: "Precision calibration of fiber-optics gyroscopes for mobile robot navigation", ICRA.
+Published numbers are in their units; ours are computed in SI and converted.
 
 """
 
@@ -33,44 +34,55 @@ from gyro_calibration.reproduction.finding import (
     from_own_figures,
 )
 
-TITLE = 'Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for mobile robot navigation, ICRA 2000'
-#: Table I: deg/s; % over all temperatures, p-p; % rms; deg/s; deg/s over all temperatures, p-p; (deg/h)/√Hz; and from section 4, Hz.
+TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '
+         'mobile robot navigation, ICRA 2000')
+#: Table I: deg/s; % over all temperatures, p-p; % rms; deg/s; deg/s over all temperatures, p-p;
+#: (deg/h)/√Hz; and from section 4, Hz.
 FULL_SCALE, SCALE_OVER_TEMPERATURE, NONLINEARITY, STABILITY = 100.0, 2.0, 0.5, 0.002
 BIAS_OVER_TEMPERATURE, ANGLE_RANDOM_WALK, OUTPUT_RATE = 0.2, 5.0, 10.0
 #: Section 3: samples of a data set, orders p and q, degC.
 SAMPLES, RATE_ORDER, TEMPERATURE_ORDER, COLDEST, WARMEST = 100, 3, 2, 25.0, 45.0
-#: Assumed: K from the coldest to the warmest of Table I; s, so that a turn at 100 deg/s is short by half a degree a second.
+#: Assumed: K from the coldest to the warmest of Table I; s, so that a turn at 100 deg/s reads
+#: half a deg/s less.
 ALL_TEMPERATURES, SAGNAC = 115.0, 0.1
-#: Assumed for showing what it does: a shaking table, deg/s, and the strong sine of another open-loop gyro, s.
+#: Assumed for comparison: a shaking table, deg/s, and the sine of another open-loop gyro, s.
 VIBRATION, STRONG_SAGNAC = 1.0, 0.25
 LATITUDE, EARTH_RATE = 42.28, 15.04  # of Ann Arbor, deg, and deg/h
 POLYNOMIAL = rate_temperature_polynomial(RATE_ORDER, TEMPERATURE_ORDER)
 PHYSICAL = (BIAS, SCALE_FACTOR_ERROR, BIAS_TEMPERATURE, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE)
-#: Rates and temperatures of a campaign: the fewest, as many as p = q = 11 says, and every 10 deg/s.
+#: Rates and temperatures of a campaign: the fewest, those of p = q = 11, and every 10 deg/s.
 CAMPAIGNS = ((4, 3), (11, 11), (21, 11))
 ASSUMED = (
-    'The gyro is synthetic: noise (5 (deg/h)/sqrt(Hz) at 10 Hz, flicker of 0.002 deg/s), bias and scale over temperature of Table I, '
-    'the two latter spread evenly over 115 K, a bias of 0.02 deg/s, and a sine response with k = 0.1 s, which takes half a deg/s off '
-    '100 deg/s, since the errors of figures 3 to 6 are a few tenths of deg/s.',
-    'The table turns exactly, the thermometer reads exactly, and nothing changes between calibration and use but the noise.',
-    'Errors are taken at 5 to 100 deg/s both ways and 25 to 45 degC, each turn after 10 s of rest whose mean is subtracted (eq. 1 and 15).',
+    'The gyro is synthetic: noise (5 (deg/h)/sqrt(Hz) at 10 Hz, flicker of 0.002 deg/s), bias and '
+    'scale over temperature of Table I, the two latter spread evenly over 115 K, a bias of '
+    '0.02 deg/s, and a sine response with k = 0.1 s, which takes half a deg/s off 100 deg/s, '
+    'since the errors of figures 3 to 6 are a few tenths of deg/s.',
+    'The table turns exactly, the thermometer reads exactly, and nothing changes between '
+    'calibration and use but the noise.',
+    'Errors are taken at 5 to 100 deg/s both ways and 25 to 45 degC, each turn after 10 s of rest '
+    'whose mean is subtracted (eq. 1 and 15).',
 )
 
 
 def rd2100(sagnac: float = SAGNAC) -> GyroModel:
     """Return a gyro like the KVH E-Core RD2100, with the sine response of a given k, s."""
-    terms = (Term(BIAS, (0.02 * DEGREE,)), Term(BIAS_TEMPERATURE, (COLDEST, BIAS_OVER_TEMPERATURE * DEGREE / ALL_TEMPERATURES)),
-             Term(SCALE_FACTOR_TEMPERATURE, (COLDEST, SCALE_OVER_TEMPERATURE / 100.0 / ALL_TEMPERATURES)),
+    terms = (Term(BIAS, (0.02 * DEGREE,)),
+             Term(BIAS_TEMPERATURE,
+                  (COLDEST, BIAS_OVER_TEMPERATURE * DEGREE / ALL_TEMPERATURES)),
+             Term(SCALE_FACTOR_TEMPERATURE,
+                  (COLDEST, SCALE_OVER_TEMPERATURE / 100.0 / ALL_TEMPERATURES)),
              Term(SINE_RESPONSE, (sagnac, 1.0)))
     return GyroModel(terms, noise=Noise(ANGLE_RANDOM_WALK * DEGREE / 3600.0, STABILITY * DEGREE))
 
 
-def reproduce(generator: np.random.Generator, runs: int = 200, progress: Progress = iter) -> Reproduction:
-    """Work through the paper."""
+def reproduce(generator: np.random.Generator, runs: int = 200,
+              progress: Progress = iter) -> Reproduction:
+    """Reproduce the numbers of the paper."""
     found = np.array([calibrate_and_turn(generator) for _ in progress(range(max(2, runs // 20)))])
     return Reproduction(TITLE, ASSUMED, (*_own_figures(), *_instrument(), *_results(found)),
-                        (_index(), _data_sets(), _condition(), _regressor(generator), _sine(generator, len(found), progress),
-                         _order_of_magnitude(found), _percent(found), _full_turn(), _earth()))
+                        (_index(), _data_sets(), _condition(), _regressor(generator),
+                         _sine(generator, len(found), progress), _order_of_magnitude(found),
+                         _percent(found), _full_turn(), _earth()))
 
 
 # a rate table
@@ -80,17 +92,21 @@ def grid(rates: Array, temperatures: Array) -> tuple[Array, Array]:
     return np.tile(rates, len(temperatures)), np.repeat(temperatures, len(rates))
 
 
-def rate_table(gyro: GyroModel, rates: Array, temperatures: Array, generator: np.random.Generator) -> Dwells:
+def rate_table(gyro: GyroModel, rates: Array, temperatures: Array,
+               generator: np.random.Generator) -> Dwells:
     """Return averaged data sets (eq. 5 to 7) for rates, rad/s, and temperatures, degC."""
     rate, temperature = grid(rates, temperatures)
-    noise = simulate_noise(gyro.noise, len(rate) * SAMPLES, 1.0 / OUTPUT_RATE, generator).reshape(len(rate), SAMPLES)
-    return Dwells(rate, gyro.output(rate, temperature) + noise.mean(axis=1), temperature, np.full(len(rate), np.nan),
+    noise = simulate_noise(gyro.noise, len(rate) * SAMPLES, 1.0 / OUTPUT_RATE,
+                           generator).reshape(len(rate), SAMPLES)
+    return Dwells(rate, gyro.output(rate, temperature) + noise.mean(axis=1), temperature,
+                  np.full(len(rate), np.nan),
                   np.repeat(np.arange(len(temperatures)), len(rates)), ('',) * len(rate))
 
 
 def fit(dwells: Dwells, effects: Sequence[Effect]) -> GyroModel:
-    """Return the model by least squares in which all data sets count alike (eq. 9)."""
-    alike = Scatter(dwell=1.0, dwell_scale=0.0, sweep_bias=0.0, sweep_scale=0.0, kept=np.ones(len(dwells), bool))
+    """Return the model by least squares with equal weights of all data sets (eq. 9)."""
+    alike = Scatter(dwell=1.0, dwell_scale=0.0, sweep_bias=0.0, sweep_scale=0.0,
+                    kept=np.ones(len(dwells), bool))
     return fit_effects(dwells, effects, alike).model
 
 
@@ -105,43 +121,62 @@ def calibrate_and_turn(generator: np.random.Generator) -> Array:
 
     Returns
     -------
-    rms error of the rate, rad/s, and largest error of a turn, rad, without a model and with each, shape (1 + campaigns, 2)
+    rms error of the rate, rad/s, and largest error of a turn, rad, without a model and with each,
+    shape (1 + campaigns, 2)
 
     """
     gyro = rd2100()
-    tables = (rate_table(gyro, spread(rates), np.linspace(COLDEST, WARMEST, temperatures), generator) for rates, temperatures in CAMPAIGNS)
+    tables = (rate_table(gyro, spread(rates), np.linspace(COLDEST, WARMEST, temperatures),
+                         generator) for rates, temperatures in CAMPAIGNS)
     models = [GyroModel(), *(fit(table, [POLYNOMIAL]) for table in tables)]
     speeds = np.arange(5.0, FULL_SCALE + 1.0, 5.0) * DEGREE
-    rates, temperatures = grid(np.concatenate([-speeds[::-1], speeds]), np.arange(COLDEST, WARMEST + 1.0, 2.0))
+    rates, temperatures = grid(np.concatenate([-speeds[::-1], speeds]),
+                               np.arange(COLDEST, WARMEST + 1.0, 2.0))
     errors, durations = simulated_turns(gyro, models, rates, temperatures, generator)
-    return np.column_stack([np.sqrt(np.mean((errors / durations) ** 2, axis=1)), np.abs(errors).max(axis=1)])
+    return np.column_stack([np.sqrt(np.mean((errors / durations) ** 2, axis=1)),
+                            np.abs(errors).max(axis=1)])
 
 
-def simulated_turns(gyro: GyroModel, models: Sequence[GyroModel], rates: Array, temperatures: Array,
-                generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return the errors of full turns, each after a rest, rad, shape (models, n), and how long the turns take, s, shape (n,)."""
+def simulated_turns(gyro: GyroModel, models: Sequence[GyroModel], rates: Array,
+                    temperatures: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+    """
+    Return the errors of full turns, each after a rest, rad, and the durations of the turns, s.
+
+    Their shapes are (models, n) and (n,).
+
+    """
     turning = np.round(2.0 * math.pi / np.abs(rates) * OUTPUT_RATE).astype(int)
-    lengths = np.column_stack([np.full(len(rates), SAMPLES), turning]).ravel()  # of rest and turn in turn
+    # of rest and turn in turn
+    lengths = np.column_stack([np.full(len(rates), SAMPLES), turning]).ravel()
     rate = np.repeat(np.column_stack([np.zeros(len(rates)), rates]).ravel(), lengths)
     temperature = np.repeat(np.repeat(temperatures, 2), lengths)
-    output = gyro.output(rate, temperature) + simulate_noise(gyro.noise, len(rate), 1.0 / OUTPUT_RATE, generator)
+    output = gyro.output(rate, temperature) + simulate_noise(
+        gyro.noise, len(rate), 1.0 / OUTPUT_RATE, generator)
     begins = np.cumsum(lengths) - lengths
-    means = np.array([np.add.reduceat(model.rate(output, temperature) - rate, begins) / lengths for model in models])
+    means = np.array([
+        np.add.reduceat(model.rate(output, temperature) - rate, begins) / lengths
+        for model in models])
     return (means[:, 1::2] - means[:, 0::2]) * turning / OUTPUT_RATE, turning / OUTPUT_RATE
 
 
-# what Table I says, and what the synthetic gyro makes of it
+# Table I and the synthetic gyro
 
 def _own_figures() -> list[Comparison]:
-    sets = len(np.arange(-FULL_SCALE, FULL_SCALE + 1.0, 10.0)) * len(np.arange(COLDEST, WARMEST + 1.0, 2.0))
+    sets = (len(np.arange(-FULL_SCALE, FULL_SCALE + 1.0, 10.0))
+            * len(np.arange(COLDEST, WARMEST + 1.0, 2.0)))
     return [
         from_own_figures('drift of 0.002 deg/s', 'deg/min', 60.0 * STABILITY, '0.12', 'section 1'),
-        from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * STABILITY, '7.2', 'section 1'),
-        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * STABILITY, '1.2', 'section 1'),
-        from_own_figures('angle random walk of 5 (deg/h)/sqrt(Hz)', 'deg/sqrt(h)', ANGLE_RANDOM_WALK / 60.0, '0.08', 'table I'),
+        from_own_figures('drift of 0.002 deg/s in an hour', 'deg/h', 3600.0 * STABILITY, '7.2',
+                         'section 1'),
+        from_own_figures('drift of 0.002 deg/s in 10 min', 'deg', 600.0 * STABILITY, '1.2',
+                         'section 1'),
+        from_own_figures('angle random walk of 5 (deg/h)/sqrt(Hz)', 'deg/sqrt(h)',
+                         ANGLE_RANDOM_WALK / 60.0, '0.08', 'table I'),
         from_own_figures('samples in 10 s', '1', 10.0 * OUTPUT_RATE, '100', 'eq. 1'),
-        from_own_figures('fewest data sets for p = 3, q = 2', '1', float((RATE_ORDER + 1) * (TEMPERATURE_ORDER + 1)), '12', 'section 3.3'),
-        from_own_figures('data sets, every 10 deg/s and 2 K', '1', float(sets), '121', 'section 3.3', '+-100 deg/s are 21 rates, not 11'),
+        from_own_figures('fewest data sets for p = 3, q = 2', '1',
+                         float((RATE_ORDER + 1) * (TEMPERATURE_ORDER + 1)), '12', 'section 3.3'),
+        from_own_figures('data sets, every 10 deg/s and 2 K', '1', float(sets), '121',
+                         'section 3.3', '+-100 deg/s are 21 rates, not 11'),
     ]
 
 
@@ -149,96 +184,125 @@ def _instrument() -> list[Comparison]:
     rates, gyro = spread(201), rd2100()
     line = gyro.output(rates, COLDEST)
     left = line - np.polyval(np.polyfit(rates, line, 1), rates)
-    slopes = [np.polyfit(rates, gyro.output(rates, temperature), 1) for temperature in (COLDEST, WARMEST)]
+    slopes = [np.polyfit(rates, gyro.output(rates, temperature), 1)
+              for temperature in (COLDEST, WARMEST)]
     (cold_slope, cold_bias), (warm_slope, warm_bias) = slopes
     return [
-        Comparison('synthetic: error at 100 deg/s, 25 degC', 'deg/s', abs(line[-1] - rates[-1]) / DEGREE),
-        Comparison('synthetic: nonlinearity, rms', '%', 100.0 * float(np.sqrt(np.mean(left ** 2))) / rates[-1], '< 0.5', 'table I'),
-        Comparison('synthetic: scale from 25 to 45 degC', '%', 100.0 * (warm_slope - cold_slope), '< 2', 'table I'),
-        Comparison('synthetic: bias from 25 to 45 degC', 'deg/s', (warm_bias - cold_bias) / DEGREE, '< 0.2', 'table I'),
+        Comparison('synthetic: error at 100 deg/s, 25 degC', 'deg/s',
+                   abs(line[-1] - rates[-1]) / DEGREE),
+        Comparison('synthetic: nonlinearity, rms', '%',
+                   100.0 * float(np.sqrt(np.mean(left ** 2))) / rates[-1], '< 0.5', 'table I'),
+        Comparison('synthetic: scale from 25 to 45 degC', '%', 100.0 * (warm_slope - cold_slope),
+                   '< 2', 'table I'),
+        Comparison('synthetic: bias from 25 to 45 degC', 'deg/s', (warm_bias - cold_bias) / DEGREE,
+                   '< 0.2', 'table I'),
     ]
 
 
 def _results(found: Array) -> list[Comparison]:
-    means, uncertainties = found.mean(axis=0), 3.0 * found.std(axis=0, ddof=1) / math.sqrt(len(found))
+    means, uncertainties = (found.mean(axis=0),
+                            3.0 * found.std(axis=0, ddof=1) / math.sqrt(len(found)))
     percent = 100.0 / (2.0 * math.pi)
     rows = [
-        Comparison('rms error of the rate, static bias only', 'deg/s', means[0, 0] / DEGREE, uncertainty=uncertainties[0, 0] / DEGREE),
-        Comparison('largest error of a full turn, static bias only', '%', percent * means[0, 1], uncertainty=percent * uncertainties[0, 1]),
+        Comparison('rms error of the rate, static bias only', 'deg/s', means[0, 0] / DEGREE,
+                   uncertainty=uncertainties[0, 0] / DEGREE),
+        Comparison('largest error of a full turn, static bias only', '%', percent * means[0, 1],
+                   uncertainty=percent * uncertainties[0, 1]),
     ]
     for number, (rates, temperatures) in enumerate(CAMPAIGNS, 1):
         ratio = found[:, 0, 0] / found[:, number, 0]
         name = f'n = {rates * temperatures}'
         rows += [
-            Comparison(f'rms error of the rate, {name}', 'deg/s', means[number, 0] / DEGREE, uncertainty=uncertainties[number, 0] / DEGREE),
-            Comparison(f'error of the rate, before over after, {name}', '1', float(ratio.mean()), '~ 10', 'abstract',
-                       3.0 * float(ratio.std(ddof=1)) / math.sqrt(len(found)), 'larger, as only Table I is simulated'),
-            Comparison(f'largest error of a full turn, {name}', '%', percent * means[number, 1], '< 2', 'section 5, fig. 9',
-                       percent * uncertainties[number, 1])]
+            Comparison(f'rms error of the rate, {name}', 'deg/s', means[number, 0] / DEGREE,
+                       uncertainty=uncertainties[number, 0] / DEGREE),
+            Comparison(f'error of the rate, before over after, {name}', '1', float(ratio.mean()),
+                       '~ 10', 'abstract', 3.0 * float(ratio.std(ddof=1)) / math.sqrt(len(found)),
+                       'larger, as only Table I is simulated'),
+            Comparison(f'largest error of a full turn, {name}', '%', percent * means[number, 1],
+                       '< 2', 'section 5, fig. 9', percent * uncertainties[number, 1])]
     return rows
 
 
 def _order_of_magnitude(found: Array) -> Contradiction:
     before, after = found[:, 0, 0].mean() / DEGREE, found[:, -1, 0].mean() / DEGREE
-    return Contradiction({'before': before, 'after': after, 'ratio': before / after, 'more': math.sqrt((before / 10.0) ** 2 - after ** 2)},
-                         'Abstract: the figures of Table I allow more than one order of magnitude, {before:.3f} to {after:.4f} deg/s, '
-                         '{ratio:.0f} times. One order is left if what is in neither table nor polynomial makes {more:.3f} deg/s rms.')
+    return Contradiction({'before': before, 'after': after, 'ratio': before / after,
+                          'more': math.sqrt((before / 10.0) ** 2 - after ** 2)},
+                         'Abstract: the figures of Table I allow more than one order of '
+                         'magnitude, {before:.3f} to {after:.4f} deg/s, {ratio:.0f} times. One '
+                         'order is left if what is in neither table nor polynomial makes '
+                         '{more:.3f} deg/s rms.')
 
 
 def _percent(found: Array) -> Contradiction:
-    before, after = (float(100.0 * found[:, number, 1].mean() / (2.0 * math.pi)) for number in (0, -1))
-    return Contradiction({'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0, 'before': before, 'after': after,
+    before, after = (float(100.0 * found[:, number, 1].mean() / (2.0 * math.pi))
+                     for number in (0, -1))
+    return Contradiction({'specified': NONLINEARITY + SCALE_OVER_TEMPERATURE / 2.0,
+                          'before': before, 'after': after,
                           'left': 100.0 * float((found[:, -1, 0] / found[:, 0, 0]).mean())},
-                         'Section 5: less than 2 % of what? Of the rate, Table I allows {specified:.1f} % before any calibration (0.5 % '
-                         'and half of 2 %), and the synthetic gyro has {before:.2f} % of a turn before and {after:.2f} % after. Of the '
-                         'error, one order of magnitude leaves 10 %; the synthetic gyro keeps {left:.1f} %.')
+                         'Section 5: less than 2 % of what? Of the rate, Table I allows '
+                         '{specified:.1f} % before any calibration (0.5 % and half of 2 %), and '
+                         'the synthetic gyro has {before:.2f} % of a turn before and '
+                         '{after:.2f} % after. Of the error, one order of magnitude leaves 10 %; '
+                         'the synthetic gyro keeps {left:.1f} %.')
 
 
-# misprints, and what is in the method
+# misprints, and properties of the method
 
 def columns_of_equation_10(rate_order: int, temperature_order: int, stride: int) -> int:
-    """Return how many different columns the index ``i + (j - 1) stride`` gives."""
-    return len({i + (j - 1) * stride for i in range(1, rate_order + 2) for j in range(1, temperature_order + 2)})
+    """Return the number of different columns that the index ``i + (j - 1) stride`` gives."""
+    return len({i + (j - 1) * stride
+                for i in range(1, rate_order + 2) for j in range(1, temperature_order + 2)})
 
 
 def _index() -> Contradiction:
     p, q = RATE_ORDER, TEMPERATURE_ORDER
-    numbers = {'printed': columns_of_equation_10(p, q, p), 'right': columns_of_equation_10(p, q, p + 1),
-               'cubic': columns_of_equation_10(p, p, p), 'cubic_right': columns_of_equation_10(p, p, p + 1)}
+    numbers = {'printed': columns_of_equation_10(p, q, p),
+               'right': columns_of_equation_10(p, q, p + 1),
+               'cubic': columns_of_equation_10(p, p, p),
+               'cubic_right': columns_of_equation_10(p, p, p + 1)}
     return Contradiction(numbers,
-                         'Eq. 10: the index i + (j-1)p collides. With p = 3 and q = 2 it gives {printed:d} different columns of {right:d}, '
-                         'with p = q = 3 {cubic:d} of {cubic_right:d}; i + (j-1)(p+1) gives all.')
+                         'Eq. 10: the index i + (j-1)p collides. With p = 3 and q = 2 it gives '
+                         '{printed:d} different columns of {right:d}, with p = q = 3 {cubic:d} of '
+                         '{cubic_right:d}; i + (j-1)(p+1) gives all.')
 
 
 def _data_sets() -> Contradiction:
     rates, temperatures = (len(np.arange(low, high + 1.0, step)) for low, high, step in
                            ((-FULL_SCALE, FULL_SCALE, 10.0), (COLDEST, WARMEST, 2.0)))
-    return Contradiction({'rates': rates, 'temperatures': temperatures, 'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
-                         'Section 3.3: every 10 deg/s over +-100 deg/s are {rates:d} rates, with {temperatures:d} temperatures {sets:d} '
-                         'data sets and not 121; 11 rates are every {step:.0f} deg/s. There p and q count rates and temperatures, in '
-                         'eq. 10 they are orders.')
+    return Contradiction({'rates': rates, 'temperatures': temperatures,
+                          'sets': rates * temperatures, 'step': 2.0 * FULL_SCALE / 10.0},
+                         'Section 3.3: every 10 deg/s over +-100 deg/s are {rates:d} rates, with '
+                         '{temperatures:d} temperatures {sets:d} data sets and not 121; 11 rates '
+                         'are every {step:.0f} deg/s. There p and q count rates and temperatures, '
+                         'in eq. 10 they are orders.')
 
 
 def condition_numbers() -> tuple[float, float]:
-    """Return those of the columns for deg/s and degC as they are, and centred and scaled to +-1."""
+    """Return the condition numbers for deg/s and degC, raw, and centred and scaled to +-1."""
     rates, temperatures = grid(spread(21) / DEGREE, np.linspace(COLDEST, WARMEST, 11))
     middle, half = (COLDEST + WARMEST) / 2.0, (WARMEST - COLDEST) / 2.0
-    raw, scaled = (np.linalg.cond(np.column_stack([rate ** i * temperature ** j for j in range(TEMPERATURE_ORDER + 1)
-                                                   for i in range(RATE_ORDER + 1)]))
-                   for rate, temperature in ((rates, temperatures), (rates / FULL_SCALE, (temperatures - middle) / half)))
+    raw, scaled = (
+        np.linalg.cond(np.column_stack([rate ** i * temperature ** j
+                                        for j in range(TEMPERATURE_ORDER + 1)
+                                        for i in range(RATE_ORDER + 1)]))
+        for rate, temperature in ((rates, temperatures),
+                                  (rates / FULL_SCALE, (temperatures - middle) / half)))
     return float(raw), float(scaled)
 
 
 def _condition() -> Contradiction:
     raw, scaled = condition_numbers()
-    return Contradiction({'raw': raw, 'scaled': scaled, 'digits': math.log10(raw), 'normal': 2.0 * math.log10(raw)},
-                         'Eq. 10: raw powers of deg/s and degC have the condition number {raw:.1e}, centred and scaled ones {scaled:.0f}. '
-                         'That costs {digits:.0f} of 16 digits, and all by normal equations ({normal:.0f}).')
+    return Contradiction({'raw': raw, 'scaled': scaled, 'digits': math.log10(raw),
+                          'normal': 2.0 * math.log10(raw)},
+                         'Eq. 10: raw powers of deg/s and degC have the condition number '
+                         '{raw:.1e}, centred and scaled ones {scaled:.0f}. That costs '
+                         '{digits:.0f} of 16 digits, and all by normal equations ({normal:.0f}).')
 
 
-def error_by_regressor(deviation: float, averaged: int, generator: np.random.Generator, samples: int = 20_000) -> float:
+def error_by_regressor(deviation: float, averaged: int, generator: np.random.Generator,
+                       samples: int = 20_000) -> float:
     """
-    Return what eq. 3, fitted over noisy outputs, says more of the error at 100 deg/s than over outputs without noise, rad/s.
+    Return the error of eq. 3 at 100 deg/s if it is fitted over noisy outputs, rad/s.
 
     Parameters
     ----------
@@ -250,7 +314,8 @@ def error_by_regressor(deviation: float, averaged: int, generator: np.random.Gen
     rates = np.repeat(spread(21), samples // averaged)
     clean = rd2100().output(rates, COLDEST)
     noisy = clean + generator.standard_normal(len(rates)) * deviation / math.sqrt(averaged)
-    wrong, right = (np.polynomial.Polynomial.fit(output, noisy - rates, RATE_ORDER) for output in (noisy, clean))
+    wrong, right = (np.polynomial.Polynomial.fit(output, noisy - rates, RATE_ORDER)
+                    for output in (noisy, clean))
     return float(wrong(clean[-1]) - right(clean[-1]))
 
 
@@ -261,44 +326,57 @@ def _regressor(generator: np.random.Generator) -> Contradiction:
         for kind, averaged in (('single', 1), ('mean', SAMPLES)):
             numbers[f'{name}_{kind}'] = error_by_regressor(deviation, averaged, generator) / DEGREE
     return Contradiction(numbers,
-                         'Eq. 9: the error is regressed on an output that holds the same noise. With samples that scatter by '
-                         '{white:.4f} deg/s the error at 100 deg/s is wrong by {white_single:.0e} deg/s, with means of 100 by '
-                         '{white_mean:.0e}; on a table that shakes by {vibration:.0f} deg/s by {vibration_single:.3f} and '
-                         '{vibration_mean:.4f} deg/s.')
+                         'Eq. 9: the error is regressed on an output that holds the same noise. '
+                         'With samples that scatter by {white:.4f} deg/s the error at 100 deg/s '
+                         'is wrong by {white_single:.0e} deg/s, with means of 100 by '
+                         '{white_mean:.0e}; on a table that shakes by {vibration:.0f} deg/s by '
+                         '{vibration_single:.3f} and {vibration_mean:.4f} deg/s.')
 
 
 def extrapolation(sagnac: float, generator: np.random.Generator) -> tuple[float, float]:
-    """Return the rms errors of the rate, rad/s, from 70 to 100 deg/s after a calibration up to 60, by polynomial and by sine."""
+    """
+    Return the rms errors of the rate from 70 to 100 deg/s, by polynomial and by sine, rad/s.
+
+    The calibration is up to 60 deg/s.
+
+    """
     gyro, temperatures = rd2100(sagnac), np.linspace(COLDEST, WARMEST, 11)
     table = rate_table(gyro, np.arange(-60.0, 61.0, 10.0) * DEGREE, temperatures, generator)
     beyond = np.arange(70.0, 101.0, 10.0) * DEGREE
     rate, temperature = grid(np.concatenate([-beyond, beyond]), temperatures)
     output = gyro.output(rate, temperature)
-    polynomial, sine = (float(np.sqrt(np.mean((fit(table, effects).rate(output, temperature) - rate) ** 2)))
-                        for effects in ([POLYNOMIAL], PHYSICAL))
+    polynomial, sine = (
+        float(np.sqrt(np.mean((fit(table, effects).rate(output, temperature) - rate) ** 2)))
+        for effects in ([POLYNOMIAL], PHYSICAL))
     return polynomial, sine
 
 
 def _sine(generator: np.random.Generator, runs: int, progress: Progress) -> Contradiction:
-    found = [[extrapolation(sagnac, generator) for sagnac in (SAGNAC, STRONG_SAGNAC)] for _ in progress(range(runs))]
+    found = [[extrapolation(sagnac, generator) for sagnac in (SAGNAC, STRONG_SAGNAC)]
+             for _ in progress(range(runs))]
     (weak, weak_sine), (strong, strong_sine) = np.mean(found, axis=0) / DEGREE
-    return Contradiction({'k': SAGNAC, 'weak': weak, 'weak_sine': weak_sine, 'strong_k': STRONG_SAGNAC, 'strong': strong,
-                          'strong_sine': strong_sine},
-                         'Eq. 3: a cubic is the start of a sine. Calibrated up to 60 deg/s, the polynomial (3, 2) errs between 70 and '
-                         '100 deg/s by {weak:.4f} deg/s, five effects with a sine by {weak_sine:.4f} (k = {k:.2f} s); with k = '
+    return Contradiction({'k': SAGNAC, 'weak': weak, 'weak_sine': weak_sine,
+                          'strong_k': STRONG_SAGNAC, 'strong': strong, 'strong_sine': strong_sine},
+                         'Eq. 3: a cubic is the start of a sine. Calibrated up to 60 deg/s, the '
+                         'polynomial (3, 2) errs between 70 and 100 deg/s by {weak:.4f} deg/s, '
+                         'five effects with a sine by {weak_sine:.4f} (k = {k:.2f} s); with k = '
                          '{strong_k:.2f} s by {strong:.3f} and {strong_sine:.4f}.')
 
 
 def _full_turn() -> Contradiction:
     error, rate = 0.1, 36.0
     duration = 360.0 / rate
-    return Contradiction({'error': error, 'rate': rate, 'right': error * duration, 'printed': error * OUTPUT_RATE * duration},
-                         'Eq. 14: error times output rate times time is no angle. {error:.1f} deg/s in a turn at {rate:.0f} deg/s are '
-                         '{right:.0f} deg, as printed {printed:.0f}; the samples have to be divided by the output rate.')
+    return Contradiction({'error': error, 'rate': rate, 'right': error * duration,
+                          'printed': error * OUTPUT_RATE * duration},
+                         'Eq. 14: error times output rate times time is no angle. {error:.1f} '
+                         'deg/s in a turn at {rate:.0f} deg/s are {right:.0f} deg, as printed '
+                         '{printed:.0f}; the samples have to be divided by the output rate.')
 
 
 def _earth() -> Contradiction:
     earth = EARTH_RATE * math.sin(LATITUDE * DEGREE)
-    return Contradiction({'earth': earth, 'stability': 3600.0 * STABILITY, 'ratio': earth / (3600.0 * STABILITY)},
-                         'Eq. 1: the static bias holds the rate of the Earth, in Ann Arbor {earth:.1f} deg/h on a level floor, {ratio:.1f} '
-                         'times the bias stability of {stability:.1f} deg/h.')
+    return Contradiction({'earth': earth, 'stability': 3600.0 * STABILITY,
+                          'ratio': earth / (3600.0 * STABILITY)},
+                         'Eq. 1: the static bias holds the rate of the Earth, in Ann Arbor '
+                         '{earth:.1f} deg/h on a level floor, {ratio:.1f} times the bias '
+                         'stability of {stability:.1f} deg/h.')
