@@ -1,15 +1,18 @@
 """
-The bias over temperature, as rests have shown it: kept between runs, aged, and used with the variance that it deserves.
+Bias at rest over temperature: kept between runs, aged, and used with its variance.
 
-The bias here is the rate at rest *after the model and before the self-calibration* (`Compensated.modelled`), which is also what a
-`SelfCalibration` calls its bias. So it is the same quantity whichever self-calibration is in use. What the table says of a change of
-temperature is added to the bias of the last calibration, and the bias that the table says is never added to that of a calibration:
-nothing is compensated twice.
+The bias here is the rate at rest *after the model and before the self-calibration*
+(`Compensated.modelled`), which is also what a `SelfCalibration` calls its bias. So it is the same
+quantity whichever self-calibration is in use. What the table says of a change of temperature is
+added to the bias of the last calibration, and the bias that the table says is never added to that
+of a calibration: nothing is compensated twice.
 
-Biases differ by what lies between them: temperature, whose local coefficient is a smooth random process over temperature; runs, as a gyro
-turns on with another bias each time; jumps; and time, by flicker, random walk and ageing. Seen from the present, every entry is then an
-estimate of the present bias with an error, and these errors have a known covariance: the answer is their generalized least squares mean.
-How large coefficient and turn-on scatter are is learned too, by restricted likelihood over a few sizes.
+Biases differ by what lies between them: temperature, whose local coefficient is a smooth random
+process over temperature; runs, as a gyro turns on with another bias each time; jumps; and time, by
+flicker, random walk and ageing. Seen from the present, every entry is then an estimate of the
+present bias with an error, and these errors have a known covariance: the answer is their
+generalized least squares mean. How large coefficient and turn-on scatter are is learned too, by
+restricted likelihood over a few sizes.
 
 """
 
@@ -48,10 +51,11 @@ _YEAR = 365.25 * 86400.0
 _SAME_RUN = 3600.0
 #: No bias is better known, (rad/s)².
 _LEAST = 1e-18
-#: Sizes of coefficient and turn-on scatter that are tried, in units of `Prior`, with how often they are met.
+#: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probability.
 _COEFFICIENTS = {0.03: 0.1, 0.1: 0.1, 0.3: 0.2, 1.0: 0.6}
 _TURN_ONS = {0.1: 0.2, 0.5: 0.3, 1.0: 0.2, 2.0: 0.2, 5.0: 0.1}
-_SIZES = np.array([(coefficient, turn_on) for coefficient in _COEFFICIENTS for turn_on in _TURN_ONS])
+_SIZES = np.array([(coefficient, turn_on)
+                   for coefficient in _COEFFICIENTS for turn_on in _TURN_ONS])
 _MET = np.array([often * also for often in _COEFFICIENTS.values() for also in _TURN_ONS.values()])
 
 
@@ -62,9 +66,11 @@ class Prior:
 
     Attributes
     ----------
-    coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D data sheet: 0.03 deg/s/K)
+    coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
+        data sheet: 0.03 deg/s/K)
     length : over which the coefficient stays about the same, K
-    compensated : what a model that looks at temperature leaves of the coefficient inside its range, 1
+    compensated : what a model that looks at temperature leaves of the coefficient inside its
+        range, 1
     turn_on : standard deviation of the bias from one run to the next, rad/s
     ageing : how far the bias at one temperature walks in a year, beyond the model's noise, rad/s
     unknown : where a temperature is not known, it is taken to be so far away, K
@@ -103,7 +109,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Jump:
-    """A step of the whole curve at the beginning of a run: its variance, (rad/s)², and its time, s since 1970."""
+    """A step of the bias at all temperatures, where a run begins: (rad/s)² and s since 1970."""
 
     run: int
     variance: float
@@ -122,7 +128,8 @@ class Carried:
     ----------
     calibration : with the bias and the covariance of now; to be used, and not to be stored
     change : its bias less the stored one, rad/s
-    variance : what the variance of the bias grew by, (rad/s)²; negative where the table knows better; nan where it was not known
+    variance : what the variance of the bias grew by, (rad/s)²; negative where the table knows
+        better; nan where it was not known
     sentence : for diagnostics, where age or distance matters; else ''
 
     """
@@ -146,11 +153,13 @@ class BiasTable:
 
     """
 
-    def __init__(self, model: GyroModel, prior: Prior | None = None, entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
+    def __init__(self, model: GyroModel, prior: Prior | None = None,
+                 entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
         """Begin a new run behind older entries, if there are any."""
         self.digest = model_digest(model)
         self.entries, self.jumps = list(entries), list(jumps)
-        self.run = 1 + max([-1, *(math.floor(each.run) for each in entries), *(each.run for each in jumps)])
+        self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
+                            *(each.run for each in jumps)])
         self._first, self._dated_anew = self.run, False
         self.held_back = 0
         self._model, self._prior = model, prior or Prior()
@@ -163,10 +172,12 @@ class BiasTable:
         self.run += any(each.run == self.run for each in self.entries)
 
     def clock_was_set(self, step: float) -> None:
-        """Take all dates since this table began for those of a clock that was then set by a step, s."""
-        self.entries, self._held = ([self._moved(each, step) for each in rows] for rows in (self.entries, self._held))
+        """Correct the dates since this table began for a clock that was set by a step, s."""
+        self.entries, self._held = ([self._moved(each, step) for each in rows]
+                                    for rows in (self.entries, self._held))
         self.jumps = [self._moved(each, step) for each in self.jumps]
-        self._dated_anew = self._dated_anew or any(each.run >= self._first for each in self.entries)
+        self._dated_anew = (self._dated_anew
+                            or any(each.run >= self._first for each in self.entries))
 
     def _moved(self, row: _Dated, step: float) -> _Dated:
         return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first else row
@@ -189,15 +200,16 @@ class BiasTable:
         """
         given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
         if not _possible(given):
-            return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of {variance:g} at {time:g} s is not used: '
-                    'that is beyond what a gyro has')
+            return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
+                    f'{variance:g} at {time:g} s is not used: that is beyond what a gyro has')
         before, known = self.predict(temperature, time)
         if abs(bias - before) <= FAR * math.sqrt(known + variance):
             self._held.clear()
             self._take(given)
             return ''
         self._held = [*(each for each in self._held if self._agree(each, given)), given]
-        off = f'{(bias - before) / DEGREE:.4f} deg/s off what is known at {temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)'
+        off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
+               f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
         if len(self._held) < IN_A_ROW:
             self.held_back += 1
             return f'a bias that is {off} was held back: was the robot turned slowly?'
@@ -205,8 +217,9 @@ class BiasTable:
         return f'the bias jumped: {IN_A_ROW} rests in a row are {off}; what was known is shifted'
 
     def _agree(self, held: Entry, given: Entry) -> bool:
-        variance = held.variance + given.variance + self._wander(given.time - held.time) + self._prior.coefficient ** 2 * _spread(
-            given.temperature - held.temperature, self._prior.length)
+        variance = (held.variance + given.variance + self._wander(given.time - held.time)
+                    + self._prior.coefficient ** 2
+                    * _spread(given.temperature - held.temperature, self._prior.length))
         return abs(given.bias - held.bias) <= FAR * math.sqrt(variance)
 
     def _jump(self, variance: float) -> None:
@@ -231,82 +244,97 @@ class BiasTable:
             self._forget()
 
     def _merged(self, entry: Entry, given: Entry) -> Entry:
-        """Return both as one at the time of the newer; the older is as uncertain then as the bias wanders."""
+        """Return both as one entry at the time of the newer, with the older aged until then."""
         older = entry.variance + self._wander(given.time - entry.time)
         weight = float(older / (older + given.variance))
-        return replace(given, bias=entry.bias + weight * (given.bias - entry.bias), variance=max(weight * given.variance, 2.0 * _LEAST),
-                       temperature=entry.temperature + weight * (given.temperature - entry.temperature))
+        return replace(given, bias=entry.bias + weight * (given.bias - entry.bias),
+                       variance=max(weight * given.variance, 2.0 * _LEAST),
+                       temperature=entry.temperature
+                       + weight * (given.temperature - entry.temperature))
 
     def _forget(self) -> None:
-        """Drop the oldest entry of the fullest bin, so that each temperature stays known, and the jumps that nothing is before."""
+        """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
         (fullest, _), = Counter(map(_bin, self.entries)).most_common(1)
-        self.entries.remove(min((each for each in self.entries if _bin(each) == fullest), key=lambda each: (each.run, each.time)))
+        self.entries.remove(min((each for each in self.entries if _bin(each) == fullest),
+                                key=lambda each: (each.run, each.time)))
         first = min(each.run for each in self.entries)
         self.jumps = [each for each in self.jumps if each.run > first]
 
     def predict(self, temperature: float, time: float) -> tuple[float, float]:
-        """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf where nothing is known."""
+        """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf if unknown."""
         return self._predicted(self.entries, temperature, time)[:2]
 
-    def _predicted(self, entries: Sequence[Entry], temperature: float, time: float) -> tuple[float, float, float]:
+    def _predicted(self, entries: Sequence[Entry], temperature: float,
+                   time: float) -> tuple[float, float, float]:
         """Return the bias, its variance, and the weight of the last entry in it."""
         if not entries:
             return 0.0, math.inf, 0.0
         temperature, time = _bounded(temperature, time)
         seen = self._seen(entries, temperature, time)
         bias, variance = _mixture(seen.likely, seen.mean, 1.0 / seen.information)
-        return bias + entries[0].bias, variance, float(seen.likely @ (seen.of_ones[:, -1] / seen.information))
+        return (bias + entries[0].bias, variance,
+                float(seen.likely @ (seen.of_ones[:, -1] / seen.information)))
 
-    def difference(self, from_temperature: float, to_temperature: float, time: float) -> tuple[float, float]:
-        """Return how much the bias changes with the temperature alone, rad/s, and the variance of that, (rad/s)²."""
-        (from_temperature, time), (to_temperature, _) = _bounded(from_temperature, time), _bounded(to_temperature, time)
+    def difference(self, from_temperature: float, to_temperature: float,
+                   time: float) -> tuple[float, float]:
+        """Return the change of bias between temperatures, rad/s, and its variance, (rad/s)²."""
+        (from_temperature, time), (to_temperature, _) = (_bounded(from_temperature, time),
+                                                         _bounded(to_temperature, time))
         own = self._by_temperature(from_temperature, np.array([to_temperature]))[:, 0]
         if not self.entries:
             return 0.0, float(_MET @ own)
         seen = self._seen(self.entries, from_temperature, time)
         temperatures = np.array([each.temperature for each in self.entries])
-        near, far = (self._by_temperature(end, temperatures) for end in (from_temperature, to_temperature))
+        near, far = (self._by_temperature(end, temperatures)
+                     for end in (from_temperature, to_temperature))
         shared = 0.5 * (near + own[:, None] - far)
-        change, of_shared = (np.einsum('mi,mi->m', shared, values) for values in (seen.of_rests, seen.of_ones))
+        change, of_shared = (np.einsum('mi,mi->m', shared, values)
+                             for values in (seen.of_rests, seen.of_ones))
         explained = np.einsum('mi,mij,mj->m', shared, seen.inverse, shared)
-        return _mixture(seen.likely, change, np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
+        return _mixture(seen.likely, change,
+                        np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
 
-    def joined(self, calibration: SelfCalibration, age: float, time: float, temperature: float | None,
-               this_run: bool) -> tuple[float, float, float]:
-        """Return the bias now, by table and calibration (see `carry`), its variance, and the weight of the calibration in it."""
-        here = self._model.reference_temperature if calibration.temperature is None else calibration.temperature
+    def joined(self, calibration: SelfCalibration, age: float, time: float,
+               temperature: float | None, this_run: bool) -> tuple[float, float, float]:
+        """Return bias and variance now (see `carry`), and the weight of the calibration in it."""
+        here = (self._model.reference_temperature if calibration.temperature is None
+                else calibration.temperature)
         now = here if temperature is None else temperature
         own = calibration.standard_deviations[1] ** 2
         if calibration.temperature is None:
             here, own = now, own + self._unknown()
         made = time - age
         jumped = any(each.time > made for each in self.jumps)
-        entry = Entry(here, calibration.bias, own, made, self.run if this_run and not jumped else self._run_at(made))
+        entry = Entry(here, calibration.bias, own, made,
+                      self.run if this_run and not jumped else self._run_at(made))
         bias, variance, weight = self._predicted([*self.entries, entry], now, time)
         return bias, variance + (self._unknown() if temperature is None else 0.0), weight
 
     def _run_at(self, time: float) -> float:
-        """Return the run that went on at a time, or a number of its own between the jumps before and after."""
+        """Return the run of a time, or a number between the jumps before and after it."""
         after = max([-1, *(each.run for each in self.jumps if each.time <= time)])
         until = min([self.run, *(each.run for each in self.jumps if each.time > time)])
-        near = {abs(each.time - time): each.run for each in self.entries if after <= each.run < until and abs(each.time - time) < _SAME_RUN}
+        near = {abs(each.time - time): each.run for each in self.entries
+                if after <= each.run < until and abs(each.time - time) < _SAME_RUN}
         return near[min(near)] if near else after + 0.5
 
     def _unknown(self) -> float:
-        """Return the variance of the bias, (rad/s)², where the temperature may be anything usual."""
+        """Return the variance of the bias, (rad/s)², where the temperature is unknown."""
         return float(_MET @ (self._usual() ** 2 * _SIZES[:, 0] ** 2)) * self._prior.unknown ** 2
 
     def _usual(self) -> float:
-        """Return the usual size of the temperature coefficient inside the range of the model, rad/s/K."""
-        return self._prior.coefficient * (self._prior.compensated if self._model.looks_at('temperature') else 1.0)
+        """Return the prior temperature coefficient within the range of the model, rad/s/K."""
+        return self._prior.coefficient * (
+            self._prior.compensated if self._model.looks_at('temperature') else 1.0)
 
     def _by_temperature(self, here: Array | float, there: Array) -> Array:
-        """Return the variance of the change of bias between temperatures, (rad/s)², shape (sizes, ...)."""
+        """Return the variance of the bias between temperatures, (rad/s)², shape (sizes, ...)."""
         inside = self._usual() ** 2 * _spread(there - here, self._prior.length)
-        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside) + self._outside(here, there))
+        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside)
+                          + self._outside(here, there))
 
     def _outside(self, here: Array | float, there: Array) -> Array | float:
-        """Return what of that comes from outside the range of temperatures of a model, where it stands still."""
+        """Return the part of that variance from outside the temperature range of the model."""
         if not self._model.looks_at('temperature'):
             return 0.0
         low, high = self._model.temperature_range
@@ -329,23 +357,27 @@ class BiasTable:
         misfit = of_rests @ rests - mean ** 2 * information
         logarithms = -0.5 * (np.linalg.slogdet(covariance)[1] + np.log(information) + misfit)
         likely = _MET * np.exp(logarithms - logarithms.max())
-        return _Seen(likely / likely.sum(), mean, information, of_ones, of_rests - mean[:, None] * of_ones, inverse)
+        return _Seen(likely / likely.sum(), mean, information, of_ones,
+                     of_rests - mean[:, None] * of_ones, inverse)
 
     def _covariance(self, entries: Sequence[Entry], temperature: float, time: float) -> Array:
-        """Return the covariance of what entries are off the bias in this run, now, at a temperature, (rad/s)², shape (sizes, n, n)."""
-        temperatures, variances, times, runs = (np.array([getattr(each, name) for each in entries])
-                                                for name in ('temperature', 'variance', 'time', 'run'))
+        """Return the covariance of the errors of entries now, (rad/s)², shape (sizes, n, n)."""
+        temperatures, variances, times, runs = (
+            np.array([getattr(each, name) for each in entries])
+            for name in ('temperature', 'variance', 'time', 'run'))
         age, runs_apart = np.abs(time - times), _between(runs) != 0.0
-        by_temperature = _shared(self._by_temperature(temperature, temperatures), self._by_temperature(temperatures[:, None], temperatures))
+        by_temperature = _shared(self._by_temperature(temperature, temperatures),
+                                 self._by_temperature(temperatures[:, None], temperatures))
         wander = self._wander(_between(times)) * (1.0 - np.eye(len(times)))
         alike = np.exp(-np.abs(_between(temperatures)) / self._prior.length)
         fixed = (_shared(self._wander(age), wander) + np.diag(variances)
-                 + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age) + self._jumped(runs))
+                 + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
+                 + self._jumped(runs))
         by_run = self._prior.turn_on ** 2 * _shared(2.0 * (runs != self.run), 2.0 * runs_apart)
         return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
 
     def _jumped(self, runs: Array) -> Array:
-        """Return the covariance by jumps, (rad/s)², shape (n, n): what was before a jump is off by the same."""
+        """Return the covariance by jumps, (rad/s)², shape (n, n), shared by all before a jump."""
         total = np.zeros((len(runs), len(runs)))
         for each in self.jumps:
             before = runs < each.run
@@ -353,14 +385,14 @@ class BiasTable:
         return total
 
     def changed(self) -> bool:
-        """Tell whether something was learned since `kept` that is worth a write, or dates were wrong."""
+        """Tell whether something worth a write was learned since `kept`, or dates were wrong."""
         if self._dated_anew:
             return True
         kept = {(each.run, _bin(each)): each for each in self._kept}
         return any(_differs(kept.get((each.run, _bin(each))), each) for each in self.entries)
 
     def due(self, now: float, ending: bool = False) -> bool:
-        """Tell whether to write now, s since 1970: when something was learned, but seldom, and at the end."""
+        """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
         return self.changed() and (ending or abs(now - self._kept_at) >= INTERVAL)
 
     def kept(self, now: float) -> None:
@@ -382,7 +414,8 @@ class _Seen:
     likely : probability of each, shape (sizes,)
     mean : of the biases less that of the first entry, rad/s, shape (sizes,)
     information : 1 over the variance of the mean, shape (sizes,)
-    of_ones, of_rests : the inverse times ones, and times what each entry is off the mean, shape (sizes, n)
+    of_ones, of_rests : the inverse times ones, and times what each entry is off the mean, shape
+        (sizes, n)
     inverse : of the covariance, shape (sizes, n, n)
 
     """
@@ -403,9 +436,10 @@ def _mixture(likely: Array, means: Array, variances: Array) -> tuple[float, floa
 
 def _spread(distance: Array | float, length: float) -> Any:
     """
-    Return the mean square, K², of the integral over a distance of a process of variance 1 and covariance (1 + |d|/length) exp(-|d|/length).
+    Return the mean square, K², of the integral of a process of variance 1 over a distance.
 
-    Its paths have a slope, which Gauss-Markov processes have not; the bias over temperature is as smooth as that.
+    Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of a
+    Gauss-Markov process: the bias over temperature is as smooth.
 
     """
     lengths = np.abs(distance) / length
@@ -417,7 +451,7 @@ def _between(values: Array) -> Array:
 
 
 def _shared(apart: Array, between: Array) -> Array:
-    """Return the covariance of what members are off a point, from the mean square off it and between them."""
+    """Return the covariance of members, from the mean squares off a point and between them."""
     return np.asarray(0.5 * (apart[..., :, None] + apart[..., None, :] - between))
 
 
@@ -427,29 +461,32 @@ def _bin(entry: Entry) -> int:
 
 def _possible(entry: Entry) -> bool:
     """Tell whether this may be a bias of a gyro; nan never is."""
-    return ((entry.temperature, entry.time) == _bounded(entry.temperature, entry.time) and abs(entry.bias) <= 1e4
-            and _LEAST <= entry.variance <= 1e8 and 0 <= entry.run <= 1e9)
+    return ((entry.temperature, entry.time) == _bounded(entry.temperature, entry.time)
+            and abs(entry.bias) <= 1e4 and _LEAST <= entry.variance <= 1e8
+            and 0 <= entry.run <= 1e9)
 
 
 def _bounded(temperature: float, time: float) -> tuple[float, float]:
-    """Return a temperature, degC, and a time, s since 1970, or the nearest ones that there may be."""
+    """Return temperature, degC, and time, s since 1970, limited to their possible ranges."""
     return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
 
 
 def _differs(kept: Entry | None, entry: Entry) -> bool:
-    """Tell whether an entry says something that the kept one does not: half a standard deviation, or a fifth of the variance."""
-    return kept is None or (entry.bias - kept.bias) ** 2 > 0.25 * kept.variance or entry.variance < 0.8 * kept.variance
+    """Tell whether an entry is new: by half a standard deviation, or a fifth of the variance."""
+    return (kept is None or (entry.bias - kept.bias) ** 2 > 0.25 * kept.variance
+            or entry.variance < 0.8 * kept.variance)
 
 
-def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: float, temperature: float | None = None,
-          this_run: bool = False) -> Carried:
+def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
+          temperature: float | None = None, this_run: bool = False) -> Carried:
     """
-    Return a stored calibration as it is worth now: moved by what the table knows, with the variance that age and distance give it.
+    Return a stored calibration as it holds now, moved and weighted by the table.
 
-    It is joined to the table as one more estimate of the bias, at its own temperature and time. It is for the start of a run, or of a
-    tracker that begins anew. Within a run an `assumptions.Way` goes on from there, of the table as it was; carried into a tracker
-    that goes on, it would hold what that knows already.
-    Its age is counted: whatever it is given to must take it for a calibration of now.
+    It is joined to the table as one more estimate of the bias, at its own temperature and time. It
+    is for the start of a run, or of a tracker that begins anew. Within a run an `assumptions.Way`
+    goes on from there, of the table as it was; carried into a tracker that goes on, it would hold
+    what that knows already. Its age is counted: whatever it is given to must take it for a
+    calibration of now.
 
     Parameters
     ----------
@@ -466,17 +503,21 @@ def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: floa
     (a, c), (_, own) = calibration.covariance
     bias, variance, weight = table.joined(calibration, age, time, temperature, this_run)
     moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
-    return Carried(moved, bias - calibration.bias, variance - own, _sentence(calibration, table, age, temperature, variance))
+    return Carried(moved, bias - calibration.bias, variance - own,
+                   _sentence(calibration, table, age, temperature, variance))
 
 
-def _moved(calibration: SelfCalibration, table: BiasTable, time: float, temperature: float | None) -> Carried:
+def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
+           temperature: float | None) -> Carried:
     """Return a calibration of which nobody knows how good it is, at another temperature."""
     here = calibration.temperature
-    change = 0.0 if here is None or temperature is None else table.difference(here, temperature, time)[0]
+    change = (0.0 if here is None or temperature is None
+              else table.difference(here, temperature, time)[0])
     return Carried(replace(calibration, bias=calibration.bias + change), change, math.nan, '')
 
 
-def _sentence(calibration: SelfCalibration, table: BiasTable, age: float, temperature: float | None, variance: float) -> str:
+def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
+              temperature: float | None, variance: float) -> str:
     """Say that a calibration is no longer as good as it was, and why."""
     own = calibration.standard_deviations[1]
     if variance < 2.0 * own ** 2:
@@ -485,8 +526,9 @@ def _sentence(calibration: SelfCalibration, table: BiasTable, age: float, temper
         why = 'at a temperature that is not known'
     else:
         why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
-    return (f'the calibration was made {_age(age)} ago {why}: its bias is now known to {math.sqrt(variance) / DEGREE:.4f} deg/s, '
-            f'then to {own / DEGREE:.4f} deg/s; let the robot rest, or calibrate again')
+    return (f'the calibration was made {_age(age)} ago {why}: its bias is now known to '
+            f'{math.sqrt(variance) / DEGREE:.4f} deg/s, then to {own / DEGREE:.4f} deg/s; '
+            'let the robot rest, or calibrate again')
 
 
 def _age(age: float) -> str:
@@ -500,25 +542,27 @@ FORMAT = 'gyro_calibration/bias_table'
 VERSION = 1
 #: A table of `ENTRIES` entries has a twentieth of this.
 _BYTES = 200_000
-_HEADER = """\
-# Biases of a gyro at rest, rad/s, behind the model with this digest and before any self-calibration; times are UTC.
-# Written by the compensation node. It may be deleted: then it is learned anew.
-"""
+_HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
+           'any self-calibration; times are UTC.\n'
+           '# Written by the compensation node. It may be deleted: then it is learned anew.\n')
 
 
 def model_digest(model: GyroModel) -> str:
-    """Return a name for what models with `same_effects` and the same serial number share: biases behind one hold behind the other."""
-    told = [[term.effect.name, list(term.values)] for term in model.terms], model.gyro.get('serial_number', '')
+    """Return a name for models with `same_effects` and one serial number: they share biases."""
+    told = ([[term.effect.name, list(term.values)] for term in model.terms],
+            model.gyro.get('serial_number', ''))
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
 
-def read_bias_table(path: str | Path, model: GyroModel, prior: Prior | None = None) -> tuple[BiasTable, str]:
+def read_bias_table(path: str | Path, model: GyroModel,
+                    prior: Prior | None = None) -> tuple[BiasTable, str]:
     """
     Read what earlier runs have learned, for a run that begins.
 
     Returns
     -------
-    the table, and '' or in a sentence why it is empty although there is a file; such a file is kept when a new one is written
+    the table, and '' or in a sentence why it is empty although there is a file; such a file is
+    kept when a new one is written
 
     """
     try:
@@ -526,21 +570,26 @@ def read_bias_table(path: str | Path, model: GyroModel, prior: Prior | None = No
     except FileNotFoundError:
         return BiasTable(model, prior), ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        said = f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, and the file is kept'
+        said = (f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, '
+                'and the file is kept')
         return BiasTable(model, prior), plain(said)
     if digest != model_digest(model):
-        return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another model: it is learned anew, and the file is '
-                                              'kept')
+        return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another '
+                                              'model: it is learned anew, and the file is kept')
     return BiasTable(model, prior, entries, jumps), ''
 
 
-def write_bias_table(path: str | Path, table: BiasTable, now: float) -> tuple[str, tuple[int, int]]:
+def write_bias_table(path: str | Path, table: BiasTable,
+                     now: float) -> tuple[str, tuple[int, int]]:
     """
-    Write a table completely or not at all; a file in its place that is not of this model or not readable is kept under another name.
+    Write a table completely or not at all.
+
+    A file in its place that is unreadable or not of this model is kept under another name.
 
     Returns
     -------
-    '', or in a sentence under which name the old file is kept; and the version that was written, as `files.write_atomically` does
+    '', or in a sentence under which name the old file is kept; and the version that was written,
+    as `files.write_atomically` does
 
     Raises
     ------
@@ -573,13 +622,16 @@ def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:
         raise ValueError(f'it does not say format: {FORMAT}')
     if content.get('version') != VERSION:
         raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {VERSION}')
-    entries = [_entry(row, float(row['temperature']), float(row['bias'])) for row in _rows(content, 'entries')]
-    jumps = [Jump(int(each.run), each.variance, each.time) for each in (_entry(row, 0.0, 0.0) for row in _rows(content, 'jumps'))]
+    entries = [_entry(row, float(row['temperature']), float(row['bias']))
+               for row in _rows(content, 'entries')]
+    jumps = [Jump(int(each.run), each.variance, each.time)
+             for each in (_entry(row, 0.0, 0.0) for row in _rows(content, 'jumps'))]
     return str(content['model']), entries, jumps
 
 
 def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
-    entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2, _seconds(row['time']), int(row['run']))
+    entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2,
+                  _seconds(row['time']), int(row['run']))
     if not _possible(entry):
         raise ValueError(f'no gyro has {entry}')
     return entry
@@ -587,25 +639,30 @@ def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
 
 def _rows(content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     rows = content[name]
-    if not isinstance(rows, list) or len(rows) > ENTRIES or not all(isinstance(row, dict) for row in rows):
+    if (not isinstance(rows, list) or len(rows) > ENTRIES
+            or not all(isinstance(row, dict) for row in rows)):
         raise ValueError(f'{name} is no list of at most {ENTRIES} rows')
     return rows
 
 
 def _seconds(value: Any) -> float:
     """Return a time, s since 1970, from its text, or from what YAML takes it for."""
-    return float(np.datetime64(str(value).removesuffix('Z').removesuffix('+00:00'), 's').astype('int64'))
+    return float(np.datetime64(
+        str(value).removesuffix('Z').removesuffix('+00:00'), 's').astype('int64'))
 
 
 def _content(table: BiasTable) -> dict[str, Any]:
-    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias), **_common(each)} for each in table.entries]
+    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias),
+                **_common(each)} for each in table.entries]
     jumps = [_common(each) for each in table.jumps]
-    return {'format': FORMAT, 'version': VERSION, 'model': table.digest, 'entries': entries, 'jumps': jumps}
+    return {'format': FORMAT, 'version': VERSION, 'model': table.digest,
+            'entries': entries, 'jumps': jumps}
 
 
 def _common(row: Entry | Jump) -> dict[str, Any]:
     time = str(np.datetime64(round(row.time), 's'))
-    return {'standard_deviation': _short(math.sqrt(row.variance)), 'time': time, 'run': int(row.run)}
+    return {'standard_deviation': _short(math.sqrt(row.variance)), 'time': time,
+            'run': int(row.run)}
 
 
 def _short(value: float) -> float:

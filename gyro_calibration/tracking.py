@@ -1,8 +1,9 @@
 """
-The heading of a robot from compensated rates, with what rests teach of the bias, and with its variance.
+The heading of a robot from compensated rates, with its variance and the bias seen at rest.
 
-At rest the bias is tracked, the rate is zero and the heading stands. In motion the bias stays, with a variance that grows. A turn too slow
-to be seen at once is seen over a longer time, and what was taken for bias meanwhile becomes heading again.
+At rest the bias is tracked, the rate is zero and the heading stands. In motion the bias stays,
+with a variance that grows. A turn too slow to be seen at once is seen over a longer time, and what
+was taken for bias meanwhile becomes heading again.
 
 """
 
@@ -29,14 +30,16 @@ _STEP = 1.0
 _FAR = 4.0
 #: A rest that is over sooner was none, s.
 _BRIEF = 2.0
-#: While the wheels stand, nobody turns the robot, and the bias may have moved by so much unseen, rad/s.
+#: While the wheels stand, nobody turns the robot, and the bias may have moved by so much, rad/s.
 _UNSEEN = 0.2 * DEGREE
-#: Noise of the samples counts for more than the model claims from this factor on, and a mean may be off by so much more, for noise figures
-#: are not better known.
+#: Noise of the samples counts from this factor over that of the model on; a mean may be off by so
+#: much more, for noise figures are not better known.
 _ALLOWED = 1.25
-#: A steady turn that is slower than so many times what would just be noticed may be a bias that moved, and is after so long, s.
+#: A steady turn slower than so many times the slowest that is noticed may be a bias that moved;
+#: it is taken for one after so long, s.
 _DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
-#: Where rests are looked for anew, a correction that waits for motion waits so much longer, s, until a rest that goes on is found again.
+#: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
+#: goes on is found again.
 _RECOGNIZED = 1.0
 #: The slowest turn that is noticed is missed with a probability of 5 %.
 _POWER = 1.645
@@ -49,7 +52,8 @@ class Settings:
 
     Attributes
     ----------
-    false_alarms : rests taken for motion, in an hour at rest, 1/h; 0 looks for no rests, and nor does an unknown noise
+    false_alarms : rests taken for motion, in an hour at rest, 1/h; 0 looks for no rests, and nor
+        does an unknown noise
     threshold : of the filter of Hong and Park, eq. 12; used where rests are not looked for
     maximum_gap : over a longer gap in the stamps nothing is integrated, s
 
@@ -62,7 +66,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """The state at some time of a rest, what the rates came to since the rest began, and what was deleted until then, rad."""
+    """State at some time of a rest; rotation since it began; heading deleted until then, rad."""
 
     drift: Drift
     turn: Turn
@@ -90,7 +94,7 @@ class _Doubt:
 
 @dataclass(frozen=True)
 class Step:
-    """A part of the way: the state before it, what the rates came to, whether the robot rested, and when it ends, s."""
+    """A part of the way: state before, integral of the rates, robot at rest or not, end in s."""
 
     before: Drift
     turn: Turn
@@ -109,21 +113,22 @@ class HeadingTracker:
     resting : whether the robot rests
     deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
     intervals : of the samples, and how many are lost
-    refused : samples that were not used, as no robot turns so fast; they are lost like those that never came
+    refused : samples that were not used, as no robot turns so fast; they count as lost
     rebuilt : how often the state was not finite and was built anew
     steps : the way so far, where it is kept
 
     """
 
-    def __init__(self, noise: Noise, covariance: Array, settings: Settings, age: float | None = 0.0, keep: bool = False):
+    def __init__(self, noise: Noise, covariance: Array, settings: Settings,
+                 age: float | None = 0.0, keep: bool = False):
         """
         Begin at heading zero.
 
         Parameters
         ----------
         noise : of the model
-        covariance : of the values of the calibration, shape (m, m), as `compensation.covariance` gives it
-        age : of the self-calibration, whose s and b are the last values, s; None where there is none
+        covariance : of the values of the calibration, (m, m), from `compensation.covariance`
+        age : of the self-calibration, whose s and b are the last values, s; None without one
         keep : the `steps`, for `smoothed`
 
         """
@@ -139,12 +144,14 @@ class HeadingTracker:
         self._biased: Array | None = None
         self._seen_off, self._bias_seen = 0.0, (0.0, 0.0)
         self._still: Array | None = None
-        self._gaps, self._energy, self._tested = Gaps(noise), Energy(noise, settings.false_alarms), (noise, settings.false_alarms)
+        self._gaps, self._energy, self._tested = (
+            Gaps(noise), Energy(noise, settings.false_alarms), (noise, settings.false_alarms))
         self.intervals = self._gaps.intervals
         self._begin(noise, covariance, 0.0, 0.0, age)
         self.set(settings)
 
-    def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float, age: float | None) -> None:
+    def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float,
+               age: float | None) -> None:
         self._claimed, self._calibrated = noise, (covariance, age)
         self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
         self._nothing, self._part = self._none(), self._none()
@@ -157,14 +164,16 @@ class HeadingTracker:
         """Go on with other settings."""
         self._settings = settings
         self._seeks = settings.false_alarms > 0.0 and self._claimed.angle_random_walk > 0.0
-        rests = self.resting and self._seeks and self._tested == (self._claimed, settings.false_alarms)
+        rests = (self.resting and self._seeks
+                 and self._tested == (self._claimed, settings.false_alarms))
         if self._tested != (self._claimed, settings.false_alarms):
             self._tested = self._claimed, settings.false_alarms
             self._energy = Energy(*self._tested)
         self._block, self._driven = Block(), False
-        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._seeks else settings.threshold)
-        self._sigmas = {
-            lag: _ALLOWED * sigmas(lag, settings.false_alarms) for lag in (WINDOW, *LAGS)} if self._seeks else {}
+        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._seeks
+                                       else settings.threshold)
+        self._sigmas = {lag: _ALLOWED * sigmas(lag, settings.false_alarms)
+                        for lag in (WINDOW, *LAGS)} if self._seeks else {}
         if rests:
             self._rest()
         else:
@@ -175,7 +184,8 @@ class HeadingTracker:
         """
         Go on with other noise figures and another calibration.
 
-        The heading does not jump. What rests taught of the bias is forgotten, but not what they have shown of the turn before.
+        The heading does not jump. What was learned of the bias at rest is forgotten, but not what
+        it showed of the turn before.
 
         """
         heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
@@ -193,7 +203,8 @@ class HeadingTracker:
         self._drift = self._drift.turned_to(0.0)
         if self._doubt:
             # if the robot has stood since, it had this direction then
-            self._doubt.before = replace(self._doubt.before, drift=self._doubt.before.drift.turned_to(0.0), deleted=0.0)
+            self._doubt.before = replace(
+                self._doubt.before, drift=self._doubt.before.drift.turned_to(0.0), deleted=0.0)
         self._take()
         if self.resting:
             self._rest()
@@ -214,11 +225,13 @@ class HeadingTracker:
         if self._known is None:
             self._known = float(self._drift.moved(self._open).covariance[HEADING, HEADING])
         part = self._part
-        return self._known + self._drift.noise.angle_random_walk ** 2 * part.duration + part.lost + part.noise + self._pending ** 2
+        return (self._known + self._drift.noise.angle_random_walk ** 2 * part.duration
+                + part.lost + part.noise + self._pending ** 2)
 
     # Samples
 
-    def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None, still: Array | None = None) -> str:
+    def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None,
+            still: Array | None = None) -> str:
         """
         Take one sample.
 
@@ -226,10 +239,11 @@ class HeadingTracker:
         ----------
         time : stamp, s
         rate : compensated, rad/s
-        sensitivity : of the rate to the values of the calibration, shape (m,), as in `compensation`
+        sensitivity : of the rate to the values of the calibration, (m,), as in `compensation`
         wheels : whether wheels or commands move the robot; None where nobody says so
-        still : the sensitivity if the true rate is zero; else that of the samples serves at rest too, whose noise in the place of the rate
-            is then taken for a scale factor error, which is harmless only where that is well known
+        still : the sensitivity if the true rate is zero; without it that of the samples serves at
+            rest too: their noise then counts as a scale factor error, which is harmless only where
+            the scale factor is well known
 
         Returns
         -------
@@ -267,15 +281,17 @@ class HeadingTracker:
         return said
 
     def _off(self, sensitivity: Array) -> float:
-        """Return what rests have taught that a rate is off by, rad/s; many samples in a row have the same sensitivity."""
+        """Return what a rate is off by, as seen at rest, rad/s; cached for one sensitivity."""
         if sensitivity is not self._seen:
-            self._seen, self._seen_off = sensitivity, self._offset - float(sensitivity @ self._values)
+            self._seen, self._seen_off = (
+                sensitivity, self._offset - float(sensitivity @ self._values))
         return self._seen_off
 
     def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
         """Take the heading on to the last sample."""
         assert self._last is not None
-        (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = self._last, last
+        (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = (
+            self._last, last)
         half = 0.5 * interval
         kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
         duration, turned = kept + last_kept, half * (filtered + last_filtered)
@@ -299,11 +315,12 @@ class HeadingTracker:
         self.heading += turned + settled
 
     def _look(self, duration: float, before: float, wheels: bool | None) -> None:
-        """Look for rest and motion: at each sample, which stands for some time, for a sudden one; at the end of each block for any."""
+        """Look for sudden motion at each sample, and for any at the end of each block."""
         assert self._last is not None
         _, rate, _, sensitivity = self._last
         self._block.add(duration, rate, before)
-        if self.resting and (wheels or abs(rate - self._off(sensitivity)) > math.hypot(self._energy.sudden(), self._unsure)):
+        if self.resting and (wheels or abs(rate - self._off(sensitivity))
+                             > math.hypot(self._energy.sudden(), self._unsure)):
             self._notice(0.0)
         self._driven = self._driven or bool(wheels)
         if self._block.duration >= BLOCK - 1e-9:
@@ -325,7 +342,7 @@ class HeadingTracker:
         if not quiet or wheels:
             self._wanted, self._doubt = WINDOW, None
         if wheels:
-            # an even turn has no more energy than a rest: what the wheels say is not held back for one
+            # an even turn has no more energy than a rest: no need to wait where wheels tell
             self._move(WINDOW)
         self._hold(part)
         if self._open.duration >= self._held.duration + _STEP:
@@ -338,29 +355,31 @@ class HeadingTracker:
         """Hold the last blocks back that may turn out to be the begin of a rest."""
         self._recent.append(part)
         self._held += part
-        while len(self._recent) > 2 and self._held.duration - self._recent[0].duration >= self._wanted - 1e-9:
+        while (len(self._recent) > 2
+               and self._held.duration - self._recent[0].duration >= self._wanted - 1e-9):
             self._held -= self._recent.popleft()
 
     def _settled(self) -> Turn:
-        """Return what is held back but for its first block: that begins at the sample before the window, in which the robot may move."""
+        """Return what is held back without its first block, in which the robot may move."""
         return self._held - self._recent[0]
 
     def _stands(self, wheels: bool | None) -> bool:
-        """Tell whether the mean of a quiet time that is long enough may be one of a robot that stands."""
+        """Tell whether the mean of a quiet time that is long enough may be that of a rest."""
         if self._held.duration < self._wanted - 1e-9 or len(self._recent) < 2:
             return False
         most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
-        stands = abs(self._surprise(self._drift, self._at_rest(self._settled()), _UNSEEN if wheels is False else 0.0)) < most
+        stands = abs(self._surprise(self._drift, self._at_rest(self._settled()),
+                                    _UNSEEN if wheels is False else 0.0)) < most
         if not stands and self._wanted > WINDOW and not self._drifted():
             self._move(self._wanted)
         return stands
 
     def _drifted(self) -> bool:
         """
-        Take a slow turn that stays as it is for a bias that moved, and the robot for standing since it was seen; tell whether so.
+        Take a slow turn that stays as it is for a bias that moved and a rest; tell whether so.
 
-        No robot turns as evenly for minutes, but a bias that wanders by more than the model says would otherwise make a heading drift at
-        rest for ever.
+        No robot turns as evenly for minutes. A bias that wanders by more than the model says would
+        otherwise make the heading drift at rest for ever.
 
         """
         doubt, held = self._doubt, self._at_rest(self._held)
@@ -368,13 +387,15 @@ class HeadingTracker:
             return False
         start = doubt.before.drift.uncertain(WALK, doubt.rate ** 2)
         moved = start.rested(self._at_rest(doubt.turn))
-        if doubt.turn.duration + held.duration < _DECIDED or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]:
+        if (doubt.turn.duration + held.duration < _DECIDED
+                or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]):
             doubt.turn += held
             return False
         if self._keep:
             assert self._last is not None
             del self.steps[doubt.before.steps:]
-            self.steps.append(Step(start, self._at_rest(doubt.turn), True, self._last[0] - self._part.duration - held.duration))
+            self.steps.append(Step(start, self._at_rest(doubt.turn), True,
+                                   self._last[0] - self._part.duration - held.duration))
         self._drift, self._open, self._doubt = moved, self._held, None
         self._rest()
         self._take()
@@ -396,27 +417,32 @@ class HeadingTracker:
             if abs(surprise) > self._sigmas[lag]:
                 if wheels is False:
                     expected, _ = before.drift.expected(turn)
-                    self._drift = self._drift.uncertain(WALK, ((turn.turned - expected) / turn.duration) ** 2)
+                    self._drift = self._drift.uncertain(
+                        WALK, ((turn.turned - expected) / turn.duration) ** 2)
                     self._rest()
                 else:
                     self._notice(lag)
                 return
 
     def _before(self, lag: float) -> _Snapshot | None:
-        """Return the state `lag` s before the last step of this rest; None where that is before it began."""
+        """Return the state `lag` s before the last step of this rest; None if before its begin."""
         until = self._rested.duration - lag + 1e-6
-        return next((each for each in reversed(self._snapshots) if each.turn.duration <= until), None)
+        return next((each for each in reversed(self._snapshots) if each.turn.duration <= until),
+                    None)
 
     # From rest to motion and back
 
     def _rest(self) -> None:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
-        self._snapshots = deque([_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))], maxlen=round(LAGS[-1] / _STEP) + 8)
+        self._snapshots = deque(
+            [_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))],
+            maxlen=round(LAGS[-1] / _STEP) + 8)
 
     def _move(self, wanted: float) -> None:
         """Take the robot for moving, until it is quiet for `wanted` s."""
-        self.resting, self._wanted, self._recent, self._held = False, wanted, deque[Turn](), self._nothing
+        self.resting, self._wanted, self._recent, self._held = (
+            False, wanted, deque[Turn](), self._nothing)
 
     def _recognize(self) -> None:
         """Look for a rest anew; if there was one, it may go on."""
@@ -442,14 +468,16 @@ class HeadingTracker:
         longest = replace(self._nothing, duration=LAGS[-1])
         least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
         rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
-        return _Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least else None
+        return (_Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
+                else None)
 
     def _restart(self, interval: float, fastest: float) -> str:
         """
         Begin anew after a gap or a jump back.
 
-        Over a gap nothing is integrated, and what may have been turned meanwhile goes into the variance. How much time a jump back hides,
-        the stamps do not tell, so nothing is known of a turn in it.
+        Over a gap nothing is integrated, and what may have been turned meanwhile goes into the
+        variance. The stamps do not tell how much time a jump back hides, so nothing is known of a
+        turn in it.
 
         """
         self._settle()
@@ -463,7 +491,8 @@ class HeadingTracker:
         if interval < 0.0:
             return f'the stamp jumps back by {-interval:.3f} s'
         self.intervals.count(interval)
-        self._go_on(replace(self._nothing, duration=interval, lost=(fastest * interval) ** 2, unseen=True), self._reached)
+        self._go_on(replace(self._nothing, duration=interval, lost=(fastest * interval) ** 2,
+                            unseen=True), self._reached)
         self._take()
         return f'no samples for {interval:.3f} s'
 
@@ -485,7 +514,8 @@ class HeadingTracker:
             if self.resting:
                 self._rested += turn
                 deleted = self.deleted - self._corrected(self._part)
-                self._snapshots.append(_Snapshot(self._drift, self._rested, deleted, len(self.steps)))
+                self._snapshots.append(
+                    _Snapshot(self._drift, self._rested, deleted, len(self.steps)))
         self._take()
 
     def _go_on(self, turn: Turn, end: float) -> None:
@@ -496,29 +526,35 @@ class HeadingTracker:
 
     def _at_rest(self, turn: Turn) -> Turn:
         """Return what the rates of a rest came to, without their noise in the sensitivity."""
-        return turn if self._still is None else replace(turn, sensitivity=turn.duration * self._still)
+        return (turn if self._still is None
+                else replace(turn, sensitivity=turn.duration * self._still))
 
     def _take(self) -> None:
-        """Take on what the state has come to, and how loud the gyro is; the heading does not jump."""
+        """Take over the state and the noise of the samples; the heading does not jump."""
         if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
             self._rebuild()
         loud = self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0
-        if (noise := replace(self._claimed, angle_random_walk=loud * self._claimed.angle_random_walk)) != self._drift.noise:
+        if (noise := replace(self._claimed, angle_random_walk=loud
+                             * self._claimed.angle_random_walk)) != self._drift.noise:
             self._drift = replace(self._drift, noise=noise)
         self._gaps.noise = self._drift.noise
-        self._offset, self._values, self._seen, self._biased = self._drift.offset[0], self._drift.values[0], None, None
+        self._offset, self._values, self._seen, self._biased = (
+            self._drift.offset[0], self._drift.values[0], None, None)
         self._unsure = _FAR * self.bias[1]
         self._known = None
-        estimate = float(self._drift.mean[HEADING]) + (0.0 if self.resting else self._corrected(self._open + self._part))
+        estimate = float(self._drift.mean[HEADING]) + (
+            0.0 if self.resting else self._corrected(self._open + self._part))
         self._pending = estimate - self.heading
         self._good = self.heading, self.variance
 
     def _rebuild(self) -> None:
-        """Begin anew where the state is not finite, with the last heading that was; it may be off by a full turn since."""
+        """Begin anew from the last finite heading, which may be off by a full turn since."""
         heading, variance = self._good
         covariance, age = self._calibrated
-        self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2, age)
-        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._doubt = heading, 0.0, 0.0, 0.0, None, None
+        self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2,
+                    age)
+        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._doubt = (
+            heading, 0.0, 0.0, 0.0, None, None)
         if self._last is not None:
             self._last = (*self._last[:3], np.zeros(len(covariance)))
         self._energy, self._block, self._driven = Energy(*self._tested), Block(), False
@@ -528,7 +564,8 @@ class HeadingTracker:
         self._move(WINDOW)
         self._known, self._pending = None, 0.0
         self.rebuilt += 1
-        self._mended = 'the state was not finite and was built anew; the heading may be off by a full turn'
+        self._mended = ('the state was not finite and was built anew; '
+                        'the heading may be off by a full turn')
         self._take()
 
     def _corrected(self, part: Turn) -> float:
@@ -544,11 +581,11 @@ class HeadingTracker:
 
     @property
     def bias(self) -> tuple[float, float]:
-        """Return what rests have taught of the bias beyond the calibration, and how well the bias is known, rad/s."""
+        """Return the bias seen at rest beyond the calibration, and its uncertainty, rad/s."""
         return self.bias_by(self._nothing.sensitivity if self._last is None else self._last[3])
 
     def bias_by(self, sensitivity: Array) -> tuple[float, float]:
-        """Return the same for samples with another sensitivity, shape (m,), as those at another temperature."""
+        """Return the same for another sensitivity, (m,), as of samples at another temperature."""
         if sensitivity is not self._biased:
             bias, variance = self._drift.bias(sensitivity)
             self._biased, self._bias_seen = sensitivity, (bias, math.sqrt(variance))
@@ -556,15 +593,18 @@ class HeadingTracker:
 
     @property
     def rate_variance(self) -> float:
-        """Return the variance of the last rate, (rad/s)²: of its noise, and of what is known of bias and scale."""
+        """Return the variance of the last rate, (rad/s)², by noise, bias and scale."""
         interval = max(min(self._interval, self.intervals.usual), SHORTEST)
-        return self.bias[1] ** 2 + self._drift.noise.rate_variance(WINDOW if self.resting else interval)
+        return self.bias[1] ** 2 + self._drift.noise.rate_variance(
+            WINDOW if self.resting else interval)
 
     @property
     def slowest_noticed(self) -> float:
-        """Return the slowest turn, rad/s, that is missed in 5 % of cases only, where no wheels tell of it; nan if unknown."""
-        turns = [(lag, replace(self._nothing, duration=lag)) for lag in LAGS] if self._seeks else []
-        return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag for lag, turn in turns), default=math.nan)
+        """Return the slowest turn, rad/s, that is noticed in 95 % of cases; nan if unknown."""
+        turns = ([(lag, replace(self._nothing, duration=lag)) for lag in LAGS]
+                 if self._seeks else [])
+        return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag
+                    for lag, turn in turns), default=math.nan)
 
 
 @dataclass(frozen=True)
@@ -590,8 +630,9 @@ class Track:
     intervals: Intervals
 
 
-def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array, settings: Settings,
-          wheels: list[bool | None] | None = None, hindsight: bool = False, age: float | None = 0.0, still: Array | None = None) -> Track:
+def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
+          settings: Settings, wheels: list[bool | None] | None = None, hindsight: bool = False,
+          age: float | None = 0.0, still: Array | None = None) -> Track:
     """
     Return the heading over a whole log.
 
@@ -602,7 +643,7 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     noise, covariance, settings, age : as in `HeadingTracker`
     wheels : whether wheels or commands move the robot, n of them, or None
     still : as in `HeadingTracker.add`
-    hindsight : let all that came later speak too
+    hindsight : let all that came later count too
 
     Raises
     ------
@@ -611,11 +652,14 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
     found = np.empty((len(time), 5))
-    for index, (at, value, seen) in enumerate(zip(time.tolist(), rate.tolist(), np.ascontiguousarray(sensitivity.T))):
+    for index, (at, value, seen) in enumerate(zip(time.tolist(), rate.tolist(),
+                                                  np.ascontiguousarray(sensitivity.T))):
         tracker.add(at, value, seen, None if wheels is None else wheels[index], still)
-        found[index] = tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance, tracker.resting
+        found[index] = (tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance,
+                        tracker.resting)
     heading, variance, shown, rate_variance, resting = found.T
-    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted, tracker.intervals)
+    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted,
+                 tracker.intervals)
     if not hindsight:
         return live
     if not np.isfinite(found).all():
@@ -626,7 +670,7 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
 
 def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
     """
-    Return heading, rad, its variance, rad², and where the robot rested, shape (n,) each, with all that came later.
+    Return heading, rad, its variance, rad², and rest, shape (n,) each, with all that came later.
 
     The heading is what the rates came to, with the correction interpolated between the steps.
 
@@ -637,11 +681,14 @@ def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
 
     """
     last, steps = tracker.finish(), tracker.steps
-    states = smoothed([*(step.before for step in steps), last], [step.turn for step in steps], [step.resting for step in steps])
+    states = smoothed([*(step.before for step in steps), last], [step.turn for step in steps],
+                      [step.resting for step in steps])
     ends = np.array([time[0], *(step.end for step in steps)])
-    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING]) for state in states]).T
+    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
+                                  for state in states]).T
     turned = integrate(time, rate)
     rested = np.array([step.resting for step in steps] or [False])
     resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
     moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
-    return np.where(resting, np.interp(time, ends, heading), moved), np.interp(time, ends, variance), resting
+    return (np.where(resting, np.interp(time, ends, heading), moved),
+            np.interp(time, ends, variance), resting)
