@@ -1,8 +1,9 @@
 """
-The heading on a robot, sample by sample: model, calibration, temperature and what rests teach, joined.
+The heading on a robot, sample by sample, by model, calibration, temperature and bias at rest.
 
-What is computed is in `compensation`, `tracking` and `bias_table`. Here a calibration is carried to the time and temperature of now, the
-bias follows the temperature while the robot drives, and what rests show of it goes into the table for the next run.
+What is computed is in `compensation`, `tracking` and `bias_table`. Here a calibration is carried
+to the time and temperature of now, the bias follows the temperature while the robot drives, and
+what rests show of it goes into the table for the next run.
 
 """
 
@@ -28,15 +29,18 @@ from gyro_calibration.tracking import HeadingTracker, Settings
 STRETCH = 10.0
 #: A mean that is so many standard deviations off what the tracker believes in the end was no rest.
 _FAR = 4.5
-#: The tracker begins anew at a rest so far from the temperature at which it began, K: what this run taught the table counts from there on.
+#: The tracker begins anew at a rest so far from the temperature at which it began, K: what the
+#: table learned in this run counts from there on.
 _AWAY = 5.0
 #: A temperature that comes no more is taken to go away so fast, K/s, up to so far, K.
 _LOST_RATE, _LOST = 1.0 / 60.0, 15.0
 #: What the rate at rest depends on is computed so often, s.
 _STILL = 0.5
-#: In motion that is computed so often, s, and where the rate has changed by more than so much, rad/s, and such a part of it.
+#: In motion it is computed so often, s, and where the rate has changed by more than so much, rad/s
+#: plus a part of it.
 _HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
-#: A calibration that turns out to be older or younger by so much is carried anew, s; one from further ahead has no known age.
+#: A calibration that turns out to be older or younger by so much is carried anew, s; one from
+#: further ahead has no known age.
 _OLDER = 3600.0
 #: Plausible stamps, s, and specific forces, m/s², are not beyond.
 _LATEST, _STRONGEST = 1e12, 1e5
@@ -52,7 +56,8 @@ class _Stretch:
     Attributes
     ----------
     begin : from when on, s
-    seen : what the rate changes by for each uncertain value, shape (m,), at the begin, and in the end on the mean
+    seen : what the rate changes by for each uncertain value, shape (m,), first at the begin, in
+        the end on the mean
     count, modelled, temperature : how many, rates after the model, rad/s, and temperatures, degC
 
     """
@@ -83,13 +88,13 @@ class HeadingEstimator:
     corrected : the same before the tracker saw it
     last : what the compensation made of the last sample
     beginnings : how often the tracker began anew
-    refused : samples that were not used, as no such gyro reports them; they are lost like those that never came
+    refused : samples that were not used, as no such gyro reports them; they count as lost
     refused_temperatures : alike; the temperature before goes on
 
     """
 
-    def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions, settings: Settings, temperature_timeout: float,
-                 now: float):
+    def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
+                 settings: Settings, temperature_timeout: float, now: float):
         """
         Begin at heading zero.
 
@@ -102,9 +107,11 @@ class HeadingEstimator:
         now : s since 1970
 
         """
-        self._assumptions, self._settings, self._timeout = assumptions, settings, temperature_timeout
+        self._assumptions, self._settings, self._timeout = (
+            assumptions, settings, temperature_timeout)
         self.temperature: float | None = None
-        self._heard_temperature, self._anchored, self._this_run, self._other_age = -math.inf, False, False, False
+        self._heard_temperature, self._anchored, self._this_run, self._other_age = (
+            -math.inf, False, False, False)
         self.rate = self.corrected = 0.0
         self.last, self.beginnings = Compensated(0.0, 0.0, 0.0, False, False), 0
         self._time, self._elapsed, self._turned_before = -math.inf, 0.0, 0.0
@@ -123,7 +130,7 @@ class HeadingEstimator:
         return self._tracker
 
     def use(self, model: GyroModel, now: float) -> None:
-        """Go on with another self-calibration, which was made just now; the heading does not jump."""
+        """Go on with a self-calibration that was made just now; the heading does not jump."""
         self.model, self._this_run = model, True
         self._begin(now, fresh=True)
 
@@ -162,14 +169,16 @@ class HeadingEstimator:
         self._other_age = self._other_age or (old and abs(step) > _OLDER)
         if self._this_run and calibration is not None and calibration.time:
             then = datetime.fromisoformat(calibration.time) + timedelta(seconds=step)
-            self.model = with_self_calibration(self.model, replace(calibration, time=then.isoformat(timespec='seconds')))
+            self.model = with_self_calibration(self.model, replace(
+                calibration, time=then.isoformat(timespec='seconds')))
 
     # What is known at the begin
 
     def _begin(self, now: float, fresh: bool = False) -> None:
-        """Carry the calibration, unless it is of just now, to the time and temperature of now, and track from here on."""
+        """Carry the calibration to time and temperature of now, unless fresh, and track on."""
         self._sentence = ''
-        self.used, age = (assumed(self.model, self._assumptions), 0.0) if fresh else self._carried(now)
+        self.used, age = ((assumed(self.model, self._assumptions), 0.0) if fresh
+                          else self._carried(now))
         self.covariance = uncertain(self.used, self._assumptions)
         if self._tracker is None:
             self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age)
@@ -190,35 +199,39 @@ class HeadingEstimator:
         """Let the bias follow the temperature from that of now on, if it is known."""
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
         self._anchored = here is not None
-        self._way = Way(self.table, here, now, coefficient) if here is not None and coefficient else None
+        self._way = (Way(self.table, here, now, coefficient)
+                     if here is not None and coefficient else None)
 
     def _hear_again(self, now: float, around: Channels | None) -> None:
         """
-        Go on from the temperature of now with what was calibrated in this run while none came.
+        Go on from the temperature of now with what was calibrated in this run without one.
 
-        It was calibrated behind the model at the temperature that was held up to the last sample. What the model makes of another one is
-        no change of the rate.
+        It was calibrated behind the model at the temperature that was held up to the last sample.
+        The different output of the model at the temperature of now is no change of the rate.
 
         """
         here = compensate(self.used, 0.0, self.temperature, around).modelled
         before = None if around is None else replace(around, temperature=self.last.temperature)
         held = compensate(self.used, 0.0, self.last.temperature, before).modelled
-        self._shift, self._astray = float(here) - float(held), _unheard(self._time - self._unheard_since)
+        self._shift, self._astray = (float(here) - float(held),
+                                     _unheard(self._time - self._unheard_since))
         self._anchor(now)
 
     def _carried(self, now: float) -> tuple[GyroModel, float | None]:
-        """Return the model to compensate with, and the age of its self-calibration, s; None where it is an assumption."""
+        """Return the model to compensate with, and the age of its self-calibration, s, or None."""
         model = assumed(self.model, self._assumptions)
         calibration = model.self_calibration
         if calibration is None:
             return self._from_table(model, now)
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        carried = carry(calibration, self.table, self.age(now), now, self._known_temperature, self._this_run)
+        carried = carry(calibration, self.table, self.age(now), now, self._known_temperature,
+                        self._this_run)
         self._sentence = carried.sentence
         if (self._dated(now) or 0.0) < -_OLDER:
-            self._sentence = (f'the calibration is dated {calibration.time}, which is later than the clock of this computer: its age is '
-                              'not known and taken for a year; set the clock, or calibrate again')
+            self._sentence = (f'the calibration is dated {calibration.time}, which is later than '
+                              'the clock of this computer: its age is not known and taken for a '
+                              'year; set the clock, or calibrate again')
         return with_self_calibration(model, carried.calibration), 0.0
 
     def _from_table(self, model: GyroModel, now: float) -> tuple[GyroModel, float | None]:
@@ -227,12 +240,14 @@ class HeadingEstimator:
         if here is None or not self.table.entries:
             return model, None
         bias, variance = self.table.predict(here, now)
-        return with_self_calibration(model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
+        return with_self_calibration(
+            model, SelfCalibration(0.0, bias, ((0.0, 0.0), (0.0, variance)))), 0.0
 
     @property
     def sentence(self) -> str:
-        """Say what age, temperature and table leave of the calibration; '' where that is not worth a word, or rests have mended it."""
-        return self._sentence if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else ''
+        """Return what age and temperature leave of the calibration; '' where it is negligible."""
+        return (self._sentence
+                if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else '')
 
     def age(self, now: float) -> float:
         """Return how long ago the bias was calibrated, s; a year where nobody knows."""
@@ -250,20 +265,22 @@ class HeadingEstimator:
         return now - (when if when.tzinfo else when.replace(tzinfo=timezone.utc)).timestamp()
 
     def known_for(self, now: float) -> float:
-        """Return since when the variance of the bias holds, s: a carried calibration has its age in it."""
+        """Return the age of the variance of the bias, s; a carried one includes its own."""
         return self.age(now) if self.used.self_calibration is None else max(now - self._begun, 0.0)
 
     @property
     def claimed(self) -> SelfCalibration:
-        """Return the calibration in use as it holds at the temperature of now; a scale that it does not know has an infinite variance."""
-        used = self.used.self_calibration or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0)))
+        """Return the calibration at this temperature; an unknown scale has infinite variance."""
+        used = (self.used.self_calibration
+                or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
         assert used.covariance is not None  # where nobody knows it, it is assumed
         variance = self.bias_variance / used.scale ** 2
-        return replace(used, bias=used.bias + self._gone(self._time)[0], covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
+        return replace(used, bias=used.bias + self._gone(self._time)[0],
+                       covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
 
     @property
     def bias_variance(self) -> float:
-        """Return the variance of the corrected rate at rest by the calibration, (rad/s)², at the temperature of the last sample."""
+        """Return the variance of the corrected rate at rest by the calibration, (rad/s)²."""
         return float(quadratic_form(self.covariance, self._still))
 
     # Samples
@@ -288,10 +305,11 @@ class HeadingEstimator:
 
     @property
     def _known_temperature(self) -> float | None:
-        """Return the temperature of now, degC; None where none came, or the last one is too old."""
+        """Return the temperature of now, degC; None where none came, or the last is too old."""
         return None if self.temperature_is_lost else self.temperature
 
-    def add(self, time: float, output: float, now: float, force: float | None = None, wheels: bool | None = None) -> str:
+    def add(self, time: float, output: float, now: float, force: float | None = None,
+            wheels: bool | None = None) -> str:
         """
         Take a sample.
 
@@ -305,14 +323,16 @@ class HeadingEstimator:
 
         Returns
         -------
-        '', or why the integration began anew with this sample; where the sample is refused, only `refused` grows
+        '', or why the integration began anew with this sample; where the sample is refused, only
+        `refused` grows
 
         """
         if not self.plausible(time, output, force):
             self._refused += 1
             return ''
         last, self._time = self._time, time
-        heard, goes_on = not self._anchored and self._known_temperature is not None, self._this_run and last > -math.inf
+        heard, goes_on = (not self._anchored and self._known_temperature is not None,
+                          self._this_run and last > -math.inf)
         if self._other_age or heard and not goes_on:
             self._begin(now)
         around = self._look_around(time - last, force) if self.used.looks_around else None
@@ -333,51 +353,60 @@ class HeadingEstimator:
         return said
 
     def plausible(self, time: float, output: float, force: float | None = None) -> bool:
-        """Tell whether such a gyro may report that, as for `add`, which refuses a sample if not; no nan is plausible."""
+        """Tell whether such a gyro may report that; `add` refuses other samples, and any nan."""
         limit = self.used.rate_limit
-        return -limit <= output <= limit and -_LATEST <= time <= _LATEST and (force is None or -_STRONGEST <= force <= _STRONGEST)
+        return (-limit <= output <= limit and -_LATEST <= time <= _LATEST
+                and (force is None or -_STRONGEST <= force <= _STRONGEST))
 
-    def _look_at(self, time: float, output: float, rate: float, around: Channels | None, distance: float) -> None:
-        """Keep the sensitivity while it hardly changes, for it is half of the work: at rest, and for a moment at nearly the same rate."""
+    def _look_at(self, time: float, output: float, rate: float, around: Channels | None,
+                 distance: float) -> None:
+        """Keep the costly sensitivity at rest, and for a moment at nearly the same rate."""
         if self.tracker.resting:
             self._sensitivity, self._looked = self._still, (time, 0.0)
             return
         at, looked = self._looked
         if abs(time - at) > _HELD or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
-            self._sensitivity, self._looked = self._sensitive(output, rate, around, distance), (time, rate)
+            self._sensitivity, self._looked = (
+                self._sensitive(output, rate, around, distance), (time, rate))
 
-    def _sensitive(self, output: float, rate: float, around: Channels | None, distance: float) -> Array:
+    def _sensitive(self, output: float, rate: float, around: Channels | None,
+                   distance: float) -> Array:
         """Return what the rate changes by for each uncertain value, shape (m,)."""
-        return sensitive(self.used, rate_sensitivity(self.used, output, rate, self.last.temperature, around), distance)
+        return sensitive(self.used, rate_sensitivity(
+            self.used, output, rate, self.last.temperature, around), distance)
 
     def _gone(self, time: float) -> tuple[float, float]:
-        """Return how far the bias has gone with the temperature, rad/s, and its distance from where it was known, K."""
+        """Return the change of the bias with temperature, rad/s, and the distance, K."""
         if self.temperature is None:
             return 0.0, 0.0
         if self._way is None:
             return self._shift, _unheard(time - self._unheard_since)
         gone, distance = self._way.at(self.temperature)
         late = abs(time - self._heard_temperature) - self._timeout
-        return self._shift + gone, self._astray + distance + math.copysign(_unheard(late), distance)
+        return (self._shift + gone,
+                self._astray + distance + math.copysign(_unheard(late), distance))
 
     def _look_around(self, interval: float, force: float | None) -> Channels:
         """
         Return what effects look at beside rate, output and temperature.
 
-        Time goes on with the stamps, also over gaps, and stands while they jump back. The heading is the own one, as if it had never been
-        reset, and goes on at the last rate up to this sample.
+        Time goes on with the stamps, also over gaps, and stands while they jump back. The heading
+        is that of the tracker without its resets, and goes on at the last rate up to this sample.
 
         """
         interval = max(interval, 0.0) if interval < math.inf else 0.0
         self._elapsed += interval
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
-        return self._history.follow(self._elapsed, self.temperature, force, heading=self._turned_before + self.tracker.heading + ahead)
+        return self._history.follow(
+            self._elapsed, self.temperature, force,
+            heading=self._turned_before + self.tracker.heading + ahead)
 
     # What rests teach the next run
 
     def _gather(self, time: float, restarted: bool) -> None:
         """Gather samples at rest to stretches."""
-        if restarted or not self.tracker.resting or self.temperature is None or self.temperature_is_lost:
+        if (restarted or not self.tracker.resting or self.temperature is None
+                or self.temperature_is_lost):
             self._stretch = None
             return
         if self._stretch is None:
@@ -393,10 +422,10 @@ class HeadingEstimator:
 
     def learn(self, now: float, ending: bool = False) -> str:
         """
-        Bring what rests have shown into the table; to be called now and then.
+        Bring what was seen at rest into the table; to be called now and then.
 
-        A stretch waits until the next one is complete, or the rest or the run has ended: if the robot has turned slowly meanwhile, the
-        tracker knows by then.
+        A stretch waits until the next one is complete, or the rest or the run has ended: if the
+        robot has turned slowly meanwhile, the tracker knows by then.
 
         Returns
         -------
@@ -415,15 +444,17 @@ class HeadingEstimator:
         if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
             return ''
         said = self.table.add(temperature, bias, variance, now)
-        if self._way is not None and self.tracker.resting and abs(temperature - self._way.begin) > _AWAY:
+        if (self._way is not None and self.tracker.resting
+                and abs(temperature - self._way.begin) > _AWAY):
             self._begin(now)
         return said
 
     def _believed(self, temperature: float, seen: Array) -> tuple[float, float]:
         """
-        Return the bias at a temperature, and its standard deviation, as the tracker has them now, rad/s.
+        Return bias at a temperature and its standard deviation by the tracker as it is now, rad/s.
 
-        It is that after the model and before the self-calibration. A rest may be over, and it may be warmer, when its stretch is judged.
+        It is that after the model and before the self-calibration. When a stretch is judged, its
+        rest may be over, and the temperature may have changed.
 
         """
         calibration = self.used.self_calibration or SelfCalibration()
@@ -433,7 +464,8 @@ class HeadingEstimator:
 
     def missing(self, brought: Collection[str]) -> list[str]:
         """Return the channels that the model looks at and no message brings."""
-        return [channel for channel in ('supply', 'specific_force') if self.used.looks_at(channel) and channel not in brought]
+        return [channel for channel in ('supply', 'specific_force')
+                if self.used.looks_at(channel) and channel not in brought]
 
 
 def _unheard(late: float) -> float:

@@ -1,4 +1,4 @@
-"""A gyro's model: its effects with their values, how well they are known, and the last self-calibration."""
+"""A gyro's model: its effects with values and their covariance, and the last self-calibration."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from gyro_calibration.history import History
 from gyro_calibration.log import DEGREE, Array, Mask
 from gyro_calibration.noise import Noise
 
-#: Largest plausible output, rad/s, where no valid range of rates is stated; and where one is: so many times its farther end, but at least
-#: what robots reach, for a model may have been fitted at rest.
+#: Largest plausible output, rad/s, where no valid range of rates is stated. Where one is: so many
+#: times its farther end, but at least what robots reach, for a model may have been fitted at rest.
 _FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
 #: Plausible temperatures, degC, where no valid range is stated.
 _TEMPERATURES = (-100.0, 200.0)
@@ -25,7 +25,8 @@ _TEMPERATURES = (-100.0, 200.0)
 _FLATTEST = 0.1
 #: Numbers of Python overflow without a word, and to say so for each sample would take time.
 _AS_IT_IS = nullcontext()
-#: The last step of the repetition, as a part of 1 rad/s and of the rate, that is taken for a solution; the error is far smaller.
+#: Largest last step of the repetition for a solution, as a part of 1 rad/s plus the rate; the
+#: error is far smaller.
 _SETTLED = 1e-10
 
 
@@ -46,22 +47,25 @@ class Term:
 
     @cached_property
     def adding(self) -> Callable[[Channels], Number]:
-        """Return the function of the channels that gives what the effect adds to the output, rad/s."""
+        """Return the function of the channels that gives the error of the effect, rad/s."""
         return self.effect.adding(self.values)
 
     @cached_property
     def fitted(self) -> tuple[int, ...]:
-        """Return the places of the values that a fit finds: those of the parameters without a default."""
-        return tuple(place for place, parameter in enumerate(self.effect.parameters) if parameter.default is None)
+        """Return the places of the values that a fit finds: parameters without a default."""
+        return tuple(place for place, parameter in enumerate(self.effect.parameters)
+                     if parameter.default is None)
 
     def sensitivity(self, channels: Channels) -> list[Number]:
-        """Return what the error changes by for each fitted value: its column, or for a shape the derivative (0 where nothing is added)."""
+        """Return the derivative of the error for each fitted value; 0 where nothing is added."""
         columns, shapes = self.columns(channels), len(self.effect.shapes)
-        return [self._derivative(place, channels) if place < shapes else columns[place - shapes] for place in self.fitted]
+        return [self._derivative(place, channels) if place < shapes else columns[place - shapes]
+                for place in self.fitted]
 
     def _derivative(self, place: int, channels: Channels) -> Number:
         step = 1e-5 * abs(self.values[place]) or 1e-9
-        below, above = (replace(self, values=(*self.values[:place], self.values[place] + change, *self.values[place + 1:]))
+        below, above = (replace(self, values=(*self.values[:place], self.values[place] + change,
+                                              *self.values[place + 1:]))
                         for change in (-step, step))
         return (above.error(channels) - below.error(channels)) / (2.0 * step)
 
@@ -112,10 +116,13 @@ class SelfCalibration:
 
     def figures(self) -> dict[str, Any]:
         """Return what there is to know, by name, in SI; None for what is not known."""
-        scale_deviation, bias_deviation = (None if math.isnan(value) else value for value in self.standard_deviations)
-        return {'scale_factor_error': self.scale_factor_error, 'scale_factor_error_standard_deviation': scale_deviation,
-                'bias': self.bias, 'bias_standard_deviation': bias_deviation, 's_bar': self.scale, 'b_bar': self.offset,
-                'calibration_time': self.time, 'calibration_temperature': self.temperature, 'method': self.method}
+        scale_deviation, bias_deviation = (None if math.isnan(value) else value
+                                           for value in self.standard_deviations)
+        return {'scale_factor_error': self.scale_factor_error,
+                'scale_factor_error_standard_deviation': scale_deviation,
+                'bias': self.bias, 'bias_standard_deviation': bias_deviation,
+                's_bar': self.scale, 'b_bar': self.offset, 'calibration_time': self.time,
+                'calibration_temperature': self.temperature, 'method': self.method}
 
     def __str__(self) -> str:
         """Return a sentence for people."""
@@ -123,7 +130,8 @@ class SelfCalibration:
         scale, bias = (f' +- {deviation:.{digits}f}' if known else '' for deviation, digits in zip(
             (100 * self.standard_deviations[0], self.standard_deviations[1] / DEGREE), (3, 4)))
         temperature = '' if self.temperature is None else f' at {self.temperature:.1f} degC'
-        return (f'scale factor error {100 * self.scale_factor_error:.3f}{scale} %, bias {self.bias / DEGREE:.4f}{bias} deg/s '
+        return (f'scale factor error {100 * self.scale_factor_error:.3f}{scale} %, '
+                f'bias {self.bias / DEGREE:.4f}{bias} deg/s '
                 f'(s_bar {self.scale:.6f}, b_bar {self.offset:.6f} rad/s){temperature}')
 
 
@@ -135,7 +143,7 @@ class GyroModel:
     Attributes
     ----------
     terms : its effects
-    covariance : of all fitted values in the order of the terms, shape (m, m), or None where it is not known
+    covariance : of all fitted values in the order of the terms, shape (m, m); None if unknown
     rate_range, temperature_range : what the values were fitted on, rad/s and degC
     noise : its noise figures
     gyro : name, serial_number, technology, as text
@@ -159,30 +167,33 @@ class GyroModel:
         return _sum(self.terms, channels)
 
     def steepness(self, channels: Channels) -> Number:
-        """Return what rate and error together grow by with the rate, 1; not below 0.1, as `rate` solves for no effect beyond that."""
+        """Return the derivative of rate plus error by the rate, 1; at least 0.1 (see `rate`)."""
         sought = self._parted_by_rate[1]
         if not sought:
             return 1.0
-        step = 1e-5  # rad/s; small beside what bends an effect, and large beside the rounding of its error
-        below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output)) for change in (-step, step))
+        # rad/s; small beside what bends an effect, and large beside the rounding of its error
+        step = 1e-5
+        below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output))
+                        for change in (-step, step))
         return np.maximum(1.0 + (above - below) / (2.0 * step), _FLATTEST)
 
     @cached_property
     def rate_limit(self) -> float:
-        """Return the largest plausible output, rad/s; a sample beyond it is not one of this gyro."""
+        """Return the largest plausible output, rad/s; this gyro reports no sample beyond it."""
         farther = max(map(abs, self.rate_range))
         return max(_MARGIN * farther, _REACHED) if farther < math.inf else _FASTEST
 
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
-        """Return the plausible temperatures, degC: the usual ones, and the valid range with its own width on both sides."""
+        """Return plausible temperatures, degC: usual ones, and three times the valid range."""
         low, high = self.used_temperatures
         return min(2.0 * low - high, _TEMPERATURES[0]), max(2.0 * high - low, _TEMPERATURES[1])
 
     @cached_property
     def used_temperatures(self) -> tuple[float, float]:
-        """Return the temperatures beyond which the nearest end is used, degC: the valid range, or the plausible temperatures."""
-        low, high = ((value if math.isfinite(value) else usual) for value, usual in zip(self.temperature_range, _TEMPERATURES))
+        """Return the temperatures, degC, to which others are clipped: valid, or plausible."""
+        low, high = ((value if math.isfinite(value) else usual)
+                     for value, usual in zip(self.temperature_range, _TEMPERATURES))
         return low, max(low, high)
 
     @cached_property
@@ -190,8 +201,8 @@ class GyroModel:
         """
         Return the rates between which the response is inverted, rad/s.
 
-        From the valid rate nearest to zero they reach as far as the output grows with the rate at all temperatures that are used, and to no
-        rate whose output would not be plausible.
+        From the valid rate nearest to zero they reach as far as the output grows with the rate at
+        all temperatures that are used, and to no rate whose output would not be plausible.
 
         """
         low, high = self.rate_range
@@ -206,9 +217,11 @@ class GyroModel:
         distances = self.rate_limit / _FLATTEST * np.geomspace(1e-6, 1.0, 160)
 
         def grows(begin: Array, end: Array) -> Mask:
-            ends = [[rate + _sum(sought, Channels(rate, rate, temperature)) for rate in (centre + side * begin, centre + side * end)]
+            ends = [[rate + _sum(sought, Channels(rate, rate, temperature))
+                     for rate in (centre + side * begin, centre + side * end)]
                     for temperature in (low, high)]
-            return np.all([side * (after - before) >= _FLATTEST * (end - begin) for before, after in ends], axis=0)
+            return np.all([side * (after - before) >= _FLATTEST * (end - begin)
+                           for before, after in ends], axis=0)
 
         with np.errstate(all='ignore'):
             steps = np.concatenate([[0.0], distances])
@@ -220,7 +233,8 @@ class GyroModel:
             near, far = (np.array([steps[first + place]]) for place in (0, 1))
             for _ in range(50):
                 middle = 0.5 * (near + far)
-                near, far = (middle, far) if grows((1.0 - 1e-6) * middle, middle).all() else (near, middle)
+                near, far = ((middle, far) if grows((1.0 - 1e-6) * middle, middle).all()
+                             else (near, middle))
         return float(near[0])
 
     def looks_at(self, channel: str) -> bool:
@@ -229,7 +243,7 @@ class GyroModel:
 
     @cached_property
     def looks_around(self) -> bool:
-        """Tell whether an effect looks at more than rate, output and temperature of the moment, so that a history is needed."""
+        """Tell whether an effect needs a history: more than rate, output and temperature now."""
         return any(term.effect.looks_at - {'rate', 'output', 'temperature'} for term in self.terms)
 
     @cached_property
@@ -242,24 +256,36 @@ class GyroModel:
         return History(self.reference_temperature, *self.used_temperatures)
 
     def output(self, rate: Number, temperature: Number) -> Number:
-        """Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``; without noise."""
+        """
+        Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``.
+
+        It has no noise.
+
+        """
         return self.output_in(Channels(rate, rate, temperature))
 
     def output_in(self, channels: Channels) -> Number:
-        """Return the output, rad/s, at the rate of the channels and in their surroundings; without noise."""
+        """Return the output, rad/s, without noise, at the rate and surroundings of channels."""
         rate, (known, sought) = channels.rate, self._parted_by_output
         given = rate + _sum(known, channels)
-        return _repeated(lambda output: given + _sum(sought, channels.moving(rate, output)), rate)[0] if sought else given
+        return (_repeated(lambda output: given + _sum(sought, channels.moving(rate, output)),
+                          rate)[0] if sought else given)
 
     def rate(self, output: Number, temperature: Number) -> Number:
-        """Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``; what cannot be undone stays."""
+        """
+        Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``.
+
+        Effects that cannot be undone stay in it.
+
+        """
         return self.rate_in(Channels(output, output, temperature))[0]
 
     def rate_in(self, channels: Channels) -> tuple[Number, Number]:
         """
-        Return the rate, rad/s, at the output of the channels and in their surroundings, of which the rate does not matter.
+        Return the rate, rad/s, at the output and the surroundings of channels.
 
-        Also whether no rate of the `rate_domain` has this output; the correction at the end of the domain is held there.
+        Their rate does not matter. Also tell whether no rate of the `rate_domain` has this output;
+        the correction at the end of the domain is held there.
 
         """
         output, (known, sought) = channels.output, self._parted_by_rate
@@ -269,22 +295,22 @@ class GyroModel:
         seen = channels.moving(output, output)
 
         def added(rate: Number) -> Number:
-            # only here is it known, and to make new channels would take as long as to compute with them
+            # only here is it known, and new channels would take as long as the computation
             seen.__dict__['rate'] = rate
             return _sum(sought, seen)
 
         return _inverse(added, given, output, self.rate_domain)
 
     def distorted(self, stage: str, signal: Array, time: Array) -> Array:
-        """Return the signal of a whole log after the effects that change it at a stage, 'rate' or 'output'."""
+        """Return a whole log's signal after the effects that change it at 'rate' or 'output'."""
         for term in self.terms:
             if term.effect.distortion is not None and term.effect.stage == stage:
                 signal = term.effect.distortion(signal, time, *term.values)
         return signal
 
     def true_time(self, time: Number) -> Number:
-        """Return when a sample was taken, s since power-on, that has a stamp of `time`, s since power-on."""
-        # As `distorted` has it: the last effect changed the signal that the ones before it had moved already.
+        """Return when a sample with a stamp of `time` was taken, both in s since power-on."""
+        # the inverse order of `distorted`: the last effect changed a signal that was moved already
         for term in reversed(self.terms):
             if term.effect.moved is not None:
                 time = term.effect.moved(time, *term.values)
@@ -299,7 +325,7 @@ class GyroModel:
         return _parted([term for term in self.terms if not term.effect.undone], 'rate')
 
 
-#: Effects that do not look at what is sought, which need no repetition to solve for it, and those that do.
+#: Effects that do not look at what is sought, which need no repetition to solve for it; others.
 Parted = tuple[list[Term], list[Term]]
 
 
@@ -315,13 +341,15 @@ def _sum(terms: Sequence[Term], channels: Channels) -> Number:
     return total
 
 
-def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf, high: float = math.inf) -> tuple[Number, Number]:
+def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf,
+              high: float = math.inf) -> tuple[Number, Number]:
     """
     Solve x = g(x) for a slope of g well below one; return x, and the last step.
 
-    The plain repetition wins a factor of the slope a pass; along the secant each pass wins more than the one before, and a slope that is
-    constant is solved at once. The number of passes is fixed, so that a sample and a whole log take the same steps; of a single sample
-    those are left out that would change nothing, and those that leave the bounds end there.
+    The plain repetition wins a factor of the slope a pass; along the secant each pass wins more
+    than the one before, and a constant slope is solved at once. The number of passes is fixed, so
+    that a sample and a whole log take the same steps. A single sample skips those that would
+    change nothing, and is held at the bounds.
 
     """
     a, b = start, g(start)
@@ -339,9 +367,10 @@ def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.i
     return b, step
 
 
-def _inverse(added: Callable[[Number], Number], given: Number, start: Number, domain: tuple[float, float]) -> tuple[Number, Number]:
+def _inverse(added: Callable[[Number], Number], given: Number, start: Number,
+             domain: tuple[float, float]) -> tuple[Number, Number]:
     """
-    Solve ``rate + added(rate) = given`` for a rate of a domain in which the left side grows with the rate.
+    Solve ``rate + added(rate) = given`` in a domain where the left side grows with the rate.
 
     Parameters
     ----------
@@ -352,13 +381,14 @@ def _inverse(added: Callable[[Number], Number], given: Number, start: Number, do
 
     Returns
     -------
-    the rate, and whether there is none in the domain: what is added at its nearer end is taken there
+    the rate, and whether there is none in the domain: the correction at its nearer end is used
+    there
 
     """
     low, high = domain
     many = isinstance(given, np.ndarray)
     with np.errstate(all='ignore') if many else _AS_IT_IS:
-        # a single sample may step out of the domain and back, but not so far that nothing can be computed
+        # a single sample may step out of the domain and back, but only as far as can be computed
         rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
         solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
     if solved.all() if many else solved:
@@ -383,6 +413,7 @@ def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None)
 
 
 def same_effects(model: GyroModel, other: GyroModel) -> bool:
-    """Tell whether two models compensate alike, so that a self-calibration behind one holds behind the other."""
-    first, second = ([(term.effect.name, term.values) for term in each.terms] for each in (model, other))
+    """Tell whether two models compensate alike, so that a self-calibration holds for both."""
+    first, second = ([(term.effect.name, term.values) for term in each.terms]
+                     for each in (model, other))
     return first == second
