@@ -22,13 +22,15 @@ class Compensated:
 
     Attributes
     ----------
-    modelled : rate after the model and before the self-calibration, rad/s; what a self-calibration is made from
+    modelled : rate after the model and before the self-calibration, rad/s; for self-calibrations
     rate : rad/s
     temperature : that was used, degC
-    temperature_clipped : the temperature is outside the calibrated range, or not plausible, and the nearest end was used
-    beyond_range : the output is outside the calibrated range of rates, or not plausible, or no rate explains it. Up to
-        `GyroModel.rate_limit` the correction is extrapolated; beyond that, and from where the response no longer grows with the rate, the
-        last correction is held, so that the rate is finite whatever the output
+    temperature_clipped : the temperature is outside the calibrated range, or not plausible, and
+        the nearest end was used
+    beyond_range : the output is outside the calibrated range of rates, or not plausible, or no
+        rate explains it. Up to `GyroModel.rate_limit` the correction is extrapolated; beyond that,
+        and from where the response no longer grows with the rate, the last correction is held, so
+        that the rate is finite whatever the output
 
     """
 
@@ -39,45 +41,52 @@ class Compensated:
     beyond_range: Number
 
 
-def compensate(model: GyroModel, output: Number, temperature: Number | None = None, surroundings: Channels | None = None) -> Compensated:
+def compensate(model: GyroModel, output: Number, temperature: Number | None = None,
+               surroundings: Channels | None = None) -> Compensated:
     """
-    Compensate by the model (eq. 13 of Ojeda et al.) and then by its self-calibration (eq. 3 of Hong and Park).
+    Compensate by model (Ojeda et al., eq. 13), then self-calibration (Hong and Park, eq. 3).
 
     Parameters
     ----------
     output : rad/s, a number or shape (n,)
     temperature : degC, alike; the model's reference temperature where it is None
-    surroundings : what else effects look at, from the `GyroModel.history` that followed the same temperatures; needed where the model
-        `looks_around`
+    surroundings : what else effects look at, from the `GyroModel.history` that followed the same
+        temperatures; needed where the model `looks_around`
 
     """
     given = model.reference_temperature if temperature is None else temperature
     if not isinstance(output, np.ndarray):
         return _of_one(model, output, given, surroundings)
-    return _by_blocks(model, output, given) if surroundings is None else _compensated(model, output, given, surroundings)
+    return (_by_blocks(model, output, given) if surroundings is None
+            else _compensated(model, output, given, surroundings))
 
 
-def _of_one(model: GyroModel, output: float, given: float, surroundings: Channels | None) -> Compensated:
+def _of_one(model: GyroModel, output: float, given: float,
+            surroundings: Channels | None) -> Compensated:
     """Compensate a sample that comes alone, with the same result as in a log."""
-    (low, high), (slowest, fastest), limit = model.used_temperatures, model.rate_range, model.rate_limit
+    (low, high), (slowest, fastest), limit = (
+        model.used_temperatures, model.rate_range, model.rate_limit)
     used, seen = min(max(given, low), high), min(max(output, -limit), limit)
-    modelled, unexplained = model.rate_in(Channels.of(seen, seen, used) if surroundings is None else surroundings.moving(seen, seen))
+    modelled, unexplained = model.rate_in(Channels.of(seen, seen, used) if surroundings is None
+                                          else surroundings.moving(seen, seen))
     if not -_LARGEST < modelled < _LARGEST:
         modelled, unexplained = seen, True
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen != output:
         modelled, rate, unexplained = modelled + (output - seen), rate + (output - seen), True
-    return Compensated(modelled, rate, used, used != given, unexplained or not slowest <= output <= fastest)
+    return Compensated(modelled, rate, used, used != given,
+                       unexplained or not slowest <= output <= fastest)
 
 
-def _compensated(model: GyroModel, output: Array, given: Number, surroundings: Channels | None = None) -> Compensated:
+def _compensated(model: GyroModel, output: Array, given: Number,
+                 surroundings: Channels | None = None) -> Compensated:
     used, limit = clip(given, *model.used_temperatures), model.rate_limit
     slowest, fastest = model.rate_range
     beyond = (output < max(slowest, -limit)) | (output > min(fastest, limit))
     seen = np.clip(output, -limit, limit) if beyond.any() else output
     with np.errstate(all='ignore'):
-        modelled, unexplained = model.rate_in(
-            Channels(seen, seen, used) if surroundings is None else surroundings.moving(seen, seen))
+        modelled, unexplained = model.rate_in(Channels(seen, seen, used) if surroundings is None
+                                              else surroundings.moving(seen, seen))
         if not -_LARGEST < modelled.sum() < _LARGEST:
             # the model itself cannot be computed there: nothing is corrected
             computed = abs(modelled) < _LARGEST
@@ -85,17 +94,21 @@ def _compensated(model: GyroModel, output: Array, given: Number, surroundings: C
     rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
     if seen is not output:
         modelled, rate = modelled + (output - seen), rate + (output - seen)
-    return Compensated(modelled, rate, used, used != given, beyond if unexplained is False else beyond | unexplained)
+    return Compensated(modelled, rate, used, used != given,
+                       beyond if unexplained is False else beyond | unexplained)
 
 
 def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
     """Compensate what the cache holds at a time; only what is returned goes through memory."""
-    modelled, clipped, beyond = np.empty(len(output)), np.empty(len(output), bool), np.empty(len(output), bool)
+    modelled, clipped, beyond = (
+        np.empty(len(output)), np.empty(len(output), bool), np.empty(len(output), bool))
     rate = modelled if model.self_calibration is None else np.empty(len(output))
     for begin in range(0, len(output), CACHED):
         block = slice(begin, begin + CACHED)
-        part = _compensated(model, output[block], given[block] if isinstance(given, np.ndarray) else given)
-        modelled[block], clipped[block], beyond[block] = part.modelled, part.temperature_clipped, part.beyond_range
+        part = _compensated(model, output[block],
+                            given[block] if isinstance(given, np.ndarray) else given)
+        modelled[block], clipped[block], beyond[block] = (
+            part.modelled, part.temperature_clipped, part.beyond_range)
         if rate is not modelled:
             rate[block] = part.rate
     used = clip(given, *model.used_temperatures) if clipped.any() else given
@@ -107,17 +120,21 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
     """
     Return what the rate changes by for each uncertain value of the model, shape (m, ...).
 
-    First the fitted values of the model, if it has a covariance, then (s, b) of the self-calibration, if there is one; the order of
-    `covariance`. The model's rate solves ``rate = output - error(rate)``, so that what a value adds to the error is divided by the
-    steepness there: 0.5 for a sine response at 60 degrees of its phase. What cannot be undone is not compensated, and changes nothing.
+    First the fitted values of the model, if it has a covariance, then (s, b) of the
+    self-calibration, if there is one; the order of `covariance`. The rate of the model solves
+    ``rate = output - error(rate)``, so that what a value adds to the error is divided by the
+    steepness there: 0.5 for a sine response at 60 degrees of its phase. What cannot be undone is
+    not compensated, and changes nothing.
 
     """
     calibration, rows = model.self_calibration, []
     if model.covariance is not None:
         modelled = rate if calibration is None else (rate - calibration.offset) / calibration.scale
-        channels = Channels(modelled, output, temperature) if surroundings is None else surroundings.moving(modelled, output)
+        channels = (Channels(modelled, output, temperature) if surroundings is None
+                    else surroundings.moving(modelled, output))
         steepness = model.steepness(channels)
-        rows = [0.0 if term.effect.undone else row / steepness for term in model.terms for row in term.sensitivity(channels)]
+        rows = [0.0 if term.effect.undone else row / steepness
+                for term in model.terms for row in term.sensitivity(channels)]
     if calibration is not None:
         rows += [rate, 1.0]
     if not isinstance(rate, np.ndarray):
@@ -129,7 +146,12 @@ def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature
 
 
 def covariance(model: GyroModel) -> np.ndarray:
-    """Return the covariance of the uncertain values of a model in the order of `rate_sensitivity`, shape (m, m); nan is not known."""
+    """
+    Return the covariance of the uncertain values of a model, shape (m, m); nan is not known.
+
+    The order is that of `rate_sensitivity`.
+
+    """
     blocks = [] if model.covariance is None else [model.covariance]
     if model.self_calibration is not None:
         known = model.self_calibration.covariance

@@ -1,4 +1,4 @@
-"""From rates to a heading: the threshold filter, the integration on the stamps, and how far the heading may be off."""
+"""From rates to a heading and its error: threshold filter, and integration on the stamps."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Threshold:
     ----------
     rate : rad/s; below it the robot counts as standing; 0 switches the filter off
     window : s; the mean over it is compared with the rate. 0 compares single samples, as published
-    angle_random_walk : rad/√s; a window that varies by more than three times what this explains is motion, whatever its mean; 0 does
-        not look at it
+    angle_random_walk : rad/√s; a window that varies by more than three times what this explains is
+        motion, whatever its mean; 0 switches this test off
 
     """
 
@@ -36,16 +36,18 @@ class ThresholdFilter:
     """
     Set the rate to zero while the robot stands, sample by sample.
 
-    As published the filter decides on single samples. With the noise of a cheap gyro this does next to nothing while it stands, so here
-    the mean over a short window decides. What it takes away is for the caller to count: a turn slower than the threshold is lost.
+    As published the filter decides on single samples. With the noise of a cheap gyro this has
+    little effect at rest, so here the mean over a short window decides. What it deletes is for the
+    caller to count: a turn slower than the threshold is lost.
 
     """
 
     def __init__(self, settings: Threshold):
         """Begin with an empty window."""
         self.settings = settings
-        # The window in two parts, oldest samples last in the first one, each sample with the sums from it to the border between them. So
-        # nothing is ever subtracted, and what has left the window leaves nothing behind in its sums.
+        # The window in two parts, oldest samples last in the first one, each sample with the sums
+        # from it to the border between them: nothing is subtracted, and what has left the window
+        # leaves no rounding error in its sums.
         self._older: list[tuple[float, float, float]] = []
         self._newer: list[tuple[float, float]] = []
         self._sum = self._squares = 0.0
@@ -78,7 +80,8 @@ class ThresholdFilter:
             return False
         # it shakes where the window varies by more than noise would
         explained = 9.0 * self.settings.angle_random_walk ** 2 * count
-        return not 0.0 < explained < ((squares + self._squares) / count - mean * mean) * (time - self._first)
+        return not 0.0 < explained < (
+            ((squares + self._squares) / count - mean * mean) * (time - self._first))
 
     @property
     def _first(self) -> float:
@@ -97,7 +100,7 @@ class ThresholdFilter:
 
 
 def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
-    """Return the heading, rad, shape (n,), from rates by the trapezoid rule; it begins at `begin`."""
+    """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
     heading = np.empty(len(time))
     heading[:1] = begin
     for first in range(1, len(time), CACHED):
@@ -116,9 +119,11 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
         return rate
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
-    # each window is summed by itself: of a running sum, one large value would ruin all that come later
-    bounded, count, windows = np.clip(rate, -LARGEST, LARGEST), end - begin, np.stack([begin, end], axis=1).ravel()
-    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2] for values in (bounded, bounded * bounded))
+    # each window is summed by itself: one large value would ruin a running sum from there on
+    bounded, count, windows = (np.clip(rate, -LARGEST, LARGEST), end - begin,
+                               np.stack([begin, end], axis=1).ravel())
+    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
+                     for values in (bounded, bounded * bounded))
     mean = sums / count
     variance = squares / count - mean * mean
     explained = 9.0 * settings.angle_random_walk ** 2 * count
@@ -128,10 +133,10 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
 
 class BlockIntegrator:
     """
-    Filter and integrate the rates of a log that comes block by block, with the same result as in one piece.
+    Filter and integrate a log block by block, with the same result as in one piece.
 
-    It gives what a `tracking.HeadingTracker` that looks for no rests gives sample by sample, for a log in which no gap is longer than that
-    one bridges.
+    The result is that of a `tracking.HeadingTracker` that looks for no rests, for a log without
+    gaps longer than that one bridges.
 
     Attributes
     ----------
@@ -140,7 +145,7 @@ class BlockIntegrator:
     """
 
     def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
-        """Begin at heading zero; `covariance` is that of the values of the calibration, shape (m, m)."""
+        """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
         self._settings, self._noise, self._covariance = settings, noise, covariance
         self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self._last: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
@@ -155,7 +160,7 @@ class BlockIntegrator:
         Parameters
         ----------
         time, rate : s and rad/s, before the threshold filter, shape (n,)
-        sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
+        sensitivity : of the rates to the values of the calibration, (m, n), as in `compensation`
 
         Returns
         -------
@@ -167,14 +172,18 @@ class BlockIntegrator:
         filtered = self._filtered(time, rate)
         kept = (filtered == rate).astype(float)
         unseen = self._unseen_at(time, rate, kept)
-        heading, moving_time, *grown = self._integrated(time, np.vstack([filtered, kept, kept * sensitivity]))
-        calibration = quadratic_form(self._covariance, np.reshape(grown, (len(self._covariance), len(time))))
-        return filtered, heading, np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen)
+        heading, moving_time, *grown = self._integrated(
+            time, np.vstack([filtered, kept, kept * sensitivity]))
+        calibration = quadratic_form(self._covariance,
+                                     np.reshape(grown, (len(self._covariance), len(time))))
+        return (filtered, heading,
+                np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
 
     def _unseen_at(self, time: Array, rate: Array, kept: Array) -> Array:
         """Return the variance by what was lost in gaps so far, rad², shape (n,)."""
         unseen, (last_time, last_rows) = np.zeros(len(time)), self._last
-        before = (float(last_time[0]), self._last_rate, bool(last_rows[1, 0])) if len(last_time) else None
+        before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0]))
+                  if len(last_time) else None)
         for index, sample in enumerate(zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())):
             gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
             if gap is not None and before is not None and (sample[2] or before[2]):
@@ -185,7 +194,8 @@ class BlockIntegrator:
 
     def _filtered(self, time: Array, rate: Array) -> Array:
         carried = len(self._window[0])
-        time, rate = np.concatenate([self._window[0], time]), np.concatenate([self._window[1], rate])
+        time, rate = (np.concatenate([self._window[0], time]),
+                      np.concatenate([self._window[1], rate]))
         begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
         self._window = time[begin:], rate[begin:]
         return filter_rates(self._settings, time, rate)[carried:]

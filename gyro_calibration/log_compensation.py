@@ -1,4 +1,4 @@
-"""A log through the compensation of a model that looks around: its surroundings are followed from block to block."""
+"""Compensation of a log by a model with history, whose surroundings are followed over blocks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, QUANTITIES, Array, Log, Mask
 from gyro_calibration.model import GyroModel
 
-#: An effect of the heading that is found meanwhile is found over so long at once, s: over longer, more passes would be needed.
+#: Where effects look at a heading without reference, it is found for so long at once, s; longer
+#: parts need more passes.
 _AT_ONCE = 60.0
 #: A reference heading that is lost for no longer is interpolated, s.
 _BRIDGED = 1.0
@@ -25,13 +26,15 @@ _SETTLED, _PASSES = 1e-10, 50
 
 class LogCompensation:
     """
-    Compensate a log that comes block by block, with the same result as in one piece; where a reference heading is lost, see below.
+    Compensate a log block by block, with the same result as in one piece.
 
-    The heading that effects look at is that of the reference. Without one it is what the compensated rates come to, from 0 on.
+    The heading that effects look at is that of the reference. Without one it is the integral of
+    the compensated rates from 0 on.
 
-    Where a reference is lost, the heading goes on from its last value by the compensated rates. Up to `_BRIDGED` s inside a block are
-    interpolated instead; over the border of blocks the next value is not known, which differs by little. Before the first value of a
-    reference its heading is that value; in blocks before the one with that it is found from 0 on.
+    Where a reference is lost, the heading goes on from its last value by the compensated rates. Up
+    to `_BRIDGED` s inside a block are interpolated instead; over the border of blocks the next
+    value is not known, and the result differs a little. Before the first value of a reference its
+    heading is that value; in blocks before the one with that it is found from 0 on.
 
     """
 
@@ -43,12 +46,13 @@ class LogCompensation:
         self._turned: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
 
     def add(self, log: Log) -> tuple[Compensated, Array]:
-        """Take the next rows, in each of which the output is known, and return them with their `rate_sensitivity`."""
+        """Take the next rows, with known outputs; return them with their `rate_sensitivity`."""
         if not self._model.looks_around or not len(log):
             return self._compensated(log, None)
         compensated, sensitivities = zip(*(self._around(part) for part in self._parts(log)))
-        joined = {each.name: np.concatenate([np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
-                  for each in fields(Compensated)}
+        joined = {each.name: np.concatenate([
+            np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
+            for each in fields(Compensated)}
         return Compensated(**joined), np.concatenate(sensitivities, axis=1)
 
     def true_time(self, time: Array) -> Array:
@@ -61,24 +65,27 @@ class LogCompensation:
     def _compensated(self, log: Log, around: Channels | None) -> tuple[Compensated, Array]:
         assert log.output is not None
         result = compensate(self._model, log.output, log.temperature, around)
-        return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature, around)
+        return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature,
+                                        around)
 
     def _parts(self, log: Log) -> Iterator[Log]:
-        """Give the rows in parts that have a reference or none, those without one so short that a heading is soon found."""
+        """Give the rows in parts with a reference or without one; those without are short."""
         if log.time is None or not self._model.looks_at('heading'):
             yield log
             return
-        part = np.where(self._referenced(log.time, log.reference_heading), -1, (log.time - log.time[0]) // _AT_ONCE)
+        part = np.where(self._referenced(log.time, log.reference_heading), -1,
+                        (log.time - log.time[0]) // _AT_ONCE)
         for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
             yield rows_of(log, rows)
 
     def _referenced(self, time: Array, heading: Array | None) -> Mask:
-        """Return for which rows there is a reference heading, or one to interpolate, shape (n,)."""
+        """Return which rows have a reference heading, or one to interpolate, shape (n,)."""
         known = np.flatnonzero(np.isfinite(heading)) if heading is not None else np.zeros(0, int)
         if not len(known):
             return np.zeros(len(time), bool)
         rows, earlier = np.arange(len(time)), self._referred
-        before, after = np.searchsorted(known, rows, 'right') - 1, np.searchsorted(known, rows, 'left')
+        before, after = (np.searchsorted(known, rows, 'right') - 1,
+                         np.searchsorted(known, rows, 'left'))
         self._referred, inside = True, (before >= 0) & (after < len(known))
         lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
         return (inside & (lost <= _BRIDGED)) | ((before < 0) & (not earlier))
@@ -88,24 +95,27 @@ class LogCompensation:
 
     def _around(self, log: Log) -> tuple[Compensated, Array]:
         time = np.zeros(len(log)) if log.time is None else log.time
-        around = self._history.follow(time, log.temperature, log.specific_force, log.supply, _bridged(time, log.reference_heading))
+        around = self._history.follow(time, log.temperature, log.specific_force, log.supply,
+                                      _bridged(time, log.reference_heading))
         if not self._model.looks_at('heading') or log.time is None:
             return self._compensated(log, around)
         if self._seeks_heading(log):
             return self._compensated(log, self._found_heading(log, around))
         result, sensitivity = self._compensated(log, around)
-        self._turned = self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:], float(np.asarray(around.heading)[-1])
+        self._turned = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],
+                        float(np.asarray(around.heading)[-1]))
         return result, sensitivity
 
     def _found_heading(self, log: Log, around: Channels) -> Channels:
-        """Repeat: compensate with a heading, and integrate to the next one; it gains about the effect times the time with each pass."""
+        """Repeat: compensate with a heading, and integrate the rates to the next heading."""
         assert log.time is not None
         last_time, last_rate, begin = self._turned
         carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
         heading = np.full(len(log), begin)
         for _ in range(_PASSES):
             around = replace(around, heading=heading)
-            rate = np.concatenate([last_rate, compensate(self._model, np.asarray(log.output), log.temperature, around).rate])
+            rate = np.concatenate([last_rate, compensate(
+                self._model, np.asarray(log.output), log.temperature, around).rate])
             before, heading = heading, integrate(time, rate, begin)[carried:]
             if np.abs(heading - before).max() < _SETTLED:
                 break
@@ -114,7 +124,7 @@ class LogCompensation:
 
 
 def plausible(model: GyroModel, log: Log) -> Mask:
-    """Return for which rows such a gyro may report this output at this temperature, shape (n,); no nan is plausible."""
+    """Return which rows have a plausible output and temperature, shape (n,); no nan is one."""
     assert log.output is not None
     found = np.abs(log.output) <= model.rate_limit
     if log.temperature is not None:
@@ -126,12 +136,13 @@ def plausible(model: GyroModel, log: Log) -> Mask:
 def none_plausible(model: GyroModel) -> str:
     """Return what to say of a log without a plausible row."""
     coldest, hottest = model.temperature_limits
-    return (f'no row has an output within {model.rate_limit / DEGREE:.0f} deg/s and a temperature from {coldest:.0f} to '
-            f'{hottest:.0f} degC, which is all that is plausible; see whether columns and units are right')
+    return (f'no row has an output within {model.rate_limit / DEGREE:.0f} deg/s and a temperature '
+            f'from {coldest:.0f} to {hottest:.0f} degC, which is all that is plausible; see '
+            'whether columns and units are right')
 
 
 def compensate_log(model: GyroModel, log: Log) -> Array:
-    """Return the rates of a whole log with output, rad/s, shape (n,); nan where the output is, or is not `plausible`."""
+    """Return the rates of a log with output, rad/s, shape (n,); nan where not `plausible`."""
     known = plausible(model, log)
     rate = np.full(len(log), np.nan)
     rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate
@@ -139,9 +150,10 @@ def compensate_log(model: GyroModel, log: Log) -> Array:
 
 
 def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
-    """Return some rows of a log, by their numbers or by a mask, without columns that are not ours."""
+    """Return some rows of a log, by their numbers or by a mask, without unknown columns."""
     arrays = {quantity: getattr(log, quantity) for quantity in QUANTITIES}
-    return Log(**{quantity: values[rows] for quantity, values in arrays.items() if values is not None}, notes=log.notes)
+    return Log(**{quantity: values[rows] for quantity, values in arrays.items()
+                  if values is not None}, notes=log.notes)
 
 
 def _bridged(time: Array, heading: Array | None) -> Array | float:
