@@ -1,8 +1,9 @@
 """
-What went wrong in a run that its profile does not explain: each way has a name, a test and a remedy.
+What went wrong in a run that its profile does not explain: a name, a test and a remedy for each.
 
-A gyro that is dead or saturated shows that by itself. What the robot did otherwise shows by which motion explains the run best: the
-profile with a stretch of its own, driven faster or slower, begun late, or ended early.
+A gyro that is dead or saturated shows that by itself. What the robot did otherwise shows by which
+motion explains the run best: the profile with one deviating stretch, driven faster or slower,
+begun late, or ended early.
 
 """
 
@@ -19,14 +20,18 @@ from gyro_calibration.likelihood import unlikeliest
 from gyro_calibration.log import DEGREE, Array, DataRefused
 from gyro_calibration.motion import Motion
 
-#: A gyro that gives one value in more than this part of its samples is dead; toggles of a last bit do not make it alive.
+#: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
+#: toggles.
 _DEAD = 0.9
-#: At least so many samples at a limit, and this part of all, make a flat top; and so many times as many as at the code beside it.
+#: A flat top has at least so many samples at a limit, this part of all, and so many times as many
+#: as the code beside it.
 _FLAT, _FLAT_PART, _FLAT_RATIO = 10, 0.005, 3.0
-#: Where this part of neighbours differ at a steady rate, in blocks of so many samples, no honest top stays in one code.
+#: Where this part of neighbours differ at a steady rate, in blocks of so many samples, the noise
+#: is resolved, and no honest top stays in one code.
 _RESOLVED, _BLOCK = 0.2, 10
-#: Length of the pieces that motions are compared by, and of the steps of begins, ends and offsets that are tried, s; a long run has longer
-#: pieces, not more than so many, for the search takes the cube of their number.
+#: Length of the pieces that motions are compared by, and step of the begins, ends and offsets that
+#: are tried, s. A long run has longer pieces, at most so many: the search takes the cube of their
+#: number.
 _PIECE, _STEP, _MOST_PIECES = 0.1, 0.1, 650
 #: Speeds that are tried, as parts of the profile's.
 _SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
@@ -35,28 +40,45 @@ EXPLAINED = 0.1
 #: One that needs a stretch of its own must leave so many times less than one that does not.
 _SIMPLER = 1.5
 
-#: What a gyro that reports so many times the true rate may be: what was taken for what, of the gyro and of the profile.
+#: What a gyro that reports so many times the true rate may be: a confused unit of the gyro, or of
+#: the profile.
 _UNITS = {
-    180.0 / math.pi: ('the gyro is in deg/s and read as rad/s', 'the profile in rad and read as deg'),
-    math.pi / 180.0: ('the gyro is in rad/s and read as deg/s', 'the profile in deg and read as rad'),
-    1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units', 'the profile in thousands'),
-    1e-3: ('the gyro is in thousands', 'the profile in thousandths (mdeg, mrad) and read as whole units'),
-    180e3 / math.pi: ('the gyro is in mdeg/s and read as rad/s', 'the profile in rad and read as mdeg'),
-    math.pi / 180e3: ('the gyro is in rad/s and read as mdeg/s', 'the profile in mdeg and read as rad'),
-    1e3 * math.pi / 180.0: ('the gyro is in mrad/s and read as deg/s', 'the profile in deg and read as mrad'),
-    180e-3 / math.pi: ('the gyro is in deg/s and read as mrad/s', 'the profile in mrad and read as deg'),
-    0.5 / math.pi: ('the gyro is in revolutions/s and read as rad/s (or in revolutions/min and read as deg/s)',
+    180.0 / math.pi: ('the gyro is in deg/s and read as rad/s',
+                      'the profile in rad and read as deg'),
+    math.pi / 180.0: ('the gyro is in rad/s and read as deg/s',
+                      'the profile in deg and read as rad'),
+    1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
+          'the profile in thousands'),
+    1e-3: ('the gyro is in thousands',
+           'the profile in thousandths (mdeg, mrad) and read as whole units'),
+    180e3 / math.pi: ('the gyro is in mdeg/s and read as rad/s',
+                      'the profile in rad and read as mdeg'),
+    math.pi / 180e3: ('the gyro is in rad/s and read as mdeg/s',
+                      'the profile in mdeg and read as rad'),
+    1e3 * math.pi / 180.0: ('the gyro is in mrad/s and read as deg/s',
+                            'the profile in deg and read as mrad'),
+    180e-3 / math.pi: ('the gyro is in deg/s and read as mrad/s',
+                       'the profile in mrad and read as deg'),
+    0.5 / math.pi: ('the gyro is in revolutions/s and read as rad/s '
+                    '(or in revolutions/min and read as deg/s)',
                     'the profile in rad and read as revolutions'),
-    2.0 * math.pi: ('the gyro is in rad/s and read as revolutions/s', 'the profile in revolutions and read as rad'),
-    1.0 / 360.0: ('the gyro is in revolutions/s and read as deg/s', 'the profile in deg and read as revolutions'),
-    360.0: ('the gyro is in deg/s and read as revolutions/s', 'the profile in revolutions and read as deg'),
-    30.0 / math.pi: ('the gyro is in revolutions/min and read as rad/s', 'the profile is 9.5 times too slow'),
+    2.0 * math.pi: ('the gyro is in rad/s and read as revolutions/s',
+                    'the profile in revolutions and read as rad'),
+    1.0 / 360.0: ('the gyro is in revolutions/s and read as deg/s',
+                  'the profile in deg and read as revolutions'),
+    360.0: ('the gyro is in deg/s and read as revolutions/s',
+            'the profile in revolutions and read as deg'),
+    30.0 / math.pi: ('the gyro is in revolutions/min and read as rad/s',
+                     'the profile is 9.5 times too slow'),
     3600.0: ('the gyro is in deg/h and read as deg/s', 'the profile is 3600 times too slow'),
-    648e3 / math.pi: ('the gyro is in deg/h and read as rad/s', 'the profile is 206265 times too slow'),
+    648e3 / math.pi: ('the gyro is in deg/h and read as rad/s',
+                      'the profile is 206265 times too slow'),
     1.0 / 3600.0: ('the gyro is in deg/s and read as deg/h', 'the profile is 3600 times too fast'),
-    2.0: ('the gyro is read with twice its sensitivity', 'the profile was driven at twice its rate'),
+    2.0: ('the gyro is read with twice its sensitivity',
+          'the profile was driven at twice its rate'),
     0.5: ('the gyro is read with half its sensitivity', 'the profile was driven at half its rate'),
-    **{factor: (f'the gyro is read with {factor:g} times its sensitivity', f'the profile was driven at {factor:g} times its rate')
+    **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
+                f'the profile was driven at {factor:g} times its rate')
        for factor in (4.0, 8.0, 10.0, 100.0, 0.25, 0.125, 0.1, 0.01)},
 }
 #: Scale errors up to this, as a logarithm, go with a unit.
@@ -64,7 +86,15 @@ _NEAR = math.log(1.1)
 
 
 def unit_error(scale: float, by_profile: bool = True) -> str:
-    """Name the error of units, of gyro or profile, that makes a gyro report `scale` times the true rate, '' where there is none."""
+    """
+    Return the error of units, of gyro or profile, that explains a scale; '' where there is none.
+
+    Parameters
+    ----------
+    scale : reported over true rate
+    by_profile : the unit of the profile may be wrong too
+
+    """
     size = abs(math.log(max(abs(scale), 1e-300)))
     nearest = min(_UNITS, key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
     if size < _NEAR or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _NEAR:
@@ -72,25 +102,28 @@ def unit_error(scale: float, by_profile: bool = True) -> str:
     turned = ', and turns the other way' if scale < 0.0 else ''
     gyro, profile = _UNITS[nearest]
     cause = f'either {gyro}, or {profile}' if by_profile else gyro
-    return f'the gyro reports {abs(scale):.4g} times what was turned{turned}: {cause}; mend the unit'
+    return (f'the gyro reports {abs(scale):.4g} times what was turned{turned}: '
+            f'{cause}; mend the unit')
 
 
 def refuse_dead(rate: Array) -> None:
     """Refuse samples of one value, or nearly all of one."""
     if np.ptp(rate) == 0.0:
-        raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: the gyro is dead or not powered')
+        raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: '
+                          'the gyro is dead or not powered')
     values, counts = np.unique(rate, return_counts=True)
     part = counts.max() / len(rate)
     if part > _DEAD:
-        raise DataRefused(f'{100 * part:.1f} % of the samples have the same value, {values[counts.argmax()]:g} rad/s: the gyro is dead, '
-                          'not powered, or did not move')
+        raise DataRefused(f'{100 * part:.1f} % of the samples have the same value, '
+                          f'{values[counts.argmax()]:g} rad/s: the gyro is dead, not powered, '
+                          'or did not move')
 
 
 def refuse_saturated(output: Array) -> None:
     """
     Refuse an output that stays at its largest or smallest value as no noise does.
 
-    Codes so coarse that they hide the noise stay honestly: there is no telling then, but by the profile.
+    Codes so coarse that they hide the noise stay honestly: only the profile can tell then.
 
     """
     limit = _limit(output)
@@ -100,8 +133,8 @@ def refuse_saturated(output: Array) -> None:
 
 def _saturated(output: Array, limit: float) -> DataRefused:
     part = 100 * np.mean(output == limit)
-    return DataRefused(f'the gyro is saturated: {part:.0f} % of the samples are at its limit of {limit / DEGREE:.4g} deg/s; turn slower, '
-                       'or set a wider range')
+    return DataRefused(f'the gyro is saturated: {part:.0f} % of the samples are at its limit of '
+                       f'{limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
 
 
 def _limit(output: Array) -> float | None:
@@ -110,13 +143,19 @@ def _limit(output: Array) -> float | None:
     if len(values) < 2:
         return None
     for end, beside in ((-1, -2), (0, 1)):
-        if counts[end] >= max(_FLAT, _FLAT_PART * len(output)) and counts[end] > _FLAT_RATIO * counts[beside]:
+        if (counts[end] >= max(_FLAT, _FLAT_PART * len(output))
+                and counts[end] > _FLAT_RATIO * counts[beside]):
             return float(values[end])
     return None
 
 
 def _resolved(output: Array) -> bool:
-    """Tell whether the codes hold the noise: whether they change where the rate does not, in the flattest quarter away from both ends."""
+    """
+    Tell whether the codes resolve the noise: whether they change at a steady rate.
+
+    The steady rate is that of the flattest quarter of the blocks away from both ends.
+
+    """
     blocks = output[:len(output) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
     blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
     if len(blocks) < 4:
@@ -133,12 +172,13 @@ class Pieces:
     edges: Array
     turned: Array
 
-    def headings(self, motion: Motion, offset: float = 0.0, speed: float = 1.0, end: float = math.inf) -> Array:
-        """Return what the motion turned in each piece if it began `offset` s late, was driven `speed` times as fast and ended at `end`."""
+    def headings(self, motion: Motion, offset: float = 0.0, speed: float = 1.0,
+                 end: float = math.inf) -> Array:
+        """Return the turn in each piece, rad, by a motion late by `offset` and cut at `end`, s."""
         return np.diff(motion.heading_at(np.minimum(speed * (self.edges - offset), end)))
 
     def left(self, reference: Array) -> tuple[float, float]:
-        """Return which part of the squares a motion leaves unexplained, and the scale; a run too short for a piece explains nothing."""
+        """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
         if not len(self.turned):
             return 1.0, 0.0
         known, turned = reference - reference.mean(), self.turned - self.turned.mean()
@@ -149,14 +189,15 @@ class Pieces:
 
 def pieces(time: Array, rate: Array) -> Pieces:
     """Return a run in pieces."""
-    length = max(_PIECE, 2.0 * float(np.median(np.diff(time))), float(time[-1] - time[0]) / _MOST_PIECES)
+    length = max(_PIECE, 2.0 * float(np.median(np.diff(time))),
+                 float(time[-1] - time[0]) / _MOST_PIECES)
     edges = np.arange(time[0], time[-1], length)
     return Pieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
 
 
 def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str = '') -> None:
     """
-    Refuse a run that another motion explains far better than the profile, by the name of what the robot did.
+    Refuse a run that another motion explains far better than the profile, with the cause.
 
     Parameters
     ----------
@@ -173,17 +214,19 @@ def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str =
     if _SIMPLER * left > followed(run, motion, largest_offset)[0] <= EXPLAINED:
         return
     if left > EXPLAINED:
-        raise DataRefused('the robot turned otherwise than the profile (the best that can be made of it explains '
-                          f'{100 * max(1 - left, 0.0):.0f} % of the run): was another profile driven?')
+        raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
+                          f'of it explains {100 * max(1 - left, 0.0):.0f} % of the run): '
+                          'was another profile driven?')
     raise DataRefused(slip if slip and name == 'slip' else _SENTENCES[name](value, motion))
 
 
 def followed(run: Pieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
-    """Return which part of the squares the profile leaves unexplained at the best delay, and the scale there."""
+    """Return what the profile leaves unexplained at the best delay, and the scale there."""
     return min(run.left(run.headings(motion, offset)) for offset in _offsets(largest_offset))
 
 
-#: How much of a run is left unexplained, and the value of what was tried: a speed, s, or a turn in rad with its time, s.
+#: Unexplained part of a run, and the value of what was tried: a speed, s, or a turn in rad with
+#: its time, s.
 Tried = Iterable[tuple[float, tuple[float, ...]]]
 
 
@@ -199,7 +242,8 @@ def _offsets(largest: float) -> Array:
 def _early(run: Pieces, motion: Motion, largest: float) -> Tried:
     """Try ends of the motion; the delay is that which fits the part before."""
     for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
-        yield _best((run.left(run.headings(motion, offset, end=end))[0], (float(end),)) for offset in _offsets(largest)[::2])
+        yield _best((run.left(run.headings(motion, offset, end=end))[0], (float(end),))
+                    for offset in _offsets(largest)[::2])
 
 
 def _speed(run: Pieces, motion: Motion, largest: float) -> Tried:
@@ -222,21 +266,27 @@ def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
     whole = np.sum((run.turned - run.turned.mean()) ** 2)
     for offset in _offsets(largest):
         reference = run.headings(motion, offset)
-        first, last, rate, squares, _ = unlikeliest(np.column_stack([reference, np.full(len(reference), interval)]), steps, run.turned)
+        first, last, rate, squares, _ = unlikeliest(
+            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.turned)
         left = run.left(reference)[0] - squares / max(float(whole), 1e-300)
-        yield left, (rate * float(edges[last] - edges[first]) * interval, float(run.edges[edges[first]]))
+        yield left, (rate * float(edges[last] - edges[first]) * interval,
+                     float(run.edges[edges[first]]))
 
 
-_WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {'early': _early, 'speed': _speed, 'late': _late, 'slip': _slip}
+_WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {
+    'early': _early, 'speed': _speed, 'late': _late, 'slip': _slip}
 _PENALTIES = {'slip': _SIMPLER}
 _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
-    'early': lambda value, motion: (f'the robot stopped at about {value[0]:.1f} s of the profile\'s {motion.duration:.1f} s: drive the '
-                                    'whole profile'),
-    'speed': lambda value, motion: (f'the robot drove the profile {value[0]:.2f} times as fast as it says, in '
-                                    f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: drive it at its own speed, '
-                                    'or give the profile that was driven'),
-    'late': lambda value, _: (f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} the profile: begin with '
-                              'it, or allow a larger time offset'),
+    'early': lambda value, motion: (
+        f'the robot stopped at about {value[0]:.1f} s of the profile\'s {motion.duration:.1f} s: '
+        'drive the whole profile'),
+    'speed': lambda value, motion: (
+        f'the robot drove the profile {value[0]:.2f} times as fast as it says, in '
+        f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
+        'drive it at its own speed, or give the profile that was driven'),
+    'late': lambda value, _: (
+        f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} '
+        'the profile: begin with it, or allow a larger time offset'),
     'slip': lambda value, _: slip_sentence(abs(value[0]), value[1]),
 }
 
@@ -244,5 +294,5 @@ _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
 def slip_sentence(turned: float, time: float, size: float = math.nan) -> str:
     """Say that the robot slipped or was bumped."""
     sure = '' if math.isnan(size) else f' ({size:.0f} standard deviations)'
-    return (f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the profile{sure}, at about {time:.1f} s: a slip or a '
-            'bump; run again on free ground')
+    return (f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the '
+            f'profile{sure}, at about {time:.1f} s: a slip or a bump; run again on free ground')
