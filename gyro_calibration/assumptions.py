@@ -1,8 +1,9 @@
 """
-What is taken of values that nobody calibrated, and of temperatures that nobody has seen the gyro at.
+Assumptions for values that nobody calibrated, and for temperatures without data.
 
-A tracker believes what it is given. So it is given all that may be wrong: scale factor error and bias where nothing says how well they are
-known, and what the bias does on the way from the temperature at which it was known to that of now.
+A tracker believes what it is given. So it is given all that may be wrong: scale factor error and
+bias where nothing says how well they are known, and the change of the bias from the temperature
+at which it was known to that of now.
 
 """
 
@@ -19,7 +20,7 @@ from gyro_calibration.compensation import covariance
 from gyro_calibration.log import DEGREE, Array
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 
-#: Temperatures at which the way of the bias is computed are so far apart, K; between them it is a straight line.
+#: Step of the temperatures for which the change of the bias is computed, K; linear between them.
 _STEP = 0.5
 
 
@@ -47,10 +48,11 @@ class Assumptions:
 
 
 def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
-    """Return the model with a self-calibration that says how well scale and bias are known, where nothing else does."""
+    """Return the model with a self-calibration that has a covariance, if nothing else has one."""
     calibration = model.self_calibration
     if calibration is None:
-        return model if model.covariance is not None else with_self_calibration(model, SelfCalibration(covariance=assumptions.covariance))
+        return (model if model.covariance is not None else with_self_calibration(
+            model, SelfCalibration(covariance=assumptions.covariance)))
     if calibration.covariance is not None and np.isfinite(calibration.covariance).all():
         return model
     return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
@@ -58,10 +60,10 @@ def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
 
 def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
     """
-    Return the covariance of all that is uncertain about the rates of an `assumed` model, shape (m, m).
+    Return the covariance of all uncertain values of an `assumed` model, shape (m, m).
 
-    The temperature coefficient stands before s and b of a self-calibration, which are the last two where there is one, and is the last
-    where there is none. `sensitive` has the same order.
+    The temperature coefficient stands before s and b of a self-calibration, which are the last two
+    where there is one, and is the last where there is none. `sensitive` has the same order.
 
     """
     values = covariance(model)
@@ -83,7 +85,8 @@ def sensitive(model: GyroModel, sensitivity: Array, distance: float) -> Array:
     """
     place = _place(model, len(sensitivity))
     whole = np.empty(len(sensitivity) + 1)
-    whole[:place], whole[place], whole[place + 1:] = sensitivity[:place], -distance, sensitivity[place:]
+    whole[:place], whole[place], whole[place + 1:] = (
+        sensitivity[:place], -distance, sensitivity[place:])
     return whole
 
 
@@ -93,10 +96,10 @@ def _place(model: GyroModel, values: int) -> int:
 
 class Way:
     """
-    What the bias does on the way from one temperature to others, as a table had it when this began.
+    Change of the bias from one temperature to others, by a table as it was when this began.
 
-    What the table learns later it learns from rests, and those teach the tracker the same. So it does not count here before the tracker
-    begins anew.
+    What the table learns later comes from rests, which the tracker uses itself. So it does not
+    count here before the tracker begins anew.
 
     """
 
@@ -110,18 +113,22 @@ class Way:
         coefficient : standard deviation in which distances are counted, rad/s/K; above 0
 
         """
-        self._table, self.begin, self._now, self._coefficient = deepcopy(table), begin, now, coefficient
+        self._table, self.begin, self._now, self._coefficient = (
+            deepcopy(table), begin, now, coefficient)
         self._known: dict[int, tuple[float, float]] = {0: (0.0, 0.0)}
 
     def at(self, temperature: float) -> tuple[float, float]:
-        """Return how far the bias has gone, rad/s, and how far away the temperature is, in K of an unknown coefficient; with its sign."""
+        """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
         steps = (temperature - self.begin) / _STEP
         below = math.floor(steps)
-        (first, near), (last, far), part = self._computed(below), self._computed(below + 1), steps - below
+        (first, near), (last, far), part = (
+            self._computed(below), self._computed(below + 1), steps - below)
         return first + part * (last - first), near + part * (far - near)
 
     def _computed(self, step: int) -> tuple[float, float]:
         if step not in self._known:
-            change, variance = self._table.difference(self.begin, self.begin + step * _STEP, self._now)
-            self._known[step] = change, math.copysign(math.sqrt(variance), step) / self._coefficient
+            change, variance = self._table.difference(
+                self.begin, self.begin + step * _STEP, self._now)
+            self._known[step] = (
+                change, math.copysign(math.sqrt(variance), step) / self._coefficient)
         return self._known[step]

@@ -1,13 +1,15 @@
 """
-What a heading is off by, as a Kalman filter: the error of each calibrated value, the wander of the bias, and the heading itself.
+Kalman filter of a heading: its error, those of calibrated values, and the wander of the bias.
 
-The state is the heading, the rate random walk w, the parts f of the flicker, and the errors e of the values of the calibration. While the
-robot turns, the heading goes on by what the compensated rate came to, less what the state explains of it::
+The state is the heading, the rate random walk w, the parts f of the flicker, and the errors e of
+the values of the calibration. In a turn, the heading goes on by the integral of the compensated
+rate, less what the state explains of it::
 
     turned = true turn + T w + sum of tau (1 - exp(-T / tau)) f - sensitivity e + white noise
 
-At rest the true turn is zero, and the same line is a measurement (d of Hong and Park, eq. 11, with the noise figures of the model): it
-teaches the bias, and by its correlation with the heading also what the heading has been off by.
+At rest the true turn is zero, and the same line is a measurement (d of Hong and Park, eq. 11, with
+the noise figures of the model). It determines the bias, and by the correlation with the heading
+also the error of the heading before.
 
 """
 
@@ -35,10 +37,11 @@ class Turn:
     ----------
     duration : s
     turned : integral of the compensated rate, rad
-    sensitivity : integral of what the rate changes by for each value of the calibration, shape (m,)
+    sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
     lost : variance of what was turned unseen, rad²
     noise : what the variance of the noise is beyond that of as long a time with all samples, rad²
-    unseen : there were no rates: the heading goes on by nothing, and what rates are off by does not concern it; not to be added to others
+    unseen : there were no rates: the heading stays, and the errors of rates do not affect it; not
+        to be added to others
 
     """
 
@@ -51,7 +54,8 @@ class Turn:
 
     def __add__(self, other: Turn) -> Turn:
         """Return both after each other."""
-        return Turn(self.duration + other.duration, self.turned + other.turned, self.sensitivity + other.sensitivity,
+        return Turn(self.duration + other.duration, self.turned + other.turned,
+                    self.sensitivity + other.sensitivity,
                     self.lost + other.lost, self.noise + other.noise)
 
     def add(self, duration: float, turned: float, sensitivity: Array) -> None:
@@ -62,7 +66,8 @@ class Turn:
 
     def __sub__(self, other: Turn) -> Turn:
         """Return what is left of this one behind another with which it begins."""
-        return Turn(self.duration - other.duration, self.turned - other.turned, self.sensitivity - other.sensitivity,
+        return Turn(self.duration - other.duration, self.turned - other.turned,
+                    self.sensitivity - other.sensitivity,
                     self.lost - other.lost, self.noise - other.noise)
 
 
@@ -75,7 +80,8 @@ class Step:
     ----------
     seen : what each part of the state adds to the integral of the compensated rate, shape (n,)
     kept : what stays of each part, shape (n,)
-    grown : covariance of what comes in new, shape (n, n); its first row and column tell of the integral of the rate, with a minus
+    grown : covariance of what comes in new, shape (n, n); its first row and column are those of
+        the integral of the rate, negated
 
     """
 
@@ -86,7 +92,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Drift:
-    """Mean and covariance of the state, shape (n,) and (n, n), with n = 2 + parts of the flicker + values of the calibration."""
+    """
+    Mean and covariance of the state, shape (n,) and (n, n).
+
+    n = 2 + parts of the flicker + values of the calibration.
+
+    """
 
     noise: Noise
     mean: Array
@@ -99,13 +110,15 @@ class Drift:
 
     def step(self, turn: Turn) -> Step:
         """Return how the state changes over a turn."""
-        wander, kept, grown = (_unseen if turn.unseen else _wander)(self.noise, round(turn.duration, 6))
+        wander, kept, grown = (_unseen if turn.unseen else _wander)(
+            self.noise, round(turn.duration, 6))
         values = len(self.mean) - len(kept)
         whole = np.zeros((len(self.mean), len(self.mean)))
         whole[:len(kept), :len(kept)] = grown
         white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
         whole[HEADING, HEADING] += white + turn.lost + turn.noise
-        return Step(np.concatenate([wander, -turn.sensitivity]), np.concatenate([kept, np.ones(values)]), whole)
+        return Step(np.concatenate([wander, -turn.sensitivity]),
+                    np.concatenate([kept, np.ones(values)]), whole)
 
     def moved(self, turn: Turn) -> Drift:
         """Return the state after a turn."""
@@ -114,7 +127,8 @@ class Drift:
         transition[HEADING] -= step.seen
         mean = step.kept * self.mean
         mean[HEADING] += turn.turned - step.seen @ self.mean
-        return replace(self, mean=mean, covariance=transition @ self.covariance @ transition.T + step.grown)
+        return replace(self, mean=mean,
+                       covariance=transition @ self.covariance @ transition.T + step.grown)
 
     def rested(self, turn: Turn) -> Drift:
         """Return the state after a time in which the true rate was zero."""
@@ -128,17 +142,19 @@ class Drift:
                        covariance=self.covariance - variance * np.outer(gain, gain))
 
     def carried(self, turn: Turn) -> Drift:
-        """Return the state at the end of a time in which the heading stood, as far as was seen, and nothing was measured."""
+        """Return the state after a time in which the heading stood and nothing was measured."""
         step = self.step(turn)
         grown = step.grown.copy()
         grown[HEADING] = grown[:, HEADING] = 0.0
         grown[HEADING, HEADING] = turn.lost
-        return replace(self, mean=step.kept * self.mean, covariance=step.kept[:, None] * self.covariance * step.kept + grown)
+        return replace(self, mean=step.kept * self.mean,
+                       covariance=step.kept[:, None] * self.covariance * step.kept + grown)
 
     def expected(self, turn: Turn) -> tuple[float, float]:
-        """Return what the integral of the compensated rate is at rest, rad, and its variance, rad²."""
+        """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
         step = self.step(turn)
-        return float(step.seen @ self.mean), float(step.seen @ self.covariance @ step.seen + step.grown[HEADING, HEADING])
+        return (float(step.seen @ self.mean),
+                float(step.seen @ self.covariance @ step.seen + step.grown[HEADING, HEADING]))
 
     @cached_property
     def offset(self) -> tuple[float, float]:
@@ -148,14 +164,16 @@ class Drift:
 
     @cached_property
     def values(self) -> tuple[Array, Array, Array]:
-        """Return the errors of the values of the calibration, their covariance, and that with the `offset`."""
+        """Return the errors of the calibration, their covariance, and that with the `offset`."""
         first = self.calibrated
-        return self.mean[first:], self.covariance[first:, first:], self.covariance[WALK:first, first:].sum(axis=0)
+        return (self.mean[first:], self.covariance[first:, first:],
+                self.covariance[WALK:first, first:].sum(axis=0))
 
     def bias(self, sensitivity: Array) -> tuple[float, float]:
-        """Return what the compensated rate is off by, rad/s, and the variance of that, for a sensitivity of shape (m,)."""
+        """Return the error of the compensated rate, rad/s, and its variance; sensitivity (m,)."""
         (offset, variance), (values, covariance, shared) = self.offset, self.values
-        return offset - float(sensitivity @ values), variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared))
+        return (offset - float(sensitivity @ values),
+                variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared)))
 
     def uncertain(self, place: int, variance: float) -> Drift:
         """Return the state with one part less well known."""
@@ -172,17 +190,19 @@ class Drift:
         return replace(self, mean=mean, covariance=covariance)
 
 
-def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0, age: float | None = None) -> Drift:
+def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
+          age: float | None = None) -> Drift:
     """
     Return the state some time after a calibration.
 
     Parameters
     ----------
     noise : of the model
-    covariance : of the values of the calibration, shape (m, m), as `compensation.covariance` gives it
+    covariance : of the calibration, shape (m, m), from `compensation.covariance`
     heading, variance : rad and rad²
-    age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None where there is none. Its variance holds
-        the floor of the Allan deviation for the flicker, which here is counted part by part instead
+    age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None
+        without one. Its variance holds the floor of the Allan deviation for the flicker, which is
+        counted part by part here instead
 
     """
     constants, of_each = noise.flicker()
@@ -202,10 +222,16 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
 
 @lru_cache(maxsize=4096)
 def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
-    """Return of heading, walk and flicker: what they add to the integral, what stays, and what comes in new, without white noise."""
+    """
+    Return what heading, walk and flicker add to the integral, what stays, and what comes in new.
+
+    White noise is not included.
+
+    """
     constants, variance = noise.flicker()
     left = np.exp(-duration / constants)
-    kept, seen = np.concatenate([[1.0, 1.0], left]), np.concatenate([[0.0, duration], constants * (1.0 - left)])
+    kept, seen = (np.concatenate([[1.0, 1.0], left]),
+                  np.concatenate([[0.0, duration], constants * (1.0 - left)]))
     walk = noise.rate_random_walk ** 2
     grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
     grown[HEADING, WALK] = -0.5 * walk * duration ** 2
@@ -248,8 +274,9 @@ def _with_hindsight(state: Drift, turn: Turn, rest: bool, later: Drift) -> Drift
     if not rest:
         transition[HEADING] -= step.seen
     back = start.covariance @ transition.T @ _inverse(after.covariance)
-    return replace(start, mean=start.mean + back @ (later.mean - after.mean),
-                   covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)
+    return replace(
+        start, mean=start.mean + back @ (later.mean - after.mean),
+        covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)
 
 
 def _inverse(covariance: Array) -> Array:

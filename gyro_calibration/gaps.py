@@ -1,12 +1,14 @@
 """
 What is not known of the heading where samples are lost.
 
-Between two samples the rate is taken as a straight line. What it may have been instead is learned from how far samples of the last seconds
-were off the line between their neighbours, over intervals from that of the samples to `_LONGEST`: c = r(t) - (r(t - h) + r(t + h)) / 2. A
-Brownian motion has a mean square of q h / 2 there, and after a gap of T = 2 h its integral has the variance q T³ / 12 = T² / 3 E(c²). Of
-means over neighbouring blocks of length h it has half of that mean square.
+Between two samples the rate is taken as a straight line. What it may have been instead is learned
+from how far samples of the last seconds were off the line between their neighbours, over intervals
+from that of the samples to `_LONGEST`: c = r(t) - (r(t - h) + r(t + h)) / 2. A Brownian motion has
+a mean square of q h / 2 there, and after a gap of T = 2 h its integral has the variance
+q T³ / 12 = T² / 3 E(c²). Means over neighbouring blocks of length h have half of that mean square.
 
-The two samples beside a gap stand for all of it, and so does their noise: with N² / dt for each of them, T² N² / (2 dt) instead of N² T.
+The two samples beside a gap stand for all of it, and so does their noise: with N² / dt for each of
+them, T² N² / (2 dt) instead of N² T.
 
 """
 
@@ -19,22 +21,26 @@ from dataclasses import dataclass
 from gyro_calibration.log import SHORTEST
 from gyro_calibration.noise import Noise
 
-#: Length of the shortest blocks whose means are compared, s; of the others, each twice as long; and how many lengths there are.
+#: Length of the shortest blocks whose means are compared, s, and the number of lengths, each twice
+#: the one before.
 _BLOCK, _LEVELS = 0.1, 3
 #: What the rate does is remembered for so long, s; of long blocks, for so many of them.
 _MEMORY, _BLOCKS = 2.0, 5
-#: Part of T² E(c²) that the variance after a gap of T is, for points and for means over blocks: between Brownian motion, with 1/3 and 2/3,
-#: and a rate that bends evenly, with 4/9 for both.
+#: Part of T² E(c²) that the variance after a gap of T is, for points and for means over blocks:
+#: between Brownian motion, with 1/3 and 2/3, and a rate that bends evenly, with 4/9 for both.
 _OF_POINTS, _OF_MEANS = 0.4, 0.5
-#: A step over a gap that is so many times the usual one has not been met in these seconds: the robot began to turn, or stopped.
+#: A step over a gap that is so many times the usual one is new in these seconds: the robot began
+#: to turn, or stopped.
 _UNMET = 5.0
-#: No rate, rad/s, and no time without samples, s, is larger than that; the variance after a gap stays a number.
+#: Largest rate, rad/s, and time without samples, s, so that the variance after a gap is finite.
 FASTEST, LONGEST = 1e4, 1e9
 #: Intervals that are remembered; so many must be known to tell a gap.
 _REMEMBERED, _NEEDED = 256, 16
-#: An interval that is so many times the usual one is a gap; one below such a part of it belongs to a burst, or follows a late sample.
+#: An interval of so many times the usual one is a gap; one below such a part of it belongs to a
+#: burst, or follows a late sample.
 _GAP, _SHORT = 1.5, 0.5
-#: From this share of short intervals on the stamps come in bursts, and where the mean is so many times the middle one.
+#: The stamps come in bursts from this share of short intervals on, and where the mean interval is
+#: so many times the median.
 _BURSTS, _TOGETHER = 0.1, 2.0
 
 
@@ -65,7 +71,7 @@ class Gap:
 
 class Intervals:
     """
-    The usual interval of stamps that may jitter or come in bursts, and how many samples are lost in others.
+    The usual interval of stamps that may jitter or come in bursts, and the samples lost in others.
 
     Attributes
     ----------
@@ -114,11 +120,12 @@ class Intervals:
             self._late = 0
 
     def _look(self) -> None:
-        """Look at the intervals that are remembered: the middle one is the usual, unless the stamps come in bursts."""
+        """Find the usual interval: the median, unless the stamps come in bursts."""
         self._until = max(len(self._seen) // 4, _NEEDED)
         steps = sorted(self._seen)
         middle = self._even = self.usual = max(steps[len(steps) // 2], SHORTEST)
-        if sum(steps) > _TOGETHER * middle * len(steps) or sum(step < _SHORT * middle for step in steps) > _BURSTS * len(steps):
+        if (sum(steps) > _TOGETHER * middle * len(steps)
+                or sum(step < _SHORT * middle for step in steps) > _BURSTS * len(steps)):
             # the longest may be gaps
             self._even = steps[-1 - len(steps) // 100]
             self.usual = max(sum(min(step, self._even) for step in steps) / len(steps), SHORTEST)
@@ -143,7 +150,8 @@ class _Level:
 
     def without_noise(self, density: float) -> tuple[float, float]:
         """Return both mean squares without white noise of a density, rad²/s."""
-        return max(self.curved - 1.5 * density / self.length, 0.0), max(self.stepped - 2.0 * density / self.length, 0.0)
+        return (max(self.curved - 1.5 * density / self.length, 0.0),
+                max(self.stepped - 2.0 * density / self.length, 0.0))
 
     def clear(self) -> None:
         """Forget the last blocks, as after a gap."""
@@ -190,7 +198,8 @@ class Gaps:
         self._surplus = self._step = 0.0
 
     def _begin_block(self) -> None:
-        self._duration, self._count, self._total, self._steps, self._squares, self._products = 0.0, 0, 0.0, 0, 0.0, 0.0
+        self._duration, self._count, self._total, self._steps, self._squares, self._products = (
+            0.0, 0, 0.0, 0, 0.0, 0.0)
 
     def add(self, interval: float, rate: float, before: float) -> Gap | None:
         """
@@ -235,7 +244,8 @@ class Gaps:
         if self._steps and self._squares < FASTEST ** 2:
             weight = self._duration / (_MEMORY + self._duration)
             self._stepped += weight * (self._squares / self._steps - self._stepped)
-            self._curved += weight * (max(0.5 * (self._squares - self._products) / self._steps, 0.0) - self._curved)
+            self._curved += weight * (
+                max(0.5 * (self._squares - self._products) / self._steps, 0.0) - self._curved)
         for level in self._levels:
             if mean is None:
                 break
@@ -243,34 +253,41 @@ class Gaps:
         self._begin_block()
 
     def _gap(self, lost: int, interval: float, step: float) -> Gap:
-        usual, step, interval = self.intervals.usual, min(abs(step), FASTEST), min(interval, LONGEST)
+        usual, step, interval = (
+            self.intervals.usual, min(abs(step), FASTEST), min(interval, LONGEST))
         surplus = min(lost * usual, interval)
         ends = self.noise.angle_random_walk ** 2 / usual
         noise = ends * (surplus * (0.5 * surplus + usual) + 0.5 * self._surplus * surplus)
         # a step that has not been met may have come at any time within the gap
-        unmet = max(step * step - _UNMET ** 2 * (_between(self._steps_seen(), interval, 2.0) + 2.0 * ends), 0.0)
-        return Gap(lost, surplus, interval ** 2 * (_between(self._curves_seen(), 0.5 * interval, 4.0) + unmet / 12.0), noise)
+        unmet = max(step * step - _UNMET ** 2
+                    * (_between(self._steps_seen(), interval, 2.0) + 2.0 * ends), 0.0)
+        return Gap(lost, surplus, interval ** 2 * (
+            _between(self._curves_seen(), 0.5 * interval, 4.0) + unmet / 12.0), noise)
 
     def _curves_seen(self) -> list[tuple[float, float]]:
-        """Return lengths, s, and what the mean square off the line is there, without noise, as a part of the variance, (rad/s)²."""
+        """Return lengths, s, and the part of the variance by curvature without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual
         points = [(usual, _OF_POINTS * max(self._curved - 1.5 * density / usual, 0.0))]
         if usual > 0.5 * _BLOCK:
-            return points + [(each.length, _OF_MEANS * each.without_noise(density)[0]) for each in self._levels[1:]]
-        return points + [(each.length, _OF_MEANS * each.without_noise(density)[0]) for each in self._levels]
+            return points + [(each.length, _OF_MEANS * each.without_noise(density)[0])
+                             for each in self._levels[1:]]
+        return points + [(each.length, _OF_MEANS * each.without_noise(density)[0])
+                         for each in self._levels]
 
     def _steps_seen(self) -> list[tuple[float, float]]:
         """Return lengths, s, and the mean squares of steps there, without noise, (rad/s)²."""
         density, usual = self.noise.angle_random_walk ** 2, self.intervals.usual
         points = [(usual, max(self._stepped - 2.0 * density / usual, 0.0))]
-        return points + [(each.length, each.without_noise(density)[1]) for each in self._levels if each.length > usual]
+        return points + [(each.length, each.without_noise(density)[1])
+                         for each in self._levels if each.length > usual]
 
 
 def _between(known: list[tuple[float, float]], length: float, steepest: float) -> float:
-    """Return a quantity at a length by what is known at others, which grow: a power law from one to the next, of some power at most."""
+    """Return a quantity at a length, by power laws between those at known, growing lengths."""
     if len(known) == 1:  # samples are further apart than any length that means were taken over
         return known[0][1]
-    (near, low), (far, high) = next(((below, above) for below, above in zip(known, known[1:]) if length <= above[0]), known[-2:])
+    (near, low), (far, high) = next(((below, above) for below, above in zip(known, known[1:])
+                                     if length <= above[0]), known[-2:])
     if high <= 0.0:
         return low
     power = min(math.log(high / low) / math.log(far / near), steepest) if low > 0.0 else steepest

@@ -160,7 +160,7 @@ class BlockIntegrator:
         Parameters
         ----------
         time, rate : s and rad/s, before the threshold filter, shape (n,)
-        sensitivity : of the rates to the values of the calibration, (m, n), as in `compensation`
+        sensitivity : of the rates to the calibration, shape (m, n), as in `compensation`
 
         Returns
         -------

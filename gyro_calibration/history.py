@@ -1,8 +1,9 @@
 """
-Channels that need more than one instant: time since power-on, lagged channels, the branch of a temperature.
+Channels that need a history: time since power-on, lagged channels, the branch of a temperature.
 
-A `History` follows a stream sample by sample, or a log in one piece or in blocks, with the same numbers. What it has to remember it
-learns from the lags that it is asked for: each starts in the value that its channel has then.
+A `History` follows a stream sample by sample, or a log in one piece or in blocks, with the same
+numbers. It remembers the lags that it is asked for: each starts at the value that its channel has
+then.
 
 """
 
@@ -21,7 +22,8 @@ from gyro_calibration.log import Log, Number
 #: Vibration is what deviates from the mean over so many seconds.
 VIBRATION_TIME = 1.0
 
-#: What the next sample has to know, by (channel, time constant) of a lag and ('heating', filter time, threshold) of a branch.
+#: What the next sample needs to know, by (channel, time constant) of a lag and ('heating', filter
+#: time, threshold) of a branch.
 Known = dict[tuple[Any, ...], float]
 
 
@@ -42,7 +44,8 @@ class History:
         self._piece: _Piece | None = None
         self._begin = 0.0
 
-    def follow(self, time: Number, temperature: Number | None = None, specific_force: Number | None = None, supply: Number | None = None,
+    def follow(self, time: Number, temperature: Number | None = None,
+               specific_force: Number | None = None, supply: Number | None = None,
                heading: Number = 0.0) -> Channels:
         """
         Take the next sample (numbers) or the next samples (arrays of shape (n,), n > 0).
@@ -64,13 +67,15 @@ class History:
         if temperature is not None:
             known['temperature'] = temperature = clip(temperature, self._low, self._high)
         here = self._stand_in + 0.0 * time if temperature is None else temperature
-        piece = self._piece = _Piece(time, {name: signal for name, signal in known.items() if signal is not None}, self._piece)
+        piece = self._piece = _Piece(time, {name: signal for name, signal in known.items()
+                                            if signal is not None}, self._piece)
 
         def lagged(channel: str, time_constant: float) -> Number:
             signal = here if channel == 'temperature' else piece.signal(channel)
             return signal + piece.ahead(channel, time_constant)
 
-        return Channels(0.0 * time, 0.0 * time, here, time - self._begin, 0.0 * time if specific_force is None else specific_force, supply,
+        return Channels(0.0 * time, 0.0 * time, here, time - self._begin,
+                        0.0 * time if specific_force is None else specific_force, supply,
                         heading, lagged, piece.heating)
 
 
@@ -85,7 +90,8 @@ class _Piece:
         begin = _end(time, 0)
         if before is not None:
             self._state, begin = before.ended(), before._end_time
-            self._last = before._last | {name: _end(signal, -1) for name, signal in before._known.items()}
+            self._last = before._last | {name: _end(signal, -1)
+                                         for name, signal in before._known.items()}
         self._ended: Known = {}
         self._interval = _change(time, begin)
 
@@ -97,15 +103,16 @@ class _Piece:
         return self._known.get(channel, 0.0)
 
     def ahead(self, channel: str, time_constant: float) -> Number:
-        """Return what the lagged channel is ahead of the channel; where that is not known, it stays as it is."""
+        """Return the lagged channel less the channel, which is held while it is not known."""
         signal, key = self.signal(channel), (channel, time_constant)
-        change = _change(signal, self._last.get(channel, _end(signal, 0))) if channel in self._known else 0.0 * self._interval
+        change = (_change(signal, self._last.get(channel, _end(signal, 0)))
+                  if channel in self._known else 0.0 * self._interval)
         ahead = lag_ahead(self._interval, change, time_constant, self._state.get(key, 0.0))
         self._ended[key] = _end(ahead, -1)
         return ahead
 
     def heating(self, filter_time: float, threshold: float) -> Number:
-        """Return the branch: the sign of how fast the temperature changes between two lags, where that is beyond a threshold, K/s."""
+        """Return the branch: the sign of the temperature rate if beyond a threshold, K/s."""
         fast, slow = (self.ahead('temperature', lag) for lag in (0.5 * filter_time, filter_time))
         rate, key = (fast - slow) / (0.5 * filter_time), ('heating', filter_time, threshold)
         branch = _held(np.sign(rate) * (abs(rate) > threshold), self._state.get(key, 0.0))
@@ -113,7 +120,7 @@ class _Piece:
         return branch
 
     def ended(self) -> Known:
-        """Return what the next piece has to know, also of the lags that nobody asked for this time."""
+        """Return what the next piece has to know, also of lags that nobody asked for now."""
         for key in self._state.keys() - self._ended.keys():
             (self.heating if key[0] == 'heating' else self.ahead)(*key[-2:])
         return self._ended
@@ -123,7 +130,8 @@ def channels_of(log: Log) -> Channels:
     """
     Return the channels of a whole log, with rate and output 0.
 
-    Of rows without time nothing is earlier than another. The heading is that of the reference, and 0 where there is none.
+    Without stamps no row is earlier than another. The heading is that of the reference, and 0
+    where there is none.
 
     """
     time = np.zeros(len(log)) if log.time is None else log.time
@@ -133,8 +141,9 @@ def channels_of(log: Log) -> Channels:
 
 def clip(value: Number, low: float, high: float) -> Number:
     """Return a number, or an array, within bounds."""
-    # numpy would make a numpy scalar of a number, and all that is computed from it three times slower.
-    return np.clip(value, low, high) if isinstance(value, np.ndarray) else min(max(value, low), high)
+    # numpy makes a numpy scalar of a number, and all computations with it three times slower
+    return (np.clip(value, low, high) if isinstance(value, np.ndarray)
+            else min(max(value, low), high))
 
 
 def _end(signal: Number, place: int) -> float:

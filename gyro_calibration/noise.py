@@ -1,4 +1,4 @@
-"""The noise of a gyro, in the words and units of IEEE Std 952: angle random walk, bias instability, rate random walk."""
+"""Noise of a gyro after IEEE Std 952: angle random walk, bias instability, rate random walk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from gyro_calibration.log import Array, Number
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: A bias is known as the mean over so long, s, as a self-calibration takes.
 CALIBRATED = 20.0
-#: Time constants, s, a factor of 10 apart, of the processes that stand for flicker from a second to some hours.
+#: Time constants, s, a factor of 10 apart, of the processes that stand for flicker from a second
+#: to some hours.
 _FLICKER = np.array([3.0, 30.0, 300.0, 3000.0])
 
 
@@ -45,26 +46,30 @@ class Noise:
         return ALLAN_FLOOR * self.bias_instability
 
     def allan_variance(self, duration: Number) -> Number:
-        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²: half the mean square of neighbours' difference."""
+        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²."""
         return (self.angle_random_walk ** 2 / duration + self.floor ** 2
                 + self.rate_random_walk ** 2 * duration / 3.0)
 
     def wander(self, age: Number, duration: float) -> Number:
         """
-        Return the variance of how far a mean over `duration` s is from one `age` s before, (rad/s)², but for the white noise.
+        Return the variance of the change of a mean over `duration` s after `age` s, (rad/s)².
 
-        Flicker of spectrum B² / (2 pi f), on both sides of zero, has the generalized covariance -B² / pi log|t|. Of means over T that are a
-        time t apart that gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
+        White noise is not included. Flicker of spectrum B² / (2 pi f), on both sides of zero, has
+        the generalized covariance -B² / pi log|t|. For means over T that are a time t apart that
+        gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
 
         """
-        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (np.log(np.maximum(age / duration, 1.0)) + 1.5)
+        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
+            np.log(np.maximum(age / duration, 1.0)) + 1.5)
         return flicker + self.rate_random_walk ** 2 * np.maximum(age, duration)
 
     def flicker(self) -> tuple[Array, float]:
         """
-        Return time constants, s, shape (k,), and the variance, (rad/s)², of each of k Gauss-Markov processes that sum up to the flicker.
+        Return time constants, s, and variance, (rad/s)², of k Gauss-Markov processes for flicker.
 
-        With time constants a factor r apart, and B² ln(r) / pi each, the spectrum between them is B² / (2 pi f) on both sides of zero.
+        The constants have shape (k,); all processes have the same variance. With time constants a
+        factor r apart, and B² ln(r) / pi each, the spectrum between them is B² / (2 pi f) on both
+        sides of zero.
 
         """
         constants = _FLICKER if self.bias_instability else _FLICKER[:0]
@@ -72,7 +77,9 @@ class Noise:
 
     def drift_variance(self, duration: Number) -> Number:
         """
-        Return the variance, rad², of a heading after `duration` s from the mean bias of the `CALIBRATED` s before, but for the white noise.
+        Return the variance, rad², of a heading after `duration` s without white noise.
+
+        The bias is known as its mean over the `CALIBRATED` s before.
 
         """
         variance = self.rate_random_walk ** 2 * (duration ** 3 + CALIBRATED * duration ** 2) / 3.0
@@ -80,17 +87,22 @@ class Noise:
         for constant in constants:
             within, shared = known_mean(constant)
             gone = constant * (1.0 - np.exp(-duration / constant))
-            variance = variance + of_each * (2.0 * constant * (duration - gone) + duration ** 2 * within - 2.0 * duration * gone * shared)
+            variance = variance + of_each * (2.0 * constant * (duration - gone)
+                                             + duration ** 2 * within
+                                             - 2.0 * duration * gone * shared)
         return variance
 
     def heading_variance(self, duration: Number) -> Number:
-        """Return the variance, rad², of a heading after `duration` s from the mean bias of the `CALIBRATED` s before."""
+        """Return the variance, rad², of a heading as in `drift_variance`, with white noise."""
         return self.angle_random_walk ** 2 * duration + self.drift_variance(duration)
 
 
 def known_mean(constant: Number) -> tuple[Number, Number]:
     """
-    Return the variance of the mean of a Gauss-Markov process of unit variance over `CALIBRATED` s, and its covariance with the value after.
+    Return the variance of the mean of a process over `CALIBRATED` s, and the covariance after.
+
+    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean with
+    the value after.
 
     """
     ratio = CALIBRATED / constant
@@ -98,16 +110,19 @@ def known_mean(constant: Number) -> tuple[Number, Number]:
     return 2.0 * (ratio - gone) / ratio ** 2, gone / ratio
 
 
-def simulate_noise(noise: Noise, count: int, interval: float, generator: np.random.Generator) -> Array:
+def simulate_noise(noise: Noise, count: int, interval: float,
+                   generator: np.random.Generator) -> Array:
     """
     Return noise of shape (count,), rad/s, for samples every `interval` s.
 
-    Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is B² / (2 pi f).
+    Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is
+    B² / (2 pi f).
 
     """
     white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
     innovations = generator.standard_normal(count) * noise.bias_instability
     response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))
     flicker = oaconvolve(innovations, response)[:count] if noise.bias_instability else innovations
-    walk = np.cumsum(generator.standard_normal(count)) * noise.rate_random_walk * math.sqrt(interval)
+    walk = (np.cumsum(generator.standard_normal(count))
+            * noise.rate_random_walk * math.sqrt(interval))
     return white + flicker + walk

@@ -1,7 +1,7 @@
 """
-Whether a gyro rests: the energy of its rate over a short window against the known noise, and how unlikely a mean may be.
+Whether a gyro rests: the energy of its rate against the known noise, and how unlikely a mean is.
 
-Each test has its share of the false alarms that are stated for an hour at rest.
+Each test has its share of the false alarms per hour at rest.
 
 """
 
@@ -22,7 +22,8 @@ BLOCK, WINDOW = 0.1, 0.5
 LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 #: A window has at least so many samples.
 _SAMPLES = 8
-#: Windows whose noise is remembered, those needed to believe it, and how far it may be from what the model claims, as a factor.
+#: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
+#: of the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
 
 
@@ -56,7 +57,7 @@ class Block:
 
 
 def sigmas(lag: float, false_alarms: float) -> float:
-    """Return how many standard deviations a mean over `lag` s may be off, so that it alarms in vain `false_alarms` times in an hour."""
+    """Return the sigmas of a mean over `lag` s that give `false_alarms` per hour at rest."""
     chances = 3600.0 / lag * _OVERLAPPING
     return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
 
@@ -70,8 +71,8 @@ class Energy:
     The energy of the last `WINDOW` s.
 
     Attributes
-    ----------
-    factor : noise of the samples over what the model claims, as the quietest windows show it; 1 until enough were seen
+    factor : noise of the samples over that of the model, by the quietest windows; 1 until enough
+        were seen
 
     """
 
@@ -90,30 +91,35 @@ class Energy:
         self._blocks.clear()
 
     def add(self, block: Block) -> bool | None:
-        """Take the next block; tell whether the window holds no more energy than noise has; None until it is full."""
+        """Take the next block; tell whether the window is only noise; None until it is full."""
         self._blocks.append(block)
-        while sum(each.duration for each in self._blocks) - self._blocks[0].duration >= WINDOW + BLOCK - 1e-9 and (
-                sum(each.count for each in self._blocks) - self._blocks[0].count >= _SAMPLES):
+        while (sum(each.duration for each in self._blocks) - self._blocks[0].duration
+               >= WINDOW + BLOCK - 1e-9
+               and sum(each.count for each in self._blocks) - self._blocks[0].count >= _SAMPLES):
             self._blocks.popleft()
-        duration, count, total, squares, differences = (sum(values) for values in zip(*(vars(each).values() for each in self._blocks)))
+        duration, count, total, squares, differences = (
+            sum(values) for values in zip(*(vars(each).values() for each in self._blocks)))
         if duration < WINDOW + BLOCK - 1e-9 or count < _SAMPLES:
             return None
         self._interval, self._sudden = duration / count, None
         claimed = self._noise.rate_variance(self._interval)
         energy = (squares - total * total / count) / (count - 1)
         self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
-        if energy >= self.factor ** 2 * claimed * float(chdtri(count - 1, self._level)) / (count - 1):
+        if (energy >= self.factor ** 2 * claimed * float(chdtri(count - 1, self._level))
+                / (count - 1)):
             return False
         # what a robot does is slower than its samples: means over blocks show it far better
         means = sum(each.total ** 2 / each.count for each in self._blocks) - total * total / count
         freedom = len(self._blocks) - 1
-        return freedom < 2 or means < self.factor ** 2 * claimed * float(chdtri(freedom, self._level))
+        return (freedom < 2
+                or means < self.factor ** 2 * claimed * float(chdtri(freedom, self._level)))
 
     def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
         """
         Learn the noise of the samples from the quietest tenth of the windows.
 
-        Vibration of a robot that goes straight is no noise, and shows less in differences of neighbours.
+        Vibration of a robot that goes straight is no noise, and shows less in differences of
+        neighbours.
 
         """
         self._since += duration
@@ -122,17 +128,19 @@ class Energy:
         self._since = 0.0
         self._seen.append((energy, differences))
         if len(self._seen) >= _NEEDED:
-            quietest, rough = np.quantile(self._seen, 0.1, axis=0) / (float(chdtri(count - 1, 0.9)) / (count - 1))
+            quietest, rough = np.quantile(self._seen, 0.1, axis=0) / (
+                float(chdtri(count - 1, 0.9)) / (count - 1))
             self.factor = math.sqrt(min(max(min(quietest, rough), 1.0), _TRUSTED ** 2))
 
     def sudden(self) -> float:
         """
         Return how far a single sample may be off at rest, rad/s.
 
-        Its noise is that of the usual interval: what comes late, or in a burst, was sampled as evenly as any.
+        Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
 
         """
         if self._sudden is None:
             limit = sigmas(self._interval, _TESTS * self._level * 3600.0 / WINDOW)
-            self._sudden = limit * self.factor * math.sqrt(self._noise.rate_variance(self._interval))
+            self._sudden = limit * self.factor * math.sqrt(
+                self._noise.rate_variance(self._interval))
         return self._sudden

@@ -127,7 +127,7 @@ class HeadingTracker:
         Parameters
         ----------
         noise : of the model
-        covariance : of the values of the calibration, (m, m), from `compensation.covariance`
+        covariance : of the calibration, shape (m, m), from `compensation.covariance`
         age : of the self-calibration, whose s and b are the last values, s; None without one
         keep : the `steps`, for `smoothed`
 
@@ -239,7 +239,7 @@ class HeadingTracker:
         ----------
         time : stamp, s
         rate : compensated, rad/s
-        sensitivity : of the rate to the values of the calibration, (m,), as in `compensation`
+        sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
         wheels : whether wheels or commands move the robot; None where nobody says so
         still : the sensitivity if the true rate is zero; without it that of the samples serves at
             rest too: their noise then counts as a scale factor error, which is harmless only where
@@ -342,7 +342,7 @@ class HeadingTracker:
         if not quiet or wheels:
             self._wanted, self._doubt = WINDOW, None
         if wheels:
-            # an even turn has no more energy than a rest: no need to wait where wheels tell
+            # an even turn has no more energy than a rest: nothing is held back while wheels move
             self._move(WINDOW)
         self._hold(part)
         if self._open.duration >= self._held.duration + _STEP:

@@ -68,7 +68,8 @@ class Parameter:
         several = isinstance(self.default, Sequence) and not isinstance(self.default, str)
         wanted: type = list if several else type(self.default)
         texts = value if isinstance(value, list) else [value]
-        if type(value) is not wanted or several and not all(isinstance(each, str) for each in texts):
+        if (type(value) is not wanted
+                or several and not all(isinstance(each, str) for each in texts)):
             self._refuse(value, self.allowed or f'{_WORDS[wanted]}, for example {self.default!r}')
         if any('\0' in each for each in texts if isinstance(each, str)):
             self._refuse(value, 'without a zero byte')

@@ -95,8 +95,8 @@ class Output(NamedTuple):
     """
     A corrected sample: stamp, ns, heading, rad, rate, rad/s, and their variances.
 
-    Where the noise of the gyro is not known, the variance of the heading is that of a quantity that
-    is not measured, and that of the rate holds the assumed bias.
+    Where the noise of the gyro is not known, the variance of the heading is that of a quantity
+    that is not measured, and that of the rate holds the assumed bias.
 
     """
 
@@ -402,7 +402,8 @@ class Pipeline:
         predecessor for up to 20 s.
 
         """
-        if not 2.0 * (stamp - self._newest) > NSEC_PER_SEC * self.estimator.tracker.intervals.usual:
+        if not (2.0 * (stamp - self._newest)
+                > NSEC_PER_SEC * self.estimator.tracker.intervals.usual):
             self._switches += 1
         if self._switches > 1:
             self._refuse_all(self.several)
