@@ -82,7 +82,8 @@ class Calibration:
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 standard deviations hold 95 %."""
         used = take(self.dwells, self.scatter.kept)
-        covariance = self._uncertainty(columns_of(used, self.terms)).covariance() if self.freedom else None
+        columns, residual = _forward(used, self.terms)
+        covariance = self._uncertainty(columns, residual).covariance() if self.freedom else None
         return _model(used, self.terms, covariance)
 
     def chance_of(self, effect: Effect) -> float:
@@ -94,11 +95,11 @@ class Calibration:
         others = [each for each in self.terms if each is not term]
         # What it adds as a whole, not its derivative by a shape: near nothing, that of a sine's is nothing too.
         columns = [*columns_of(used, others).T, term.error(channels_of(used))] if others else [term.error(channels_of(used))]
-        below = float(self._uncertainty(np.column_stack(columns)).below(-1.0)[-1])
+        below = float(self._uncertainty(np.column_stack(columns), self.residual[self.scatter.kept]).below(-1.0)[-1])
         return 2.0 * min(below, 1.0 - below)
 
-    def _uncertainty(self, columns: Array) -> Uncertainty:
-        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns, self.residual[self.scatter.kept])
+    def _uncertainty(self, columns: Array, residual: Array) -> Uncertainty:
+        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns, residual)
 
     @property
     def folded_beyond(self) -> float | None:
@@ -188,6 +189,26 @@ def columns_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
     """Return what the error changes by for each fitted value, shape (n, m)."""
     channels = channels_of(dwells)
     return np.column_stack([row for term in terms for row in term.sensitivity(channels)])
+
+
+def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
+    """
+    Return what the output at the reference rate changes by for each fitted value, shape (n, m), and output less that of the model.
+
+    The polynomial looks at the output. With the measured one among the columns, a scale factor error of -1 would make every residual
+    nothing, whatever sweeps share, and the likelihood of a large scatter of their scale would win: the Jacobian of output against error
+    is missing there. Here columns and residual are those of the output, at what the model expects of it: ``Δoutput = Δerror / (1 - g)``
+    with ``g`` the slope of the error over the output.
+
+    """
+    model, channels = GyroModel(tuple(terms)), channels_of(dwells)
+    if not model.looks_at('output'):
+        return columns_of(dwells, terms), error_of(dwells, terms)
+    expected, step = model.output_in(channels), 1e-5
+    below, here, above = (channels.moving(channels.rate, expected + change) for change in (-step, 0.0, step))
+    slope = (model.error(above) - model.error(below)) / (2.0 * step)
+    columns = np.column_stack([row for term in terms for row in term.sensitivity(here)])
+    return columns / np.maximum(1.0 - slope, 0.1)[:, None], dwells.output - expected
 
 
 def _search(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:

@@ -12,7 +12,7 @@ from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
 from gyro_calibration.calibration import EffectsNotParted, binned, channels_of, fit_effects
-from gyro_calibration.dwells import Dwells, take
+from gyro_calibration.dwells import Dwells, from_table, take
 from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -24,7 +24,7 @@ from gyro_calibration.effects import (
     polynomial_to_matrix,
     rate_temperature_polynomial,
 )
-from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.log import DEGREE, DataRefused, read_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import Scatter, Whitener, _restricted_likelihood, _surface, find_scatter
 
@@ -269,3 +269,25 @@ def test_a_polynomial_of_too_high_an_order_is_refused_in_a_whole_sentence():
 def test_fewer_dwells_than_values_are_refused():
     with pytest.raises(DataRefused, match='2 dwells do not determine 9 values; add dwells, or fit fewer'):
         fit_effects(dwells([0.0, 1.0], 0.0, np.array([20.0, 40.0])), list(STEADY.values()))
+
+
+# a polynomial of the output
+
+def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
+    """On this table 0.1.0 stated 46 deg/s for t0w1 = 0.097 deg/s, beside a residual of 0.045 deg/s."""
+    fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')), [rate_temperature_polynomial(3, 2)])
+    assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms
+
+
+def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
+    intervals = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'polynomial_intervals.py'))
+    held = []
+    for seed in range(10):
+        table, output = intervals['table'](np.random.default_rng(seed))
+        model = fit_effects(table, [rate_temperature_polynomial(3, 2)]).model
+        at = channels_of(table).moving(table.rate, output)
+        rows = np.array(model.terms[0].sensitivity(at))
+        off = model.error(at) - (output - table.rate)
+        held.append(np.abs(off) < 1.96 * np.sqrt(np.einsum('ik,ij,jk->k', rows, model.covariance, rows)))
+    # errors at the rates of one table go together: 10 tables of 12 values each show the share to 0.02
+    assert np.mean(held) > 0.95 - 4.0 * 0.02

@@ -1,8 +1,6 @@
 """Calibration against a course over ground: late, smoothed, lost, and at times far off."""
 
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import pytest
 from gyro_calibration.encoder import calibrate_encoder
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
 
-DATA = Path(os.environ.get('GYRO_CALIBRATION_DATA', '')) / 'wheeled_drives'
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 
 
@@ -72,10 +69,9 @@ def test_another_drives_gyro_is_refused():
         )
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason='GYRO_CALIBRATION_DATA has no wheeled_drives')
 @pytest.mark.parametrize('name', ['wid_03', 'wid_07', 'rc_car_j_unit3'])
-def test_recorded_drives_are_answered(name):
-    fit = calibrate_encoder(read_log(DATA / f'{name}.csv.gz')).fit
+def test_recorded_drives_are_answered(data, name):
+    fit = calibrate_encoder(read_log(data / 'wheeled_drives' / f'{name}.csv.gz')).fit
     bias = {'wid_03': 0.0, 'wid_07': 0.0, 'rc_car_j_unit3': -0.20 * DEGREE}[name]
     assert fit.bias == pytest.approx(bias, abs=0.03 * DEGREE)
     assert abs(fit.scale_factor_error) < 0.02
