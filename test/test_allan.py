@@ -354,3 +354,17 @@ def test_the_verb_names_the_file_that_it_refuses(tmp_path, capsys):
     path.write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},{i % 7}\n' for i in range(50)))
     assert main(['allan', str(path)]) == 1
     assert 'short.csv: 50 samples' in capsys.readouterr().err
+
+
+def test_what_comes_before_and_after_is_left_out(tmp_path, capsys):
+    """A warm-up of 1 deg/s in the first 300 s would be a rate random walk."""
+    time, generator = np.arange(60000) * 0.05, np.random.default_rng(8)
+    output = 0.1 * generator.standard_normal(len(time)) + np.exp(-time / 60.0)
+    log = tmp_path / 'warm.csv'
+    np.savetxt(log, np.column_stack([time, output]), header='time_s,gyro_dps', delimiter=',', comments='', fmt='%.5f')
+    assert main(['allan', str(log), '--from', '900', '--to', '2800', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['samples'] == 38001 and not found['rate_random_walk']['seen']
+    assert found['angle_random_walk']['value'] == pytest.approx(0.1 * math.sqrt(0.05) * math.pi / 180.0, rel=0.03)
+    assert main(['allan', str(log), '--from', '4000']) == 1
+    assert '--from 4000' in capsys.readouterr().err
