@@ -10,20 +10,41 @@ from typing import Any
 
 import numpy as np
 
-from gyro_calibration.allan import AllanChart, Figure, NoiseFit, Record, allan_deviation, even_record, fit_noise
-from gyro_calibration.cli.verb import Answer, UsageError, add_log, bar, output_of, picture_file, read, time_of, verb, with_origin
+from gyro_calibration.allan import (
+    AllanChart,
+    Figure,
+    NoiseFit,
+    Record,
+    allan_deviation,
+    even_record,
+    fit_noise,
+)
+from gyro_calibration.cli.verb import (
+    Answer,
+    UsageError,
+    add_log,
+    bar,
+    output_of,
+    picture_file,
+    read,
+    time_of,
+    verb,
+    with_origin,
+)
 from gyro_calibration.log import DEGREE, DataRefused
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.picture import draw_allan
 
 #: Symbol -> unit that people use, and how many of it are one in SI.
-UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE), 'K': ('deg/h/√h', 216000.0 / DEGREE),
-         'Q': ('arcsec', 3600.0 / DEGREE), 'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
+UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),
+         'K': ('deg/h/√h', 216000.0 / DEGREE), 'Q': ('arcsec', 3600.0 / DEGREE),
+         'R': ('deg/h/h', 3600.0 ** 2 / DEGREE)}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'allan', _allan, 'find the noise figures of a gyro in a record at rest, by its Allan deviation',
+    parser = verb(verbs, 'allan', _allan,
+                  'find the noise figures of a gyro in a record at rest, by its Allan deviation',
                   'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
     add_log(parser)
     parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the chart, .png or .svg')
@@ -49,7 +70,9 @@ def _allan(given: argparse.Namespace) -> Answer:
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
     if given.picture:
-        draw_allan(given.picture, chart, fit, {symbol: _named(symbol, figure) for symbol, figure in fit.figures.items() if figure.value})
+        draw_allan(given.picture, chart, fit, {
+            symbol: _named(symbol, figure) for symbol, figure in fit.figures.items()
+            if figure.value})
     if given.out:
         write_model(given.out, replace(with_origin(given, model), noise=fit.noise))
     return Answer('\n'.join(_lines(given, record, chart, fit)), _data(given, record, chart, fit))
@@ -58,25 +81,33 @@ def _allan(given: argparse.Namespace) -> Answer:
 def _check(given: argparse.Namespace) -> None:
     """Refuse what cannot work before the work is done."""
     if given.model and not given.out:
-        raise UsageError('--model says which model the figures are put in; say with --out where to write it')
+        raise UsageError('--model says which model the figures are put in; '
+                         'say with --out where to write it')
 
 
-def _lines(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
+def _lines(given: argparse.Namespace, record: Record, chart: AllanChart,
+           fit: NoiseFit) -> list[str]:
     lost = int(np.isnan(record.rate).sum())
     lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
              f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks]
-    lines += [_said_of_floor(chart, fit), *(_line(symbol, figure) for symbol, figure in fit.figures.items()), _said_of_fit(fit)]
+    lines += [_said_of_floor(chart, fit),
+              *(_line(symbol, figure) for symbol, figure in fit.figures.items()),
+              _said_of_fit(fit)]
     if given.out:
-        lines.append('The model gets the flicker as its bias instability, for it adds N and K to it.')
+        lines.append('The model gets the flicker as its bias instability, '
+                     'for it adds N and K to it.')
     return lines + [f'Written to {each}.' for each in (given.picture, given.out) if each]
 
 
 def _line(symbol: str, figure: Figure) -> str:
     unit, factor = UNITS[symbol]
-    name = 'Flicker, in a fit of all parts together' if symbol == 'B' else f'{_words(figure).capitalize()} {symbol}'
+    name = ('Flicker, in a fit of all parts together' if symbol == 'B'
+            else f'{_words(figure).capitalize()} {symbol}')
     if not figure.value:
-        return f'{name}: not seen; below {figure.upper * factor:.3g} {unit} ({figure.upper:.3g} {figure.part.unit}).'
-    return (f'{name}: {figure.value * factor:.4g} {unit}, 95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
+        return (f'{name}: not seen; below {figure.upper * factor:.3g} {unit} '
+                f'({figure.upper:.3g} {figure.part.unit}).')
+    return (f'{name}: {figure.value * factor:.4g} {unit}, '
+            f'95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
             f'({figure.value:.4g} {figure.part.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
 
 
@@ -93,12 +124,14 @@ def _said_of_floor(chart: AllanChart, fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
     floor = chart.floor
     value, lower, upper = floor.bias_instability
-    where = f'the lowest Allan deviation, {floor.deviation * factor:.4g} {unit} at {floor.time:.4g} s, over 0.664'
+    where = (f'the lowest Allan deviation, {floor.deviation * factor:.4g} {unit} '
+             f'at {floor.time:.4g} s, over 0.664')
     if fit.floor_reached:
-        return (f'Bias instability B: {value * factor:.4g} {unit}, 95 %: {lower * factor:.4g} to {upper * factor:.4g} ({value:.4g} rad/s): '
-                f'{where}.')
-    return (f'Bias instability B: below {upper * factor:.4g} {unit} ({upper:.3g} rad/s): {where}, and the deviation still falls at the end '
-            'of the chart; record longer to reach the floor.')
+        return (f'Bias instability B: {value * factor:.4g} {unit}, 95 %: {lower * factor:.4g} '
+                f'to {upper * factor:.4g} ({value:.4g} rad/s): {where}.')
+    return (f'Bias instability B: below {upper * factor:.4g} {unit} ({upper:.3g} rad/s): {where}, '
+            'and the deviation still falls at the end of the chart; '
+            'record longer to reach the floor.')
 
 
 def _said_of_fit(fit: NoiseFit) -> str:
@@ -106,23 +139,31 @@ def _said_of_fit(fit: NoiseFit) -> str:
     if fit.shortest > fit.chart.time[0]:
         text += '; shorter ones are bent by the filters of the gyro, or by what it picks up'
     if fit.misfit:
-        text += f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation unexplained, which the intervals allow for'
+        text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
+                 'unexplained, which the intervals allow for')
     if fit.rivals:
         others = ' or '.join(' + '.join(rival) for rival in fit.rivals)
         text += f'; {others} would describe them nearly as well, and a longer record would tell'
     return f'{text}.'
 
 
-def _data(given: argparse.Namespace, record: Record, chart: AllanChart, fit: NoiseFit) -> dict[str, Any]:
+def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
+          fit: NoiseFit) -> dict[str, Any]:
     value, lower, upper = chart.floor.bias_instability
-    figures = {figure.part.name: {'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
-                                  'upper': figure.upper, 'seen': bool(figure.value),
-                                  'standard_deviation': None if math.isnan(figure.standard_deviation) else figure.standard_deviation}
-               for symbol, figure in fit.figures.items()}
-    columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower, 'upper': chart.upper,
-               'degrees_of_freedom': chart.degrees_of_freedom, 'differences': chart.differences, 'fit': fit.deviation(chart.time)}
-    return {'samples': len(record.rate), 'interval_s': record.interval, 'remarks': list(record.remarks), **figures,
-            'bias_instability': {'symbol': 'B', 'unit': 'rad/s', 'value': value, 'lower': lower, 'upper': upper, 'seen': fit.floor_reached},
+    figures = {figure.part.name: {
+        'symbol': symbol, 'unit': figure.part.unit, 'value': figure.value, 'lower': figure.lower,
+        'upper': figure.upper, 'seen': bool(figure.value),
+        'standard_deviation': None if math.isnan(figure.standard_deviation)
+        else figure.standard_deviation} for symbol, figure in fit.figures.items()}
+    columns = {'time_s': chart.time, 'deviation': chart.deviation, 'lower': chart.lower,
+               'upper': chart.upper, 'degrees_of_freedom': chart.degrees_of_freedom,
+               'differences': chart.differences, 'fit': fit.deviation(chart.time)}
+    return {'samples': len(record.rate), 'interval_s': record.interval,
+            'remarks': list(record.remarks), **figures,
+            'bias_instability': {'symbol': 'B', 'unit': 'rad/s', 'value': value, 'lower': lower,
+                                 'upper': upper, 'seen': fit.floor_reached},
             'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
-            'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit, 'rivals': list(fit.rivals),
-            'chart': {name: values.tolist() for name, values in columns.items()}, 'picture': given.picture, 'out': given.out}
+            'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
+            'rivals': list(fit.rivals),
+            'chart': {name: values.tolist() for name, values in columns.items()},
+            'picture': given.picture, 'out': given.out}

@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.assumptions import Assumptions, assumed
-from gyro_calibration.cli.verb import Answer, UsageError, add_log, not_negative, output_of, read, read_blocks, verb
+from gyro_calibration.cli.verb import (
+    Answer,
+    UsageError,
+    add_log,
+    not_negative,
+    output_of,
+    read,
+    read_blocks,
+    verb,
+)
 from gyro_calibration.compensation import Compensated, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.gaps import Intervals
 from gyro_calibration.heading import BlockIntegrator, Threshold
@@ -23,33 +32,40 @@ from gyro_calibration.tracking import Settings, Track, track
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'compensate', _compensate, 'add compensated rates, and for samples in time the heading, to a log',
+    parser = verb(verbs, 'compensate', _compensate,
+                  'add compensated rates, and for samples in time the heading, to a log',
                    'drive.csv --model model.yaml --out compensated.csv')
     add_log(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
     parser.add_argument('--threshold', type=not_negative, default=0.0, metavar='DPS',
-                        help='a robot that turns slower stands, as 0.3 in the node; default: 0, off')
-    parser.add_argument('--window', type=not_negative, default=0.2, metavar='S', help='of the threshold filter; 0 is single samples')
-    parser.add_argument('--rest', action='store_true',
-                        help='look for rests, as the node does: the heading stands there, and the bias is learned')
-    parser.add_argument('--hindsight', action='store_true', help='alike, and let all that came later speak too')
+                        help='a robot that turns slower stands, as 0.3 in the node; '
+                        'default: 0, off')
+    parser.add_argument('--window', type=not_negative, default=0.2, metavar='S',
+                        help='of the threshold filter; 0 is single samples')
+    parser.add_argument('--rest', action='store_true', help='look for rests, as the node does: '
+                        'the heading stands there, and the bias is learned')
+    parser.add_argument('--hindsight', action='store_true',
+                        help='alike, and let all that came later speak too')
     return parser
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Found()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
-        raise UsageError('--rest and --hindsight go without --threshold, and with an angle random walk in the model, which allan finds')
+        raise UsageError('--rest and --hindsight go without --threshold, and with an angle '
+                         'random walk in the model, which allan finds')
     write_log_blocks(given.out, _compensated(given, model, found))
     return _answer(given, model, found)
 
 
-#: What else effects may look at: quantity of a log -> channel, and what is said where the log lacks it.
+#: Other inputs of effects: quantity of a log -> channel, and the sentence where the log lacks it.
 _WORDS = {
-    'specific_force': ('specific_force', 'The log holds no specific force: it was taken for zero.'),
+    'specific_force': ('specific_force',
+                       'The log holds no specific force: it was taken for zero.'),
     'supply': ('supply', 'The log holds no supply voltage: its effect was left out.'),
-    'reference_heading': ('heading', 'The log holds no reference heading: the one found here was taken, from zero on.'),
+    'reference_heading': ('heading', 'The log holds no reference heading: '
+                          'the one found here was taken, from zero on.'),
 }
 
 
@@ -81,12 +97,13 @@ class _Found:
         self.temperature_known = log.temperature is not None
         self.unknown = tuple(quantity for quantity in _WORDS if getattr(log, quantity) is None)
         if len(columns.get('heading_rad', ())):
-            self.heading, self.deviation = (float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
+            self.heading, self.deviation = (
+                float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """A block of a log, the rows with a plausible output, the new columns there, and the intervals of the samples so far."""
+    """A block of a log, its plausible rows, their new columns, and the intervals so far."""
 
     log: Log
     known: Mask
@@ -94,7 +111,8 @@ class _Piece:
     intervals: Intervals
 
 
-def _compensated(given: argparse.Namespace, model: GyroModel, found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
+def _compensated(given: argparse.Namespace, model: GyroModel,
+                 found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and count what is found in it."""
     pieces = _followed(given, model) if given.rest or given.hindsight else _pieces(given, model)
     for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
@@ -114,21 +132,28 @@ def _refuse_infinite(given: argparse.Namespace, piece: _Piece) -> None:
             row = int(np.argmin(finite))
             output = float(np.asarray(piece.log.output)[piece.known][row])
             at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
-            raise DataRefused(f'{given.log}: {name} is no finite number from an output of {output:g} rad/s{at} on; remove the sample if no '
-                              'gyro says that, or see whether columns, units and the model are right')
+            raise DataRefused(
+                f'{given.log}: {name} is no finite number from an output of {output:g} rad/s{at} '
+                'on; remove the sample if no gyro says that, or see whether columns, units and '
+                'the model are right')
 
 
 def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
     threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
-    integrator, compensation = BlockIntegrator(threshold, model.noise, covariance(model)), LogCompensation(model)
+    integrator, compensation = (BlockIntegrator(threshold, model.noise, covariance(model)),
+                                LogCompensation(model))
     variance: float | None = None
     for log in read_blocks(given):
         log = replace(log, output=output_of(given, log))
         known = plausible(model, log)
         if variance is None:
-            # A rate is as noisy as its samples are close. All have the interval of the first block, for a lost sample calms no gyro.
-            variance = 0.0 if log.time is None else model.noise.rate_variance(_interval(log.time, known))
-        yield _Piece(log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)), integrator.intervals)
+            # The noise of a rate depends on the interval between samples. All rates have the
+            # interval of the first block, since a lost sample makes no gyro less noisy.
+            variance = (0.0 if log.time is None
+                        else model.noise.rate_variance(_interval(log.time, known)))
+        yield _Piece(
+            log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)),
+            integrator.intervals)
 
 
 def _interval(time: Array, known: Mask) -> float:
@@ -142,49 +167,63 @@ def _followed(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
     log = replace(log, output=output_of(given, log))
     known, supposed = plausible(model, log), assumed(model, Assumptions())
     if log.time is None or known.sum() < 2:
-        raise DataRefused(f'{given.log}: rests show in samples over time; give a log with time_s, or say --rate')
+        raise DataRefused(f'{given.log}: rests show in samples over time; '
+                          'give a log with time_s, or say --rate')
     rows, compensation = rows_of(log, known), LogCompensation(supposed)
     result, sensitivity = compensation.add(rows)
-    tracked = _tracked(given, supposed, rows, compensation.true_time(np.asarray(rows.time)), result, sensitivity)
+    tracked = _tracked(given, supposed, rows, compensation.true_time(np.asarray(rows.time)),
+                       result, sensitivity)
     yield _Piece(log, known, {
-        'rate_rad_s': tracked.rate, 'heading_rad': tracked.heading, 'heading_std_rad': np.sqrt(tracked.variance),
-        'rate_std_rad_s': np.sqrt(tracked.rate_variance), 'resting': tracked.resting.astype(float),
-        'temperature_clipped': result.temperature_clipped, 'beyond_range': result.beyond_range}, tracked.intervals)
+        'rate_rad_s': tracked.rate, 'heading_rad': tracked.heading,
+        'heading_std_rad': np.sqrt(tracked.variance),
+        'rate_std_rad_s': np.sqrt(tracked.rate_variance),
+        'resting': tracked.resting.astype(float),
+        'temperature_clipped': result.temperature_clipped,
+        'beyond_range': result.beyond_range}, tracked.intervals)
 
 
-def _tracked(given: argparse.Namespace, model: GyroModel, log: Log, time: Array, result: Compensated, sensitivity: Array) -> Track:
-    """Return the heading of a log from rest to rest; the column `moving` tells what the wheels did."""
-    wheels: list[bool | None] | None = None if log.moving is None else [bool(moving) for moving in log.moving]
+def _tracked(given: argparse.Namespace, model: GyroModel, log: Log, time: Array,
+             result: Compensated, sensitivity: Array) -> Track:
+    """Return the heading of a log from rest to rest; `moving` is the state of the wheels."""
+    wheels: list[bool | None] | None = (None if log.moving is None
+                                        else [bool(moving) for moving in log.moving])
     middle = float(np.median(np.asarray(log.output))), 0.0, float(np.median(result.temperature))
     still = None if model.looks_around else rate_sensitivity(model, *middle)
-    return track(time, np.asarray(result.rate), sensitivity, model.noise, covariance(model), Settings(), wheels, given.hindsight,
-                 0.0 if model.self_calibration else None, still)
+    return track(time, np.asarray(result.rate), sensitivity, model.noise, covariance(model),
+                 Settings(), wheels, given.hindsight, 0.0 if model.self_calibration else None,
+                 still)
 
 
-def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator, variance: float, log: Log) -> dict[str, Array]:
+def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator,
+             variance: float, log: Log) -> dict[str, Array]:
     result, sensitivity = compensation.add(log)
     columns = {'rate_rad_s': result.rate}
     if log.time is not None:
         time = compensation.true_time(log.time) if model.moves_stamps else log.time
-        columns['rate_rad_s'], columns['heading_rad'], columns['heading_std_rad'] = integrator.add(time, result.rate, sensitivity)
+        (columns['rate_rad_s'], columns['heading_rad'],
+         columns['heading_std_rad']) = integrator.add(time, result.rate, sensitivity)
         if model.moves_stamps:
             columns[_TRUE_TIME] = time
     columns['rate_std_rad_s'] = np.sqrt(variance + quadratic_form(covariance(model), sensitivity))
-    columns['temperature_clipped'], columns['beyond_range'] = result.temperature_clipped, result.beyond_range
+    columns['temperature_clipped'], columns['beyond_range'] = (result.temperature_clipped,
+                                                               result.beyond_range)
     return columns
 
 
-#: When samples were taken, where a model moves stamps; what belongs to these times is interpolated at the stamps of the rows.
-_TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad', 'rate_std_rad_s')
+#: When samples were taken, where a model moves stamps, and the columns of these times, which are
+#: interpolated at the stamps of the rows.
+_TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad',
+                                   'rate_std_rad_s')
 
 
 def _on_stamps(pieces: Iterator[_Piece]) -> Iterator[_Piece]:
-    """Bring what belongs to moved stamps back to the rows, so that it stands beside the reference of its time; blocks beside help."""
+    """Bring columns of moved stamps back to the stamps of the rows; the blocks beside help."""
     before: _Piece | None = None
     here = next(pieces, None)
     while here is not None:
         after = next(pieces, None)
-        around = [each.columns for each in (before, here, after) if each is not None and _TRUE_TIME in each.columns]
+        around = [each.columns for each in (before, here, after)
+                  if each is not None and _TRUE_TIME in each.columns]
         yield _brought(here, around) if around else here
         before, here = here, after
 
@@ -192,9 +231,11 @@ def _on_stamps(pieces: Iterator[_Piece]) -> Iterator[_Piece]:
 def _brought(piece: _Piece, around: list[dict[str, Array]]) -> _Piece:
     assert piece.log.time is not None
     true = np.concatenate([columns[_TRUE_TIME] for columns in around])
-    stamps, columns = piece.log.time[piece.known], {name: values for name, values in piece.columns.items() if name != _TRUE_TIME}
+    stamps, columns = piece.log.time[piece.known], {
+        name: values for name, values in piece.columns.items() if name != _TRUE_TIME}
     if len(true):
-        columns.update({name: np.interp(stamps, true, np.concatenate([each[name] for each in around])) for name in _MOVED})
+        columns.update({name: np.interp(
+            stamps, true, np.concatenate([each[name] for each in around])) for name in _MOVED})
     return replace(piece, columns=columns)
 
 
@@ -216,15 +257,23 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
         known = '' if sure is None else f' +- {sure / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if not found.temperature_known:
-        lines.append('The log holds no temperature: the model was used at its reference temperature.')
-    lines += [words for quantity, (channel, words) in _WORDS.items() if quantity in found.unknown and model.looks_at(channel)]
-    lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms if term.effect.undone]
-    for name, words in (('rows_without_output', 'rows have no output of the gyro; the heading is integrated across them.'),
-                        ('refused_samples', 'rows are not used: no such gyro reports that rate or temperature; they count as lost.'),
-                        ('lost_samples', 'samples are lost; the heading goes on over the true intervals, and the deviation allows for it.'),
-                        ('temperature_clipped', 'rows are outside the calibrated temperatures; the nearest end was used.'),
-                        ('beyond_range', 'rows are beyond the calibrated rates; the correction is extrapolated, or held where no rate '
-                         'explains the output.')):
+        lines.append('The log holds no temperature: '
+                     'the model was used at its reference temperature.')
+    lines += [words for quantity, (channel, words) in _WORDS.items()
+              if quantity in found.unknown and model.looks_at(channel)]
+    lines += [f'{term.effect.name}: {term.effect.undone}' for term in model.terms
+              if term.effect.undone]
+    for name, words in (
+            ('rows_without_output',
+             'rows have no output of the gyro; the heading is integrated across them.'),
+            ('refused_samples', 'rows are not used: no such gyro reports that rate or '
+             'temperature; they count as lost.'),
+            ('lost_samples', 'samples are lost; the heading goes on over the true intervals, '
+             'and the deviation allows for it.'),
+            ('temperature_clipped',
+             'rows are outside the calibrated temperatures; the nearest end was used.'),
+            ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
+             'extrapolated, or held where no rate explains the output.')):
         if data[name]:
             lines.append(f'{data[name]} {words}')
     return Answer('\n'.join(lines), data)

@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from gyro_calibration.cli.verb import Answer, UsageError, add_log, origin_of, output_of, read, verb, whole
+from gyro_calibration.cli.verb import (
+    Answer,
+    UsageError,
+    add_log,
+    origin_of,
+    output_of,
+    read,
+    verb,
+    whole,
+)
 from gyro_calibration.diagnosis.extension import calibrated
 from gyro_calibration.diagnosis.finding import Diagnosis
 from gyro_calibration.diagnosis.report import report
@@ -29,13 +38,16 @@ _STEPS = 6
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'diagnose', _diagnose, 'say what a simulation gets wrong, name the cause, extend the model, measure the gain',
+    parser = verb(verbs, 'diagnose', _diagnose, 'say what a simulation gets wrong, name the '
+                  'cause, extend the model, measure the gain',
                   'drive.csv --model gyro.yaml --out diagnosis')
     add_log(parser, nargs='+')
-    parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an ideal gyro with the bias and scale factor '
-                        'error that fit the logs best')
-    parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and model.yaml, the extended model')
-    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='of what is drawn to learn what chance shows; default: 0')
+    parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
+                        'ideal gyro with the bias and scale factor error that fit the logs best')
+    parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
+                        'model.yaml, the extended model')
+    parser.add_argument('--seed', type=whole, default=0, metavar='N',
+                        help='of what is drawn to learn what chance shows; default: 0')
     return parser
 
 
@@ -59,7 +71,8 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
     generator = np.random.default_rng(given.seed)
     if any(log.time is None for log in logs):
         if len(logs) > 1:
-            raise UsageError(f'{len(logs)} logs, and one without time_s; give rate tables one by one, or say with --rate how samples came')
+            raise UsageError(f'{len(logs)} logs, and one without time_s; give rate tables one by '
+                             'one, or say with --rate how samples came')
         found = diagnose_table(logs[0], None if model is None else calibrated(model))
     else:
         with tqdm(total=_STEPS, desc='diagnose', delay=2.0, leave=False, disable=None) as bar:
@@ -71,19 +84,21 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
 
 
 def _with_origin(found: Diagnosis, model: GyroModel | None) -> Diagnosis:
-    """Return a diagnosis whose model says what it comes from; one that was given and is not extended stays as it is."""
+    """Return a diagnosis whose model has an origin; a given model not extended keeps its own."""
     if model is not None and not offered(found):
         return replace(found, before=model, model=model)
-    return replace(found, model=replace(found.model, origin={**found.model.origin, **origin_of(found.logs)}))
+    return replace(found, model=replace(
+        found.model, origin={**found.model.origin, **origin_of(found.logs)}))
 
 
 def _written(folder: str, found: Diagnosis) -> list[str]:
     """Write all files; what they hold is made before the first of them is touched."""
-    content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n', 'report.html': report(found),
-               'model.yaml': model_text(found.model)}
+    content = {'diagnosis.json': json.dumps(found.figures(), indent=2, allow_nan=False) + '\n',
+               'report.html': report(found), 'model.yaml': model_text(found.model)}
     for name in content:
         if (Path(folder) / name).is_dir():
-            raise IsADirectoryError(f'{Path(folder) / name} is a folder, where a file is to be written; move it away')
+            raise IsADirectoryError(f'{Path(folder) / name} is a folder, where a file is to be '
+                                    'written; move it away')
     for name, text in content.items():
         write_atomically(Path(folder) / name, text.encode())
     return [f'Written to {folder}: {", ".join(content)}.']

@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from gyro_calibration.cli.simulate import add_motion, simulated
-from gyro_calibration.cli.verb import UsageError, add_topics, output_of, positive, read, time_of, verb
+from gyro_calibration.cli.verb import (
+    UsageError,
+    add_topics,
+    output_of,
+    positive,
+    read,
+    time_of,
+    verb,
+)
 from gyro_calibration.driver.emulator import Emulator, emulate
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings, find
 from gyro_calibration.driver.serial_faults import SerialFaults
@@ -23,19 +31,26 @@ from gyro_calibration.log import DEGREE, Array, DataRefused
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'emulate', _emulate, 'be a gyro on a pseudo-terminal, from a model and a motion or from a log; prints its path',
+    parser = verb(verbs, 'emulate', _emulate, 'be a gyro on a pseudo-terminal, from a model and '
+                  'a motion or from a log; prints its path',
                    '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
-    parser.add_argument('--protocol', required=True, metavar='NAME', help=f'one of {", ".join(PROTOCOLS)}')
+    parser.add_argument('--protocol', required=True, metavar='NAME',
+                        help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument('--log', metavar='LOG', help='send a recording')
     source.add_argument('--model', metavar='MODEL.yaml', help='send what a simulated gyro says')
     add_motion(parser, default='rest')
-    parser.add_argument('--rate', type=positive, metavar='HZ', help='the log was taken at this rate; for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count of the wire format; default: its own')
-    parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc', help='of the protocol csv; default: %(default)s')
-    parser.add_argument('--link', metavar='PATH', help='a link to the pseudo-terminal, whose own name changes')
+    parser.add_argument('--rate', type=positive, metavar='HZ', help='the log was taken at this '
+                        'rate; for logs without a usable time_s')
+    parser.add_argument('--sensitivity', type=positive, metavar='DPS',
+                        help='deg/s a count of the wire format; default: its own')
+    parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
+                        help='of the protocol csv; default: %(default)s')
+    parser.add_argument('--link', metavar='PATH',
+                        help='a link to the pseudo-terminal, whose own name changes')
     parser.add_argument('--speed', type=positive, default=1.0, help='times real time; default: 1')
-    parser.add_argument('--wait', action='store_true', help='begin when a program has opened the port')
+    parser.add_argument('--wait', action='store_true',
+                        help='begin when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='begin again at the end')
     add_topics(parser)
     _add_line(parser)
@@ -44,14 +59,20 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _add_line(parser: argparse.ArgumentParser) -> None:
-    line = parser.add_argument_group('a bad line', 'P is a probability from 0 to 1; --seed says what it strikes')
-    line.add_argument('--lose-samples', type=float, default=0.0, metavar='P', help='a sample is never sent')
-    line.add_argument('--invalid-samples', type=float, default=0.0, metavar='P', help='the gyro does not stand by a sample')
+    line = parser.add_argument_group(
+        'a bad line', 'P is a probability from 0 to 1; --seed says what it strikes')
+    line.add_argument('--lose-samples', type=float, default=0.0, metavar='P',
+                      help='a sample is never sent')
+    line.add_argument('--invalid-samples', type=float, default=0.0, metavar='P',
+                      help='the gyro does not stand by a sample')
     line.add_argument('--lose', type=float, default=0.0, metavar='P', help='a byte is lost')
     line.add_argument('--double', type=float, default=0.0, metavar='P', help='a byte comes twice')
-    line.add_argument('--flip', type=float, default=0.0, metavar='P', help='a bit of a byte is flipped')
-    line.add_argument('--burst', type=float, default=0.0, metavar='MS', help='bytes come together each so many ms; USB adapters: 16')
-    line.add_argument('--piece', type=int, default=0, metavar='BYTES', help='bytes come in pieces of so many, at the pace of the line')
+    line.add_argument('--flip', type=float, default=0.0, metavar='P',
+                      help='a bit of a byte is flipped')
+    line.add_argument('--burst', type=float, default=0.0, metavar='MS',
+                      help='bytes come together each so many ms; USB adapters: 16')
+    line.add_argument('--piece', type=int, default=0, metavar='BYTES',
+                      help='bytes come in pieces of so many, at the pace of the line')
 
 
 def _emulate(given: argparse.Namespace) -> None:
@@ -60,17 +81,21 @@ def _emulate(given: argparse.Namespace) -> None:
     log = read(given) if given.log else simulated(given)[0]
     time, output = time_of(given, log), output_of(given, log)
     if np.isfinite(output).sum() < 2:
-        raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples have an output; send a log with two or more')
+        raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
+                          'have an output; send a log with two or more')
     samples = _samples(time, output, log.temperature, given.repeat)
     generator = np.random.default_rng(secrets.randbits(32) if given.seed is None else given.seed)
-    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults, generator)
+    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults,
+                        generator)
     _handle_signals(lambda *_: emulator.stop())
     def answer(path: str) -> None:
-        print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json else plain(path), flush=True)
+        print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
+              else plain(path), flush=True)
     try:
         emulate(emulator, answer)
     finally:
-        _handle_signals(signal.SIG_IGN)  # launch sends a second one, which must not hit a program that is about to end
+        # launch sends a second signal, which must not interrupt a program that is about to end
+        _handle_signals(signal.SIG_IGN)
 
 
 def _handle_signals(handler: Any) -> None:
@@ -81,7 +106,8 @@ def _handle_signals(handler: Any) -> None:
 def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
     try:
-        protocol, settings = find(given.protocol), Settings(sensitivity=sensitivity, columns=tuple(given.columns.split(',')))
+        protocol, settings = find(given.protocol), Settings(
+            sensitivity=sensitivity, columns=tuple(given.columns.split(',')))
         protocol.check(settings)
     except ValueError as error:
         raise UsageError(str(error)) from None
@@ -96,11 +122,14 @@ def _faults(given: argparse.Namespace) -> SerialFaults:
         raise UsageError(str(error)) from None
 
 
-def _samples(time: Array, output: Array, temperature: Array | None, again: bool) -> Iterator[Sample]:
-    """Give the samples of a log that have an output, and all of them again and again where that is wanted."""
+def _samples(time: Array, output: Array, temperature: Array | None,
+             again: bool) -> Iterator[Sample]:
+    """Give the samples of a log that have an output, once or, on request, again and again."""
     known = np.isfinite(output)
     times, outputs = time[known] - time[known][0], output[known].tolist()
     temperatures = repeat(None) if temperature is None else temperature[known].tolist()
     length = float(times[-1] + np.median(np.diff(times)))
-    for start in chain([0.0], (length * number for number in range(1, sys.maxsize if again else 1))):
-        yield from (Sample(output, temperature, start + time) for time, output, temperature in zip(times.tolist(), outputs, temperatures))
+    for start in chain([0.0], (length * number
+                               for number in range(1, sys.maxsize if again else 1))):
+        yield from (Sample(output, temperature, start + time) for time, output, temperature
+                    in zip(times.tolist(), outputs, temperatures))

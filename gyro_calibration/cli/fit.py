@@ -28,7 +28,17 @@ from gyro_calibration.cli.fit_answer import (
     value_data,
     value_lines,
 )
-from gyro_calibration.cli.verb import Answer, UsageError, add_log, bar, origin_of, output_of, picture_file, read, verb
+from gyro_calibration.cli.verb import (
+    Answer,
+    UsageError,
+    add_log,
+    bar,
+    origin_of,
+    output_of,
+    picture_file,
+    read,
+    verb,
+)
 from gyro_calibration.dwells import Dwells, dwells, join, take
 from gyro_calibration.effects import STEADY, Effect, rate_temperature_polynomial
 from gyro_calibration.encoder import EncoderCalibration, calibrate_encoder
@@ -41,7 +51,8 @@ METHODS = ('dwells', 'likelihood', 'course', 'rate')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an encoder, or any log with a reference',
+    parser = verb(verbs, 'fit', _fit, 'calibrate from a rate table, a turntable, an encoder, '
+                  'or any log with a reference',
                   'table.csv --out model.yaml')
     add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
@@ -49,24 +60,28 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         'course: a course over ground, as of satellites; '
                         'rate: the rate of the reference heading, sample by sample. Default: what the log holds')
     what = parser.add_mutually_exclusive_group()
-    what.add_argument('--effects', type=_effects, metavar='NAME,...', help=f'fit these of {", ".join(STEADY)}; default: those that '
-                      'the data support')
+    what.add_argument('--effects', type=_effects, metavar='NAME,...', help='fit these of '
+                      f'{", ".join(STEADY)}; default: those that the data support')
     what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders instead; default: 3,2')
     parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; decides where effects look alike, and what is '
                         'likely where a course over ground leaves it open (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT', help='of the gyro, kept in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='of the gyro, kept in the model')
-    parser.add_argument('--matrix', action='store_true', help='print the polynomial as the matrix C of Ojeda et al., in deg/s and degC')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the errors before and after, .png or .svg')
-    parser.add_argument('--surface', type=picture_file, metavar='FILE', help='draw the error over rate and temperature, .png or .svg')
+    parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
+                        'matrix C of Ojeda et al., in deg/s and degC')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE',
+                        help='draw the errors before and after, .png or .svg')
+    parser.add_argument('--surface', type=picture_file, metavar='FILE',
+                        help='draw the error over rate and temperature, .png or .svg')
     return parser
 
 
 def _effects(text: str) -> list[Effect]:
     unknown = [name for name in text.split(',') if name not in STEADY]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect that fit knows; choose from {", ".join(STEADY)}')
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect that fit knows; '
+                                         f'choose from {", ".join(STEADY)}')
     return [STEADY[name] for name in dict.fromkeys(text.split(','))]
 
 
@@ -76,7 +91,8 @@ def _orders(text: str) -> list[Effect]:
         if not (0 <= rate_order <= 9 and 0 <= temperature_order <= 9):
             raise ValueError
     except ValueError:
-        raise argparse.ArgumentTypeError(f'{text!r} is not two orders from 0 to 9, such as 3,2') from None
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not two orders from 0 to 9, such as 3,2') from None
     return [rate_temperature_polynomial(rate_order, temperature_order)]
 
 
@@ -104,8 +120,10 @@ def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
 
 def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return the model with what it comes from, and write it where that is wanted."""
-    identity = {'name': given.gyro_name, 'serial_number': given.serial_number, 'technology': given.technology}
-    model = replace(model, gyro={name: value for name, value in identity.items() if value}, origin=origin_of(given.log))
+    identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
+                'technology': given.technology}
+    model = replace(model, gyro={name: value for name, value in identity.items() if value},
+                    origin=origin_of(given.log))
     if given.out:
         write_model(given.out, model)
     return model
@@ -116,19 +134,24 @@ def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and not given.polynomial:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
-    table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '') for path, log in logs.items()])
+    table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '')
+                  for path, log in logs.items()])
     effects = given.effects or given.polynomial
-    selection = Selection(fit_effects(table, effects), (), ()) if effects else _selected(table, given.technology)
+    selection = (Selection(fit_effects(table, effects), (), ()) if effects
+                 else _selected(table, given.technology))
     fit = selection.calibration
     model = _written(given, fit.model)
     if given.picture:
         picture.draw_residuals(given.picture, fit)
     if given.surface:
-        picture.draw_error_surface(given.surface, model, model.rate_range, model.temperature_range, take(table, fit.scatter.kept))
+        picture.draw_error_surface(given.surface, model, model.rate_range,
+                                   model.temperature_range, take(table, fit.scatter.kept))
     matrix = matrix_of(model)
-    data = {'out': given.out, 'method': 'dwells', **dwell_data(selection), 'effects': value_data(model), **model_data(model),
-            'matrix_dps': matrix, 'remarks': list(table.remarks)}
-    lines = [*dwell_lines(fit), '', *value_lines(model), '', *quality_lines(fit), '', *bin_lines(fit), *choice_lines(selection)]
+    data = {'out': given.out, 'method': 'dwells', **dwell_data(selection),
+            'effects': value_data(model), **model_data(model), 'matrix_dps': matrix,
+            'remarks': list(table.remarks)}
+    lines = [*dwell_lines(fit), '', *value_lines(model), '', *quality_lines(fit), '',
+             *bin_lines(fit), *choice_lines(selection)]
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
@@ -142,19 +165,21 @@ def _selected(table: Dwells, technology: str | None) -> Selection:
 
 def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if len(logs) > 1:
-        raise UsageError(f'--method {given.method or "likelihood"} takes one log; give the logs one by one, or use --method dwells')
-    if _names(given.effects) - {'bias', 'scale_factor_error'} or given.polynomial or given.surface or given.matrix:
-        raise UsageError('a reference heading gives bias and scale_factor_error; for other effects, --matrix and --surface use '
-                         '--method dwells')
+        raise UsageError(f'--method {given.method or "likelihood"} takes one log; '
+                         'give the logs one by one, or use --method dwells')
+    if (_names(given.effects) - {'bias', 'scale_factor_error'} or given.polynomial
+            or given.surface or given.matrix):
+        raise UsageError('a reference heading gives bias and scale_factor_error; for other '
+                         'effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
     found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)
     if given.picture:
         picture.draw_headings(given.picture, *_headings(log, found))
-    data = {'out': given.out, 'method': found.method, 'effects': value_data(model), **model_data(model), **heading_data(found),
-            'remarks': list(found.remarks)}
-    lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '', *heading_lines(found),
-             *sentences(found.remarks)]
+    data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
+            **model_data(model), **heading_data(found), 'remarks': list(found.remarks)}
+    lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',
+             *heading_lines(found), *sentences(found.remarks)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
 
 
@@ -167,4 +192,5 @@ def _headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, dict[str, 
     assert log.reference_heading is not None
     true = log.reference_heading[np.isfinite(log.reference_heading)]
     true = true - true[0]
-    return found.time, true, {'without calibration': true + found.before.heading, 'calibrated': true + found.after.heading}
+    return found.time, true, {'without calibration': true + found.before.heading,
+                              'calibrated': true + found.after.heading}

@@ -1,4 +1,4 @@
-"""What the verb fit says of a calibration: as data in SI, and in words, in units that people use."""
+"""The answer of the verb fit: as data in SI, and in words, in units that people use."""
 
 from __future__ import annotations
 
@@ -24,17 +24,20 @@ _MUCH_LEFT = 5.0 * DEGREE
 #: Lines for people are not longer.
 _WIDTH = 120
 #: What people read instead of the unit of the file, and the factor to it.
-_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE), 'rad/s/K²': ('deg/s/K²', 1 / DEGREE),
-          's/rad': ('s/deg', DEGREE), 's²/rad²': ('s²/deg²', DEGREE ** 2)}
+_UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
+          'rad/s/K²': ('deg/s/K²', 1 / DEGREE), 's/rad': ('s/deg', DEGREE),
+          's²/rad²': ('s²/deg²', DEGREE ** 2)}
 
 
 # as data
 
 def model_data(model: GyroModel) -> dict[str, Any]:
     """Return what a model holds beside its values."""
-    return {'covariance': None if model.covariance is None else model.covariance.tolist(), 'rate_range_rad_s': list(model.rate_range),
+    return {'covariance': None if model.covariance is None else model.covariance.tolist(),
+            'rate_range_rad_s': list(model.rate_range),
             'temperature_range_degc': [_finite(end) for end in model.temperature_range],
-            'reference_temperature_degc': model.reference_temperature, 'technology': model.gyro.get('technology')}
+            'reference_temperature_degc': model.reference_temperature,
+            'technology': model.gyro.get('technology')}
 
 
 def value_data(model: GyroModel) -> dict[str, dict[str, Any]]:
@@ -44,17 +47,20 @@ def value_data(model: GyroModel) -> dict[str, dict[str, Any]]:
         known = math.isfinite(deviation)
         values.setdefault(effect, {})[parameter.name] = {
             'estimate': value, 'standard_deviation': deviation if known else None,
-            'ci95': [value - 1.96 * deviation, value + 1.96 * deviation] if known else None, 'unit': parameter.unit}
+            'ci95': [value - 1.96 * deviation, value + 1.96 * deviation] if known else None,
+            'unit': parameter.unit}
     return values
 
 
 def _fitted(model: GyroModel) -> Iterator[tuple[str, Parameter, float, float]]:
-    """Give the name of the effect, the parameter, its value and its standard deviation, for each fitted value."""
+    """Give effect name, parameter, value and standard deviation of each fitted value."""
     count = sum(len(term.fitted) for term in model.terms)
-    deviations = iter([math.nan] * count if model.covariance is None else np.sqrt(np.diag(model.covariance)).tolist())
+    deviations = iter([math.nan] * count if model.covariance is None
+                      else np.sqrt(np.diag(model.covariance)).tolist())
     for term in model.terms:
         for place in term.fitted:
-            yield term.effect.name, term.effect.parameters[place], term.values[place], next(deviations)
+            yield (term.effect.name, term.effect.parameters[place], term.values[place],
+                   next(deviations))
 
 
 def dwell_data(selection: Selection) -> dict[str, Any]:
@@ -65,33 +71,38 @@ def dwell_data(selection: Selection) -> dict[str, Any]:
         'dwells': len(table), 'sweeps': len(np.unique(table.sweep)),
         'outlying': [table.place[row] for row in np.flatnonzero(~scatter.kept)],
         'condition': fit.condition, 'folded_beyond_rad_s': fit.folded_beyond,
-        'rms_before_rad_s': fit.before_rms, 'rms_residual_rad_s': fit.residual_rms, 'rms_left_out_rad_s': _finite(fit.left_out_rms),
+        'rms_before_rad_s': fit.before_rms, 'rms_residual_rad_s': fit.residual_rms,
+        'rms_left_out_rad_s': _finite(fit.left_out_rms),
         'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
                     'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
         'choices': [_choice_data(choice) for choice in selection.choices],
         'look_alikes': [_twins_data(twins) for twins in selection.twins],
         'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
-        'by_temperature': [] if table.temperature is None else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
+        'by_temperature': [] if table.temperature is None
+        else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
     }
 
 
 def _choice_data(choice: Choice) -> dict[str, Any]:
-    return {'effect': choice.effect, 'taken': choice.taken, 'left_out_without_rad_s': _finite(choice.without),
-            'left_out_with_rad_s': _finite(choice.with_it), 'chance': _finite(choice.chance), 'reason': choice.reason}
+    return {'effect': choice.effect, 'taken': choice.taken,
+            'left_out_without_rad_s': _finite(choice.without),
+            'left_out_with_rad_s': _finite(choice.with_it), 'chance': _finite(choice.chance),
+            'reason': choice.reason}
 
 
 def _twins_data(twins: Twins) -> dict[str, Any]:
-    return {'taken': twins.taken, 'other': twins.other, 'sigmas': twins.sigmas, 'parted': twins.parted,
-            'parting_rate_rad_s': twins.rate, 'reason': twins.reason}
+    return {'taken': twins.taken, 'other': twins.other, 'sigmas': twins.sigmas,
+            'parted': twins.parted, 'parting_rate_rad_s': twins.rate, 'reason': twins.reason}
 
 
 def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
-    return {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count, 'mean_before_rad_s': part.before,
-            'mean_residual_rad_s': part.residual, 'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
+    return {f'from_{unit}': part.low, f'to_{unit}': part.high, 'dwells': part.count,
+            'mean_before_rad_s': part.before, 'mean_residual_rad_s': part.residual,
+            'standard_deviation_rad_s': part.deviation, 'rms_rad_s': part.rms}
 
 
 def matrix_of(model: GyroModel) -> list[list[float]] | None:
-    """Return the polynomial of a model as the matrix C of Ojeda et al., eq. 11; None where it has none."""
+    """Return the polynomial of a model as the matrix C of Ojeda et al., eq. 11, or None."""
     for term in model.terms:
         if term.effect.name == POLYNOMIAL:
             matrix: list[list[float]] = polynomial_to_matrix(term.effect, term.values).tolist()
@@ -102,10 +113,13 @@ def matrix_of(model: GyroModel) -> list[list[float]] | None:
 def heading_data(found: EncoderCalibration) -> dict[str, Any]:
     """Return how good a calibration from a reference heading is."""
     fit = found.fit
-    return {'time_offset_s': _finite(fit.time_offset), 'angle_random_walk_rad_per_root_s': _finite(fit.angle_random_walk),
-            'reference_noise_rad': _finite(fit.reference_noise), 'lost_samples': found.lost_samples,
+    return {'time_offset_s': _finite(fit.time_offset),
+            'angle_random_walk_rad_per_root_s': _finite(fit.angle_random_walk),
+            'reference_noise_rad': _finite(fit.reference_noise),
+            'lost_samples': found.lost_samples,
             'rms_heading_before_rad': found.before.rms, 'rms_heading_after_rad': found.after.rms,
-            'largest_heading_before_rad': found.before.largest, 'largest_heading_after_rad': found.after.largest}
+            'largest_heading_before_rad': found.before.largest,
+            'largest_heading_after_rad': found.after.largest}
 
 
 def _finite(value: float) -> float | None:
@@ -120,7 +134,8 @@ def sentences(remarks: Sequence[str]) -> Iterator[str]:
 
 
 def _wrapped(text: str, indent: int = 0) -> str:
-    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False, break_on_hyphens=False)
+    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False,
+                         break_on_hyphens=False)
 
 
 def value_lines(model: GyroModel) -> Iterator[str]:
@@ -130,9 +145,11 @@ def value_lines(model: GyroModel) -> Iterator[str]:
         unit, factor = _UNITS.get(parameter.unit, (parameter.unit, 1.0))
         name = effect if parameter.name == effect else f'{effect} {parameter.name}'
         low, high = ((value + sign * 1.96 * deviation) * factor for sign in (-1, 1))
-        sure = f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}' if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}'
+        sure = (f'{deviation * factor:10.2g}   {f"{low:.5g} to {high:.5g}":27s}'
+                if math.isfinite(deviation) else f'{"-":>10s}   {"-":27s}')
         yield f'{name:38s} {value * factor:12.5g} {sure} {unit}'
-    for temperature in {term.values[0] for term in model.terms if term.effect.parameters[0].name == 'reference_temperature'}:
+    for temperature in {term.values[0] for term in model.terms
+                        if term.effect.parameters[0].name == 'reference_temperature'}:
         yield f'Temperatures are counted from {temperature:g} degC.'
 
 
@@ -140,12 +157,15 @@ def dwell_lines(fit: Calibration) -> Iterator[str]:
     """Say what was measured, and what of it was left out."""
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
-    temperatures = '' if table.temperature is None else f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC'
+    temperatures = ('' if table.temperature is None else
+                    f', {table.temperature.min():.1f} to {table.temperature.max():.1f} degC')
     sweeps = len(np.unique(table.sweep))
-    yield f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, {slowest:.1f} to {fastest:.1f} deg/s{temperatures}.'
+    yield (f'{len(table)} dwells in {sweeps} sweep{"s" if sweeps > 1 else ""}, '
+           f'{slowest:.1f} to {fastest:.1f} deg/s{temperatures}.')
     outlying = np.flatnonzero(~fit.scatter.kept)
     if len(outlying):
-        named = listed([f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)' for row in outlying])
+        named = listed([f'{table.place[row]} ({fit.residual[row] / DEGREE:+.3f} deg/s)'
+                        for row in outlying])
         yield _wrapped(f'{len(outlying)} outlying, not fitted: {named}.')
     yield from sentences(table.remarks)
 
@@ -154,12 +174,16 @@ def quality_lines(fit: Calibration) -> Iterator[str]:
     """Say how large the errors are, and what to mistrust."""
     scatter, several = fit.scatter, len(np.unique(fit.dwells.sweep)) >= FEWEST_SWEEPS
     part = 'sweeps' if several else 'blocks of time'
-    yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, {fit.residual_rms / DEGREE:.4f} after; '
-           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} that were left out.' if math.isfinite(fit.left_out_rms)
+    yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, '
+           f'{fit.residual_rms / DEGREE:.4f} after; '
+           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} that were left out.'
+              if math.isfinite(fit.left_out_rms)
               else f'some values show in one of the {part} only, which cannot be left out.'))
-    wander = f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s and {100.0 * scatter.sweep_scale:.3f} %' if several \
-        else f'how sweeps scatter takes at least {FEWEST_SWEEPS} of them'
-    yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
+    wander = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
+              f'and {100.0 * scatter.sweep_scale:.3f} %' if several
+              else f'how sweeps scatter takes at least {FEWEST_SWEEPS} of them')
+    yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s '
+                   f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
                    f'Condition number {fit.condition:.1f}.')
     yield from map(_wrapped, _warnings(fit))
 
@@ -167,11 +191,11 @@ def quality_lines(fit: Calibration) -> Iterator[str]:
 def _warnings(fit: Calibration) -> Iterator[str]:
     excess = math.sqrt(fit.misfit / fit.freedom) if fit.freedom else 1.0
     if excess > 1.2:
-        yield (f'These effects leave {excess:.1f} times the scatter of the dwells about a smooth surface: something is missing. '
-               'The intervals are widened by that.')
+        yield (f'These effects leave {excess:.1f} times the scatter of the dwells about a smooth '
+               'surface: something is missing. The intervals are widened by that.')
     if fit.folded_beyond is not None:
-        yield (f'From {fit.folded_beyond / DEGREE:.0f} deg/s on the output does not grow with the rate, so that no output tells these '
-               'rates: the model must not be used there.')
+        yield (f'From {fit.folded_beyond / DEGREE:.0f} deg/s on the output does not grow with the '
+               'rate, so that no output tells these rates: the model must not be used there.')
     if not fit.freedom:
         yield 'There are as many values as dwells, so nothing says how sure they are: add dwells.'
 
@@ -179,14 +203,18 @@ def _warnings(fit: Calibration) -> Iterator[str]:
 def bin_lines(fit: Calibration) -> Iterator[str]:
     """Give the tables of residuals by rate and by temperature."""
     table = fit.dwells
-    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, table.rate), ('temperature', 'degC', 1.0, table.temperature)):
+    for name, unit, factor, values in (('rate', 'deg/s', 1 / DEGREE, table.rate),
+                                       ('temperature', 'degC', 1.0, table.temperature)):
         if values is None or np.ptp(values) == 0.0:
             continue
-        yield f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} {"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s'
+        yield (f'{f"by {name}, {unit}":22s} {"dwells":>6s} {"mean error before":>18s} '
+               f'{"residual":>10s} {"+-":>8s} {"rms":>8s}  deg/s')
         for part in binned(fit, values):
             place = f'{part.low * factor:.1f} to {part.high * factor:.1f}'
-            before, residual, deviation, rms = (value / DEGREE for value in (part.before, part.residual, part.deviation, part.rms))
-            yield f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} {deviation:8.4f} {rms:8.4f}'
+            before, residual, deviation, rms = (
+                value / DEGREE for value in (part.before, part.residual, part.deviation, part.rms))
+            yield (f'{place:22s} {part.count:6d} {before:18.4f} {residual:10.4f} '
+                   f'{deviation:8.4f} {rms:8.4f}')
         yield ''
 
 
@@ -195,16 +223,19 @@ def choice_lines(selection: Selection) -> Iterator[str]:
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"chance":>7s}'
     for choice in selection.choices:
-        without, with_it = (f'{_shown(value / DEGREE, ".4f"):>8s}' for value in (choice.without, choice.with_it))
+        without, with_it = (f'{_shown(value / DEGREE, ".4f"):>8s}'
+                            for value in (choice.without, choice.with_it))
         numbers = f'{without} {with_it} {_shown(choice.chance, ".1g"):>7s}'
-        yield _wrapped(f'{choice.effect:26s} {numbers}  {"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
+        yield _wrapped(f'{choice.effect:26s} {numbers}  '
+                       f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
     yield from (_wrapped(_alike(twins)) for twins in selection.twins if not twins.parted)
 
 
 def _alike(twins: Twins) -> str:
     remedy = ('no rate up to three times the fastest would part them' if twins.rate is None
               else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s would part them')
-    return (f'These data hardly part {twins.taken} from {twins.other}: {twins.reason}. It matters beyond the calibrated rates; {remedy}.')
+    return (f'These data hardly part {twins.taken} from {twins.other}: {twins.reason}. '
+            f'It matters beyond the calibrated rates; {remedy}.')
 
 
 def _shown(value: float, form: str) -> str:
@@ -213,16 +244,20 @@ def _shown(value: float, form: str) -> str:
 
 def matrix_lines(matrix: list[list[float]]) -> Iterator[str]:
     """Give the matrix C of Ojeda et al."""
-    yield 'C of eq. 11 for deg/s and degC, highest powers of temperature above, of the output to the left:'
+    yield ('C of eq. 11 for deg/s and degC, highest powers of temperature above, '
+           'of the output to the left:')
     yield from (' '.join(f'{value: .8e}' for value in row) for row in matrix)
 
 
 def heading_lines(found: EncoderCalibration) -> Iterator[str]:
     """Say how large the errors of the heading are."""
     if math.isfinite(found.fit.time_offset):
-        yield f'The gyro lags the reference by {1000.0 * found.fit.time_offset:.1f} ms; that is taken out.'
+        yield (f'The gyro lags the reference by {1000.0 * found.fit.time_offset:.1f} ms; '
+               'that is taken out.')
     for name, residual in (('before', found.before), ('after', found.after)):
-        yield f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, {residual.largest / DEGREE:.3f} deg at most.'
+        yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
+               f'{residual.largest / DEGREE:.3f} deg at most.')
     if found.after.rms > _MUCH_LEFT:
-        yield _wrapped('That is much. If the gyro is not linear, or changes with temperature, --method dwells finds the effects, provided '
-                       'that the log has stretches of steady rate.')
+        yield _wrapped('That is much. If the gyro is not linear, or changes with temperature, '
+                       '--method dwells finds the effects, provided that the log has stretches '
+                       'of steady rate.')

@@ -1,4 +1,4 @@
-"""The program ``gyro_calibration``: it runs one verb, prints its answer and says by its exit code how it went."""
+"""The program ``gyro_calibration``: it runs one verb, prints its answer and sets its exit code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-# The matrices of a fit are small; threads that wait for each other make it ten times slower on a busy machine. NumPy reads it once.
+# The matrices of a fit are small; threads that wait for each other make it ten times slower on a
+# busy machine. NumPy reads the variable once.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
@@ -26,7 +27,7 @@ DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb, print its answer and return 0 (done), 1 (the data allow no answer) or 2 (wrong use)."""
+    """Run one verb, print its answer, and return 0 (done), 1 (no answer) or 2 (wrong use)."""
     given = _parser().parse_args(arguments)
     try:
         _refuse_empty(given)
@@ -36,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(error)
         return NO_ANSWER
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-        say(f'the numbers are too large or too far apart to be computed with ({reason(error)}); see whether columns and units are right')
+        say(f'the numbers are too large or too far apart to be computed with ({reason(error)}); '
+            'see whether columns and units are right')
         return NO_ANSWER
     except InputError as error:
         say(error)
@@ -63,32 +65,36 @@ def _numbers(value: Any) -> Any:
 
 
 def _refuse_empty(given: argparse.Namespace) -> None:
-    """Refuse an option without a value, as a variable of the shell leaves it that is not set; a file without a name is never written."""
+    """Refuse an option with an empty value, as from a shell variable that is not set."""
     for name, value in vars(given).items():
         if value == '' or isinstance(value, list) and '' in value:
-            raise UsageError(f'{name.replace("_", "-")} is empty; give it a value, or leave it out')
+            raise UsageError(f'{name.replace("_", "-")} is empty; '
+                             'give it a value, or leave it out')
 
 
 def _show(text: str) -> None:
-    """Print; a reader that has gone, as `head` does, is no error, nor is the name of a file that is no text."""
+    """Print; a closed pipe, as after `head`, or a file name that is not text is no error."""
     encoding = sys.stdout.encoding or 'utf-8'
     try:
-        print(plain(text, kept='\n').encode(encoding, 'backslashreplace').decode(encoding), flush=True)
+        print(plain(text, kept='\n').encode(encoding, 'backslashreplace').decode(encoding),
+              flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with arguments without what a terminal would obey, as names of files have it."""
+    """Reports wrong arguments without control characters, which names of files may contain."""
 
     def _print_message(self, message: str, file: Any = None) -> None:
         super()._print_message(plain(message, kept='\n'), file)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog='gyro_calibration', description='Calibrate a gyro, so that a robot knows its heading.')
+    parser = _Parser(prog='gyro_calibration',
+                     description='Calibrate a gyro, so that a robot knows its heading.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
     for verb in VERBS:
-        verb.add(verbs).add_argument('--json', action='store_true', help='print one JSON object and nothing else')
+        verb.add(verbs).add_argument('--json', action='store_true',
+                                     help='print one JSON object and nothing else')
     return parser

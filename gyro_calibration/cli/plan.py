@@ -19,7 +19,7 @@ from gyro_calibration.plan import Ability, Forecast, Plan, Prediction, able, bes
 from gyro_calibration.reproduction.hong_park import XV3500
 from gyro_calibration.settings_file import read_settings
 
-#: What limits are called in a file, with what they are in `Ability`, their unit, and the range of their numbers.
+#: Name of a limit in a file -> its name in `Ability`, its unit, and the range of its numbers.
 LIMITS = {
     'maximum_rate_dps': ('rate', DEGREE, 0.01, 1e5),
     'maximum_acceleration_dps2': ('acceleration', DEGREE, 0.01, 1e6),
@@ -35,22 +35,30 @@ LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'plan', _plan, 'compute the motion that calibrates best within what a robot can do',
+    parser = verb(verbs, 'plan', _plan,
+                  'compute the motion that calibrates best within what a robot can do',
                   '--limits limits.yaml --seconds 20 --out profile.csv')
-    parser.add_argument('--limits', required=True, metavar='LIMITS.yaml', help='what the robot can do; config/limits.yaml is an example')
-    parser.add_argument('--seconds', type=positive, default=20.0, metavar='S', help='length of the motion; default: 20')
-    parser.add_argument('--out', metavar='PROFILE.csv', help='write the motion, for self-calibrate and the node')
-    parser.add_argument('--model', metavar='MODEL.yaml', help='its noise figures; default: those of the Epson XV-3500')
+    parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
+                        help='what the robot can do; config/limits.yaml is an example')
+    parser.add_argument('--seconds', type=positive, default=20.0, metavar='S',
+                        help='length of the motion; default: 20')
+    parser.add_argument('--out', metavar='PROFILE.csv',
+                        help='write the motion, for self-calibrate and the node')
+    parser.add_argument('--model', metavar='MODEL.yaml',
+                        help='its noise figures; default: those of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
-                        help=f'the later drive whose heading counts, one of {", ".join(NAMED)} or a profile; default: robot')
-    parser.add_argument('--drive', type=positive, metavar='S', help='length of that drive, begun again where it ends; default: its own')
+                        help='the later drive whose heading counts, one of '
+                        f'{", ".join(NAMED)} or a profile; default: robot')
+    parser.add_argument('--drive', type=positive, metavar='S',
+                        help='length of that drive, begun again where it ends; default: its own')
     parser.add_argument('--seed', type=whole, default=1, help='of the search; default: 1')
     return parser
 
 
 def _plan(given: argparse.Namespace) -> Answer:
     if given.seconds > LONGEST:
-        raise UsageError(f'--seconds {given.seconds:g} is beyond {LONGEST:g}; plan a shorter motion and repeat it')
+        raise UsageError(f'--seconds {given.seconds:g} is beyond {LONGEST:g}; '
+                         'plan a shorter motion and repeat it')
     ability, noise = read_limits(given.limits), _noise(given)
 
     drive = named(given.motion)
@@ -58,11 +66,14 @@ def _plan(given: argparse.Namespace) -> Answer:
 
     def planned(seconds: float, generations: int = 30) -> tuple[Plan, Forecast]:
         forecast = Forecast(noise, seconds, drive, given.drive)
-        return best(ability, forecast, seconds, np.random.default_rng(given.seed), generations), forecast
+        return best(ability, forecast, seconds, np.random.default_rng(given.seed),
+                    generations), forecast
     plan, forecast = planned(given.seconds, 60)
     built_in = Forecast(noise, CALIBRATION.duration, drive, given.drive).predict(CALIBRATION)
-    rows = {'planned': plan.prediction, 'plain': forecast.predict(plain(ability, given.seconds)), 'built_in': built_in}
-    more = {seconds: planned(seconds)[0].prediction for seconds in bar([each for each in LENGTHS if each > given.seconds], 'more seconds')}
+    rows = {'planned': plan.prediction,
+            'plain': forecast.predict(plain(ability, given.seconds)), 'built_in': built_in}
+    more = {seconds: planned(seconds)[0].prediction for seconds in bar(
+        [each for each in LENGTHS if each > given.seconds], 'more seconds')}
     if given.out:
         write_motion(given.out, plan.motion)
     fits = able(ability, CALIBRATION)
@@ -79,18 +90,22 @@ def read_limits(path: str) -> Ability:
 
     Raises
     ------
-    UsageError : the file cannot be read, misses what is needed, or holds an unknown name or a value out of its range
+    UsageError : the file cannot be read, misses a limit that is needed, or holds an unknown name
+        or a value out of its range
 
     """
     try:
         content = read_settings(path)
     except (OSError, ValueError) as error:
-        raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); begin with a copy of config/limits.yaml') from error
+        raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); '
+                         'begin with a copy of config/limits.yaml') from error
     if not isinstance(content, dict):
-        raise UsageError(f'{path}: holds no names with values; wanted {", ".join(NEEDED)} and others, as in config/limits.yaml')
+        raise UsageError(f'{path}: holds no names with values; wanted {", ".join(NEEDED)} '
+                         'and others, as in config/limits.yaml')
     unknown = [name for name in content if name not in LIMITS]
     if unknown:
-        raise UsageError(f'{path}: {reprlib.repr(unknown[0])} is no limit; wanted some of {", ".join(LIMITS)}')
+        raise UsageError(f'{path}: {reprlib.repr(unknown[0])} is no limit; '
+                         f'wanted some of {", ".join(LIMITS)}')
     missing = [name for name in NEEDED if name not in content]
     if missing:
         raise UsageError(f'{path}: {missing[0]} is missing; add what the robot can do')
@@ -103,56 +118,72 @@ def read_limits(path: str) -> Ability:
 def _limit(path: str, name: str, value: Any) -> tuple[str, float]:
     attribute, unit, low, high = LIMITS[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise UsageError(f'{path}: {name} is {reprlib.repr(value)}; wanted a number from {low:g} to {high:g}')
+        raise UsageError(f'{path}: {name} is {reprlib.repr(value)}; '
+                         f'wanted a number from {low:g} to {high:g}')
     return attribute, float(value) * unit
 
 
 def _noise(given: argparse.Namespace) -> Noise:
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
-        raise UsageError(f'{given.model}: gives no angle_random_walk; run allan on a log at rest, with --model and --out')
+        raise UsageError(f'{given.model}: gives no angle_random_walk; '
+                         'run allan on a log at rest, with --model and --out')
     return noise
 
 
 def write_motion(path: str, motion: Motion) -> None:
     """Write a motion of rates as a profile."""
     rows = zip(motion.time, motion.rate_at(motion.time) / DEGREE)
-    lines = ['# The rate is linear between rows.', 'time_s,rate_dps', *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
+    lines = ['# The rate is linear between rows.', 'time_s,rate_dps',
+             *(f'{time:.9f},{rate:.9f}' for time, rate in rows)]
     write_atomically(path, ('\n'.join(lines) + '\n').encode())
 
 
-_NAMES = {'planned': 'planned', 'plain': 'one turn there and back', 'built_in': 'built-in profile, 20 s'}
+_NAMES = {'planned': 'planned', 'plain': 'one turn there and back',
+          'built_in': 'built-in profile, 20 s'}
 
 
-def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction], more: dict[float, Prediction], fits: bool) -> str:
+def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
+          more: dict[float, Prediction], fits: bool) -> str:
     rate, angle = plan.motion.rate_at(plan.motion.time) / DEGREE, plan.motion.heading / DEGREE
-    lines = [f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} deg/s and headings of {angle.min():.0f} '
-             f'to {angle.max():.0f} deg.', '', f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
-    lines += [_row(_NAMES[name] + ('' if fits or name != 'built_in' else ', beyond the limits'), row) for name, row in rows.items()]
+    lines = [
+        f'A motion of {given.seconds:g} s with rates of {rate.min():.1f} to {rate.max():.1f} '
+        f'deg/s and headings of {angle.min():.0f} to {angle.max():.0f} deg.', '',
+        f'Expected of a calibration, and of the heading over {given.drive:g} s after it:']
+    lines += [_row(_NAMES[name] + ('' if fits or name != 'built_in' else ', beyond the limits'),
+                   row) for name, row in rows.items()]
     lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in more.items()]
     scale, less = _gains(rows)
-    lines += ['', f'Over one turn there and back, the scale is {scale:.2f} times as well known, and the heading errs by '
-              f'{100 * less:.2f} % less.', f'White noise, integrated, makes {plan.prediction.floor / DEGREE:.3f} deg of the error, '
-              'whatever the calibration.', 'The bias is known as well as the time allows, whatever the motion: only more seconds help.']
+    lines += [
+        '', f'Over one turn there and back, the scale is {scale:.2f} times as well known, '
+        f'and the heading errs by {100 * less:.2f} % less.',
+        f'White noise, integrated, makes {plan.prediction.floor / DEGREE:.3f} deg of the error, '
+        'whatever the calibration.',
+        'The bias is known as well as the time allows, whatever the motion: '
+        'only more seconds help.']
     return '\n'.join(lines + ([f'Written to {given.out}.'] if given.out else []))
 
 
 def _row(name: str, row: Prediction) -> str:
-    return (f'  {name + ":":34} scale +- {100 * row.scale_deviation:.4f} %, bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
+    return (f'  {name + ":":34} scale +- {100 * row.scale_deviation:.4f} %, '
+            f'bias +- {row.bias_deviation / DEGREE:.4f} deg/s, '
             f'mean heading error {row.heading_error / DEGREE:.3f} deg')
 
 
 def _gains(rows: dict[str, Prediction]) -> tuple[float, float]:
-    """Return how much better than by the plain motion the scale is known, as a factor, and the heading, as a part."""
+    """Return the gains over the plain motion: of the scale a factor, of the heading a fraction."""
     planned, simple = rows['planned'], rows['plain']
-    return simple.scale_deviation / planned.scale_deviation, 1.0 - planned.heading_error / simple.heading_error
+    return (simple.scale_deviation / planned.scale_deviation,
+            1.0 - planned.heading_error / simple.heading_error)
 
 
-def _data(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction], more: dict[float, Prediction],
-          fits: bool) -> dict[str, Any]:
+def _data(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
+          more: dict[float, Prediction], fits: bool) -> dict[str, Any]:
     scale, heading = _gains(rows)
     return {'duration_s': plan.motion.duration, 'time_s': plan.motion.time.tolist(),
-            'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(), **{name: asdict(row) for name, row in rows.items()},
+            'rate_rad_s': plan.motion.rate_at(plan.motion.time).tolist(),
+            **{name: asdict(row) for name, row in rows.items()},
             'built_in_within_limits': fits, 'scale_gain': scale, 'heading_gain': heading,
-            'more_seconds': [{'duration_s': seconds, **asdict(row)} for seconds, row in more.items()],
+            'more_seconds': [{'duration_s': seconds, **asdict(row)}
+                             for seconds, row in more.items()],
             'drive_s': given.drive, 'seed': given.seed, 'out': given.out}

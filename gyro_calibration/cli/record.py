@@ -1,4 +1,4 @@
-"""The verb record: what comes of a gyro, from its port or from topics, into a log file or an MCAP recording."""
+"""The verb record: samples of a gyro, from its port or from topics, into a log or an MCAP file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ from gyro_calibration.cli.verb import Answer, UsageError, positive, say, verb
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
-from gyro_calibration.driver.recorder import KINDS, PIECE, CsvRecorder, DiskFull, McapRecorder, MessageLog, Notes, about
+from gyro_calibration.driver.recorder import (
+    KINDS,
+    PIECE,
+    CsvRecorder,
+    DiskFull,
+    McapRecorder,
+    MessageLog,
+    Notes,
+    about,
+)
 from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.files import plain
 from gyro_calibration.log import DEGREE, DataRefused
@@ -34,33 +43,48 @@ _PATIENCE = 5.0  # s; without a message, until it is said what is waited for
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'record', _record, 'record a gyro, from its port or from topics, until Ctrl-C',
+    parser = verb(verbs, 'record', _record,
+                  'record a gyro, from its port or from topics, until Ctrl-C',
                    '--port /dev/ttyUSB0 --out drive.csv')
-    parser.add_argument('--out', required=True, metavar='FILE', help=f'a new file, {", ".join(KINDS)}')
-    parser.add_argument('--seconds', type=positive, metavar='N', help='end after so many seconds; default: when interrupted')
+    parser.add_argument('--out', required=True, metavar='FILE',
+                        help=f'a new file, {", ".join(KINDS)}')
+    parser.add_argument('--seconds', type=positive, metavar='N',
+                        help='end after so many seconds; default: when interrupted')
     topics = parser.add_argument_group('from topics, with ROS 2')
-    topics.add_argument('--topic', metavar='TOPIC', help=f'of the gyro; default: {_TOPICS["gyro"]}')
-    topics.add_argument('--temperature-topic', metavar='TOPIC', help=f'default: {_TOPICS["temperature"]}')
+    topics.add_argument('--topic', metavar='TOPIC',
+                        help=f'of the gyro; default: {_TOPICS["gyro"]}')
+    topics.add_argument('--temperature-topic', metavar='TOPIC',
+                        help=f'default: {_TOPICS["temperature"]}')
     topics.add_argument('--reference-topic', metavar='TOPIC', action='append', default=[],
                         help='of a reference; in .mcap several may be given')
     topics.add_argument('--all', action='store_true', help='every topic that there is, into .mcap')
     port = parser.add_argument_group('from the port, without ROS 2')
-    port.add_argument('--port', metavar='PORT', help='of the gyro, or a pattern such as "/dev/serial/by-id/*A9003XYZ*"')
-    port.add_argument('--protocol', metavar='NAME', help=f'{", ".join(PROTOCOLS)}; default: {AUTO}, found by listening')
-    port.add_argument('--baud', type=int, default=0, metavar='N', help='bit/s; default: that of the protocol')
-    port.add_argument('--columns', metavar='NAME,...', help=f'of the protocol csv; default: {",".join(Settings().columns)}')
-    port.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count; default: that of the protocol')
-    port.add_argument('--axis', default='z', choices=['x', 'y', 'z'], help='of a gyro with three; default: z')
-    port.add_argument('--invert', action='store_true', default=None, help='the gyro counts clockwise turns positive')
+    port.add_argument('--port', metavar='PORT', help='of the gyro, or a pattern such as '
+                      '"/dev/serial/by-id/*A9003XYZ*"')
+    port.add_argument('--protocol', metavar='NAME',
+                      help=f'{", ".join(PROTOCOLS)}; default: {AUTO}, found by listening')
+    port.add_argument('--baud', type=int, default=0, metavar='N',
+                      help='bit/s; default: that of the protocol')
+    port.add_argument('--columns', metavar='NAME,...', help='of the protocol csv; '
+                      f'default: {",".join(Settings().columns)}')
+    port.add_argument('--sensitivity', type=positive, metavar='DPS',
+                      help='deg/s a count; default: that of the protocol')
+    port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
+                      help='of a gyro with three; default: z')
+    port.add_argument('--invert', action='store_true', default=None,
+                      help='the gyro counts clockwise turns positive')
     port.add_argument('--increments', choices=list(_INCREMENTS), default='default',
-                      help='whether the gyro sends angles, not rates; default: as the protocol says')
-    port.add_argument('--sample-rate', type=positive, metavar='HZ', help='that the gyro is set to; default: that of the protocol')
+                      help='whether the gyro sends angles, not rates; '
+                      'default: as the protocol says')
+    port.add_argument('--sample-rate', type=positive, metavar='HZ',
+                      help='that the gyro is set to; default: that of the protocol')
     return parser
 
 
 def _record(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(KINDS):
-        raise UsageError(f'{given.out}: a recording ends in {", ".join(KINDS[:-1])} or {KINDS[-1]}; name it so')
+        raise UsageError(f'{given.out}: a recording ends in {", ".join(KINDS[:-1])} or '
+                         f'{KINDS[-1]}; name it so')
     with _stopping(given.seconds) as stop:
         session = (_PortSession if given.port else _TopicSession)(given, stop)
         session.run()
@@ -72,11 +96,13 @@ def _stopping(seconds: float | None) -> Iterator[threading.Event]:
     """
     Give an event that Ctrl-C, a SIGTERM, a terminal that closes or the end of the time sets.
 
-    A second signal changes nothing, for the file is being closed. Whoever has it run on without a terminal (nohup) ignores SIGHUP.
+    A second signal changes nothing, since the file is being closed. SIGHUP stays ignored where it
+    is ignored already (nohup).
 
     """
     stop = threading.Event()
-    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
+    numbers = [signal.SIGINT, signal.SIGTERM, *(
+        [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else [])]
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
     timer = threading.Timer(seconds, stop.set) if seconds else None
     if timer is not None:
@@ -93,7 +119,7 @@ def _stopping(seconds: float | None) -> Iterator[threading.Event]:
 
 @contextmanager
 def _prints_on_standard_error() -> Iterator[None]:
-    """Let go to standard error what the middleware of ROS 2 prints, for standard output is for the answer alone."""
+    """Redirect prints of the ROS 2 middleware to standard error; standard output is the answer."""
     sys.stdout.flush()
     before = os.dup(1)
     os.dup2(2, 1)
@@ -105,7 +131,7 @@ def _prints_on_standard_error() -> Iterator[None]:
 
 
 class _Session:
-    """What both ways to record share: the file, its pieces, the progress, and what is said at the end."""
+    """The common part of both ways to record: the file, its pieces, the progress, the answer."""
 
     #: What is waited for, for the sentence that nothing came.
     waited_for = ''
@@ -134,9 +160,11 @@ class _Session:
 
     def _create(self, notes: Notes, expected: tuple[str, ...] = ()) -> Recorder:
         try:
-            return McapRecorder(self._given.out, notes) if self._is_mcap() else CsvRecorder(self._given.out, notes, expected)
+            return (McapRecorder(self._given.out, notes) if self._is_mcap()
+                    else CsvRecorder(self._given.out, notes, expected))
         except FileExistsError:
-            raise UsageError(f'{self._given.out}: is there already, and no recording is ever written over; name a new file') from None
+            raise UsageError(f'{self._given.out}: is there already, and no recording is ever '
+                             'written over; name a new file') from None
 
     def _is_mcap(self) -> bool:
         return bool(self._given.out.endswith('.mcap'))
@@ -144,7 +172,8 @@ class _Session:
     def run(self) -> None:
         """Record until it is to end, and close the file whatever happens."""
         try:
-            with tqdm(desc=plain(self._given.out), unit=' samples', leave=False, disable=None) as shown:
+            with tqdm(desc=plain(self._given.out), unit=' samples', leave=False,
+                      disable=None) as shown:
                 try:
                     self._take(lambda: self._tick(shown))
                 finally:
@@ -164,13 +193,17 @@ class _Session:
         """Say what was recorded."""
         seconds = time.monotonic() - self._begin
         if self._full is not None:
-            written = f'{self._recorder.size} bytes stay in {self._given.out}, which can be read up to the last {PIECE:g} s'
+            written = (f'{self._recorder.size} bytes stay in {self._given.out}, '
+                       f'which can be read up to the last {PIECE:g} s')
             written = written if self._recorder.size else 'nothing was written'
             raise DataRefused(f'{self._full.strerror}; {written}: make room, then record again')
         if not self.samples:
-            raise DataRefused(f'nothing came within {seconds:.1f} s{self._why()}; no file was written: {self.waited_for}')
-        data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost, 'seconds': seconds, **self._details()}
-        lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, written to {self._given.out}.', *self._remarks()]
+            raise DataRefused(f'nothing came within {seconds:.1f} s{self._why()}; '
+                              f'no file was written: {self.waited_for}')
+        data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost,
+                'seconds': seconds, **self._details()}
+        lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
+                 f'written to {self._given.out}.', *self._remarks()]
         return Answer('\n'.join(lines), {**data, 'remarks': self._remarks()})
 
     def _why(self) -> str:
@@ -182,7 +215,8 @@ class _Session:
     def _remarks(self) -> list[str]:
         missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
         way_out = '.mcap keeps temperature, acceleration and reference whenever they come'
-        return [f'{", ".join(missed)} came too late for a column of a log; {way_out}.'] if missed else []
+        return ([f'{", ".join(missed)} came too late for a column of a log; {way_out}.']
+                if missed else [])
 
 
 class _PortSession(_Session):
@@ -192,15 +226,19 @@ class _PortSession(_Session):
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
-            raise UsageError('--port and topics were both given; record one of them, or the topics of a driver on that port')
+            raise UsageError('--port and topics were both given; record one of them, '
+                             'or the topics of a driver on that port')
         if not 0 <= given.baud <= _LARGEST_BAUD:
-            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_LARGEST_BAUD}; leave it out for that of the protocol')
+            raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_LARGEST_BAUD}; '
+                             'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
         sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
         try:
-            self._settings = Settings(sensitivity=sensitivity, invert=given.invert, axis=given.axis, columns=columns,
-                                      increments=_INCREMENTS[given.increments], sample_rate=given.sample_rate)
-            self._connection = Connection(given.port, given.protocol or AUTO, given.baud, self._settings, on_change=self._tell)
+            self._settings = Settings(
+                sensitivity=sensitivity, invert=given.invert, axis=given.axis, columns=columns,
+                increments=_INCREMENTS[given.increments], sample_rate=given.sample_rate)
+            self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
+                                          self._settings, on_change=self._tell)
         except ValueError as error:
             raise UsageError(str(error)) from None
         self._told = ''
@@ -222,8 +260,10 @@ class _PortSession(_Session):
 
     def _about(self) -> dict[str, str]:
         found, protocol = self._connection, self._connection.protocol
-        return about(port=self._given.port, device=found.path, protocol=protocol.name if protocol else '', baud=found.baud,
-                     axis=self._settings.axis, **(_scale(protocol, self._settings) if protocol else {}))
+        return about(port=self._given.port, device=found.path,
+                     protocol=protocol.name if protocol else '', baud=found.baud,
+                     axis=self._settings.axis,
+                     **(_scale(protocol, self._settings) if protocol else {}))
 
     def _take(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
@@ -235,10 +275,12 @@ class _PortSession(_Session):
         if state.name == 'failed':
             self._recorder.flush()  # there is no piece in a silence
         said = state.problem or state.name
-        if state.name == 'opening' or said == self._told or state.name == 'listening' and self._told:
+        if (state.name == 'opening' or said == self._told
+                or state.name == 'listening' and self._told):
             return  # it listens again at each attempt
         found, self._told = self._connection, said
-        name = f'samples of {found.protocol.name} come at {found.baud} bit/s' if found.protocol else ''
+        name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
+                if found.protocol else '')
         say(name if state.name == 'reading' else said)
 
     def _why(self) -> str:
@@ -247,50 +289,66 @@ class _PortSession(_Session):
     def _details(self) -> dict[str, Any]:
         found = self._connection
         protocol = found.protocol.name if found.protocol else None
-        return {**super()._details(), 'protocol': protocol, 'baud': found.baud, 'openings': found.openings}
+        return {**super()._details(), 'protocol': protocol, 'baud': found.baud,
+                'openings': found.openings}
 
     def _remarks(self) -> list[str]:
-        counts, protocol, clock = vars(self._connection.counts()), self._connection.protocol, self._connection.clock
-        warning = protocol.wrong_rate(self._settings, clock.period) if protocol and clock and clock.is_settled else ''
-        told = {name.replace('_', ' '): count for name, count in counts.items() if name not in ('samples', 'lost_samples') and count}
-        return [*(f'{count} {name}.' for name, count in told.items()), *([f'{warning}.'] if warning else []), *super()._remarks()]
+        counts, protocol, clock = (vars(self._connection.counts()), self._connection.protocol,
+                                   self._connection.clock)
+        warning = (protocol.wrong_rate(self._settings, clock.period)
+                   if protocol and clock and clock.is_settled else '')
+        told = {name.replace('_', ' '): count for name, count in counts.items()
+                if name not in ('samples', 'lost_samples') and count}
+        return [*(f'{count} {name}.' for name, count in told.items()),
+                *([f'{warning}.'] if warning else []), *super()._remarks()]
 
 
 def _scale(protocol: Protocol, settings: Settings) -> dict[str, str]:
-    """Return what one unit of the device was taken for; columns in rad/s or deg/s have their unit in their names."""
+    """Return the scale of the device; columns in rad/s or deg/s have their unit in their names."""
     factor = protocol.factor(settings)
-    angles = f', an angle at {protocol.nominal_rate(settings):g} Hz' if protocol.sends_angles(settings) else ''
-    sensitivity = '' if protocol is CSV and settings.sensitivity is None else f'{abs(factor)!r} rad/s a unit of the device{angles}'
+    angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
+              if protocol.sends_angles(settings) else '')
+    sensitivity = ('' if protocol is CSV and settings.sensitivity is None
+                   else f'{abs(factor)!r} rad/s a unit of the device{angles}')
     return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
 
 
 class _TopicSession(_Session):
     """Records what comes on topics."""
 
-    waited_for = 'see whether a driver publishes, and whether ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE agree'
+    waited_for = ('see whether a driver publishes, and whether ROS_DOMAIN_ID and '
+                  'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
-        wire = given.protocol, given.columns, given.sensitivity, given.invert, given.baud, given.sample_rate
+        wire = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
+                given.sample_rate)
         if any(wire) or given.increments != 'default':
-            raise UsageError('options of a port were given without --port; give it, or leave them out')
+            raise UsageError('options of a port were given without --port; '
+                             'give it, or leave them out')
         if not given.out.endswith('.mcap') and (given.all or len(given.reference_topic) > 1):
-            raise UsageError(f'{given.out}: a log has one gyro and one reference; record several topics into .mcap')
+            raise UsageError(f'{given.out}: a log has one gyro and one reference; '
+                             'record several topics into .mcap')
         try:
             from gyro_calibration.ros.recorder_node import take_messages
         except ImportError as error:
-            raise UsageError(f'topics need ROS 2, which is not there ({error}); source it, or record from --port') from None
+            raise UsageError(f'topics need ROS 2, which is not there ({error}); '
+                             'source it, or record from --port') from None
         self._take_messages = take_messages
-        roles = {'gyro': given.topic or _TOPICS['gyro'], 'temperature': given.temperature_topic or _TOPICS['temperature']}
+        roles = {'gyro': given.topic or _TOPICS['gyro'],
+                 'temperature': given.temperature_topic or _TOPICS['temperature']}
         if given.reference_topic:
             roles['reference'] = given.reference_topic[0]
         self._roles = {role: '/' + topic.lstrip('/') for role, topic in roles.items()}
         if len(set(self._roles.values())) < len(roles):
-            raise UsageError(f'one topic was named twice, of {", ".join(self._roles.values())}; name one each for {", ".join(roles)}')
+            raise UsageError(f'one topic was named twice, of {", ".join(self._roles.values())}; '
+                             f'name one each for {", ".join(roles)}')
         self._topics = [*self._roles.values(), *given.reference_topic[1:]]
-        self._heard, self._waiting, self._missing, self._known = 0, True, list(self._topics), list[str]()
+        self._heard, self._waiting, self._missing, self._known = (0, True, list(self._topics),
+                                                                  list[str]())
         self._unknown: dict[str, str] = {}
         super().__init__(given, stop)
-        self._log = MessageLog(self._recorder if isinstance(self._recorder, CsvRecorder) else None, self._roles)
+        self._log = MessageLog(
+            self._recorder if isinstance(self._recorder, CsvRecorder) else None, self._roles)
 
     @property
     def samples(self) -> int:
@@ -301,13 +359,16 @@ class _TopicSession(_Session):
         return self._log.lost
 
     def _open(self) -> Recorder:
-        # Who names a temperature or a reference wants it in the file; the usual temperature may be missing.
-        return self._create(lambda: about(topics='everything' if self._given.all else ', '.join(self._topics)),
-                            ('temperature_degc', *(['reference'] if 'reference' in self._roles else [])))
+        # A temperature or reference that was named belongs in the file; the usual temperature
+        # may be missing.
+        return self._create(
+            lambda: about(topics='everything' if self._given.all else ', '.join(self._topics)),
+            ('temperature_degc', *(['reference'] if 'reference' in self._roles else [])))
 
     def _take(self, tick: Callable[[], None]) -> None:
         with _prints_on_standard_error():
-            self._take_messages(self._topics, self._given.all, self._add, lambda node: self._watch(node, tick), self._stop)
+            self._take_messages(self._topics, self._given.all, self._add,
+                                lambda node: self._watch(node, tick), self._stop)
 
     def _add(self, message: Message, definition: str) -> None:
         self._heard += 1
@@ -322,19 +383,24 @@ class _TopicSession(_Session):
             self._waiting = False
             self._missing, self._known = node.missing, node.known()
             if self._missing:
-                say(f'nobody publishes {", ".join(self._missing)} so far; there are {", ".join(self._known) or "none"}')
+                say(f'nobody publishes {", ".join(self._missing)} so far; '
+                    f'there are {", ".join(self._known) or "none"}')
 
     def _details(self) -> dict[str, Any]:
         return {**super()._details(), 'messages': self._heard}
 
     def _remarks(self) -> list[str]:
-        log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.' for topic, reason in self._unknown.items()]
+        log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.'
+                                   for topic, reason in self._unknown.items()]
         left_out = '' if self._is_mcap() else ', and were left out'
-        remarks += [f'{wrong}; it was recorded as it is.' for wrong in log.of_another_kind.values()]
+        remarks += [f'{wrong}; it was recorded as it is.'
+                    for wrong in log.of_another_kind.values()]
         if log.damaged:
             remarks.append(f'{log.damaged} messages could not be read.')
         if log.left_out:
-            remarks.append(f'{log.left_out} samples had the stamp of another or an earlier one{left_out}.')
+            remarks.append(f'{log.left_out} samples had the stamp of another or an earlier one'
+                           f'{left_out}.')
         if log.clock_steps:
-            remarks.append(f'The clock of the stamps was set {log.clock_steps} times; the log goes on by the time of receiving.')
+            remarks.append(f'The clock of the stamps was set {log.clock_steps} times; '
+                           'the log goes on by the time of receiving.')
         return [*remarks, *super()._remarks()]

@@ -18,34 +18,44 @@ HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'reproduce', _reproduce, "the sources' numbers beside ours, with a verdict on each", 'hong_park')
-    parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE', help=f'one of {", ".join(SOURCES)}; default: all')
-    parser.add_argument('--seed', type=whole, default=0, help='of the noise; default: 0, as in docs/reproduction.md')
+    parser = verb(verbs, 'reproduce', _reproduce,
+                  "the sources' numbers beside ours, with a verdict on each", 'hong_park')
+    parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
+                        help=f'one of {", ".join(SOURCES)}; default: all')
+    parser.add_argument('--seed', type=whole, default=0,
+                        help='of the noise; default: 0, as in docs/reproduction.md')
     return parser
 
 
 def _reproduce(given: argparse.Namespace) -> Answer:
-    """Give every source a generator of its own, so that it says the same alone and with the others."""
+    """Give every source its own generator, so that its numbers do not depend on the others."""
     names = [given.source] if given.source else list(SOURCES)
-    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=partial(bar, what=name)) for name in names}
+    found = {name: SOURCES[name](np.random.default_rng(given.seed),
+                                 progress=partial(bar, what=name)) for name in names}
     text = '\n\n'.join(page(reproduction) for reproduction in found.values())
-    return Answer(text, {'seed': given.seed, 'sources': {name: reproduction.data() for name, reproduction in found.items()}})
+    return Answer(text, {'seed': given.seed, 'sources': {
+        name: reproduction.data() for name, reproduction in found.items()}})
 
 
 def page(reproduction: Reproduction) -> str:
     """Return title, assumptions, table and contradictions in Markdown."""
-    parts = [f'## {reproduction.title}', _items('Assumed:', reproduction.assumed), _table(reproduction.comparisons),
-             _items('What does not hold:', [contradiction.sentence for contradiction in reproduction.contradictions])]
+    parts = [f'## {reproduction.title}', _items('Assumed:', reproduction.assumed),
+             _table(reproduction.comparisons),
+             _items('What does not hold:',
+                    [contradiction.sentence for contradiction in reproduction.contradictions])]
     return '\n\n'.join(parts)
 
 
 def _items(heading: str, sentences: Iterable[str]) -> str:
-    items = [textwrap.fill(sentence, 130, initial_indent='* ', subsequent_indent='  ', break_on_hyphens=False) for sentence in sentences]
+    items = [textwrap.fill(sentence, 130, initial_indent='* ', subsequent_indent='  ',
+                           break_on_hyphens=False) for sentence in sentences]
     return '\n'.join([heading, '', *items])
 
 
 def _table(comparisons: Iterable[Comparison]) -> str:
     rows = [HEADER, *(comparison.cells() for comparison in comparisons)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER))]
-    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |' for row in rows]
-    return '\n'.join([lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|', *lines[1:]])
+    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |'
+             for row in rows]
+    return '\n'.join([lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|',
+                      *lines[1:]])

@@ -1,4 +1,4 @@
-"""The verb self-calibrate: scale factor error and bias from about 20 s of known motion, or from whole turns closed on a mark."""
+"""The verb self-calibrate: scale factor error and bias from a known motion or from whole turns."""
 
 from __future__ import annotations
 
@@ -43,21 +43,29 @@ NEAREST = 'nearest'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'self-calibrate', _self_calibrate, 'find scale factor error and bias from about 20 s of known motion',
+    parser = verb(verbs, 'self-calibrate', _self_calibrate,
+                  'find scale factor error and bias from about 20 s of known motion',
                    'run.csv --profile profile.csv --out model.yaml')
     add_log(parser)
-    parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or rate_dps; default: the reference of the log')
-    parser.add_argument('--turns', type=_turns, metavar='N', help='the robot was turned so many whole turns from a mark to the same mark '
-                        f'with a rest at both ends, counter-clockwise positive; or {NEAREST}')
-    parser.add_argument('--marking', type=not_negative, metavar='DEG', help='standard deviation of the angle between the two rests on '
-                        f'the mark, deg; default: {MARKING / DEGREE:g}')
-    parser.add_argument('--method', choices=list(METHODS), default='likelihood', help='default: likelihood; the others as published')
+    parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
+                        'rate_dps; default: the reference of the log')
+    parser.add_argument('--turns', type=_turns, metavar='N', help='the robot was turned so many '
+                        'whole turns from a mark to the same mark with a rest at both ends, '
+                        f'counter-clockwise positive; or {NEAREST}')
+    parser.add_argument('--marking', type=not_negative, metavar='DEG', help='standard deviation '
+                        'of the angle between the two rests on the mark, deg; '
+                        f'default: {MARKING / DEGREE:g}')
+    parser.add_argument('--method', choices=list(METHODS), default='likelihood',
+                        help='default: likelihood; the others as published')
     parser.add_argument('--model', metavar='MODEL.yaml', help='compensate by it first')
-    for name, unit, what in (('scale-deviation', '%%', 'the scale factor error'), ('drift', 'deg/s', 'the drift'),
+    for name, unit, what in (('scale-deviation', '%%', 'the scale factor error'),
+                             ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
         parser.add_argument(f'--reference-{name}', type=not_negative, default=0.0, metavar='X',
-                            help=f'standard deviation of {what} of the reference, or of who drives the profile, {unit}')
-    parser.add_argument('--out', metavar='MODEL.yaml', help='write the model with this self-calibration')
+                            help=f'standard deviation of {what} of the reference, '
+                            f'or of who drives the profile, {unit}')
+    parser.add_argument('--out', metavar='MODEL.yaml',
+                        help='write the model with this self-calibration')
     return parser
 
 
@@ -69,39 +77,50 @@ def _turns(text: str) -> int | str:
     except ValueError:
         value = 0
     if not value:
-        raise argparse.ArgumentTypeError(f'{text} is no whole number of turns other than 0, nor {NEAREST}')
+        raise argparse.ArgumentTypeError(f'{text} is no whole number of turns other than 0, '
+                                         f'nor {NEAREST}')
     return value
 
 
 def _self_calibrate(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
-        raise UsageError('--turns and --profile were both given; the mark or the profile is the reference, not both')
+        raise UsageError('--turns and --profile were both given; '
+                         'the mark or the profile is the reference, not both')
     if given.turns is None and given.marking is not None:
-        raise UsageError('--marking is the error of a mark, which only --turns has; leave it out, or say how many turns')
+        raise UsageError('--marking is the error of a mark, which only --turns has; '
+                         'leave it out, or say how many turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = read(given)
-    return _of_turns(given, model, log) if given.turns is not None else _of_motion(given, model, log)
+    return (_of_turns(given, model, log) if given.turns is not None
+            else _of_motion(given, model, log))
 
 
 def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = time_of(given, log), output_of(given, log)
-    motion, begin = (read_motion(given.profile), time[0]) if given.profile else _reference(given, log, time)
+    motion, begin = ((read_motion(given.profile), time[0]) if given.profile
+                     else _reference(given, log, time))
     time, known = time - begin, _plausible(given, model, log)
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rates = compensate_log(with_self_calibration(model, None), log)
-    fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise, reference=_goodness(given), output=output[run])
+    fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
+                         reference=_goodness(given), output=output[run])
     rest = rest_after(time[known], rates[known], fit, motion)
-    check = None if rest is None else check_rest(time[known][rest], rates[known][rest], fit, model.noise)
-    return _answer(given, model, log, fit, run, given.method, _figures(fit, check), list(_sentences(fit, check, given.method)))
+    check = (None if rest is None
+             else check_rest(time[known][rest], rates[known][rest], fit, model.noise))
+    return _answer(given, model, log, fit, run, given.method, _figures(fit, check),
+                   list(_sentences(fit, check, given.method)))
 
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, output = time_of(given, log), output_of(given, log)
-    known, rates = _plausible(given, model, log), compensate_log(with_self_calibration(model, None), log)
+    known, rates = (_plausible(given, model, log),
+                    compensate_log(with_self_calibration(model, None), log))
     marking = MARKING if given.marking is None else given.marking * DEGREE
-    found = calibrate_turns(time[known], rates[known], None if given.turns == NEAREST else given.turns,
-                            noise=model.noise, marking=marking, output=output[known])
-    data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rests), 'marking_rad': marking}
+    found = calibrate_turns(time[known], rates[known],
+                            None if given.turns == NEAREST else given.turns, noise=model.noise,
+                            marking=marking, output=output[known])
+    data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rests),
+            'marking_rad': marking}
     return _answer(given, model, log, found.fit, known, 'turns', data, [_turned(found, marking)])
 
 
@@ -116,27 +135,31 @@ def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
 def _turned(found: Turns, marking: float) -> str:
     way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rests
-    return (f'{abs(found.turns)} whole turns {way} in {found.duration:.1f} s, between rests of {before:.1f} and {after:.1f} s; the mark is '
-            f'met to {marking / DEGREE:g} deg.')
+    return (f'{abs(found.turns)} whole turns {way} in {found.duration:.1f} s, between rests of '
+            f'{before:.1f} and {after:.1f} s; the mark is met to {marking / DEGREE:g} deg.')
 
 
 def _goodness(given: argparse.Namespace) -> Reference:
     """Return how good the reference is said to be."""
-    return Reference(given.reference_scale_deviation / 100.0, given.reference_drift * DEGREE, given.reference_random_walk * DEGREE / 60.0)
+    return Reference(given.reference_scale_deviation / 100.0, given.reference_drift * DEGREE,
+                     given.reference_random_walk * DEGREE / 60.0)
 
 
-def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask, method: str, data: dict[str, Any],
-            lines: list[str]) -> Answer:
+def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask,
+            method: str, data: dict[str, Any], lines: list[str]) -> Answer:
     """Keep the calibration, and say what it is."""
     temperature = None if log.temperature is None else float(log.temperature[used].mean())
-    calibration = record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'), temperature)
+    calibration = record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
+                         temperature)
     if given.out:
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
     written = [f'Written to {given.out}.'] if given.out else []
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
-    said = [f'{refused} rows are not used: no such gyro reports that rate or temperature.'] if refused else []
+    said = ([f'{refused} rows are not used: no such gyro reports that rate or temperature.']
+            if refused else [])
     return Answer('\n'.join([_first(calibration, int(used.sum())), *lines, *said, *written]),
-                  {**calibration.figures(), 'samples': int(used.sum()), 'refused_samples': refused, **data, 'out': given.out})
+                  {**calibration.figures(), 'samples': int(used.sum()),
+                   'refused_samples': refused, **data, 'out': given.out})
 
 
 def _first(calibration: SelfCalibration, samples: int) -> str:
@@ -146,33 +169,42 @@ def _first(calibration: SelfCalibration, samples: int) -> str:
 def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
     """Return what else the fit found, in SI; None for what is not known."""
     good = fit.goodness
-    values = {'time_offset_s': fit.time_offset, 'time_offset_standard_deviation_s': fit.time_offset_deviation,
-              'start_heading_rad': fit.start_heading, 'start_heading_standard_deviation_rad': fit.start_heading_deviation,
-              'chi_square': good.chi_square if good else math.nan, 'degrees_of_freedom': good.freedom if good else math.nan,
-              'probability': good.probability if good else math.nan, 'noise_ratio': good.noise_ratio if good else math.nan,
-              'rest_rate_rad_s': check.rate if check else math.nan, 'rest_limit_rad_s': check.limit if check else math.nan}
+    values = {'time_offset_s': fit.time_offset,
+              'time_offset_standard_deviation_s': fit.time_offset_deviation,
+              'start_heading_rad': fit.start_heading,
+              'start_heading_standard_deviation_rad': fit.start_heading_deviation,
+              'chi_square': good.chi_square if good else math.nan,
+              'degrees_of_freedom': good.freedom if good else math.nan,
+              'probability': good.probability if good else math.nan,
+              'noise_ratio': good.noise_ratio if good else math.nan,
+              'rest_rate_rad_s': check.rate if check else math.nan,
+              'rest_limit_rad_s': check.limit if check else math.nan}
     return {name: None if math.isnan(value) else value for name, value in values.items()}
 
 
 def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
     if method == 'likelihood':
-        yield f'The gyro lags the profile by {fit.time_offset:.4f} +- {fit.time_offset_deviation:.4f} s.'
+        yield (f'The gyro lags the profile by {fit.time_offset:.4f} '
+               f'+- {fit.time_offset_deviation:.4f} s.')
     if not math.isnan(fit.start_heading):
-        yield (f'The run began {fit.start_heading / DEGREE:.3f} +- {fit.start_heading_deviation / DEGREE:.3f} deg from the first heading '
+        yield (f'The run began {fit.start_heading / DEGREE:.3f} '
+               f'+- {fit.start_heading_deviation / DEGREE:.3f} deg from the first heading '
                'of the reference.')
     if fit.goodness:
         yield f'{fit.goodness}.'
     if check:
-        yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; up to {check.limit / DEGREE:.4f} are '
-               'explained.')
+        yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
+               f'up to {check.limit / DEGREE:.4f} are explained.')
 
 
 def _reference(given: argparse.Namespace, log: Log, time: Array) -> tuple[Motion, float]:
-    """Return the motion that the reference of a log shows, and when by the log's time it begins, s."""
-    for values, motion in ((log.reference_heading, from_headings), (log.reference_rate, from_rates)):
+    """Return the motion of the reference of a log, and the time at which it begins, s."""
+    for values, motion in ((log.reference_heading, from_headings),
+                           (log.reference_rate, from_rates)):
         if values is not None:
             known = np.isfinite(values)
             if known.sum() < 2:
-                raise DataRefused(f'{given.log}: the reference is lost nearly everywhere; give the motion by --profile')
+                raise DataRefused(f'{given.log}: the reference is lost nearly everywhere; '
+                                  'give the motion by --profile')
             return motion(time[known], values[known]), float(time[known][0])
     raise UsageError(f'{given.log}: holds no reference; give the motion by --profile')

@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from gyro_calibration.cli.verb import Answer, UsageError, degrees_celsius, positive, time_of, verb, whole
+from gyro_calibration.cli.verb import (
+    Answer,
+    UsageError,
+    degrees_celsius,
+    positive,
+    time_of,
+    verb,
+    whole,
+)
 from gyro_calibration.log import Log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import NAMED, read_motion
@@ -21,9 +29,12 @@ MOST = 20_000_000
 
 
 def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
-    parser.add_argument('--motion', metavar='FILE|NAME', help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
-    parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ', help='default: 100')
-    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC', help='default: the reference temperature of the model')
+    parser.add_argument('--motion', metavar='FILE|NAME',
+                        help=f'a motion profile, or one of {", ".join(NAMED)}', **how)
+    parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ',
+                        help='default: 100')
+    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
+                        help='default: the reference temperature of the model')
     parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
 
 
@@ -39,20 +50,24 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _simulate(given: argparse.Namespace) -> Answer:
     log, seed = simulated(given)
     duration = float(time_of(given, log)[-1])
-    write_log(given.out, replace(log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
+    write_log(given.out, replace(
+        log, notes=(f'simulated with {given.model}, motion {given.motion}, seed {seed}',)))
     data = {'out': given.out, 'rows': len(log), 'duration_s': duration, 'seed': seed}
-    return Answer(f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.', data)
+    return Answer(f'{len(log)} samples over {duration:g} s, seed {seed}, written to {given.out}.',
+                  data)
 
 
 def simulated(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
     if given.motion not in NAMED and not os.path.exists(given.motion):
-        raise UsageError(f'{given.motion}: there is no such motion; name a file, or one of {", ".join(NAMED)}')
+        raise UsageError(f'{given.motion}: there is no such motion; '
+                         f'name a file, or one of {", ".join(NAMED)}')
     motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
     if motion.duration * given.sample_rate > MOST:
-        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than {MOST:g} samples; give a lower rate or a '
-                         'shorter motion')
+        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
+                         f'{MOST:g} samples; give a lower rate or a shorter motion')
     if round(motion.duration * given.sample_rate) < 1:
-        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has less than two samples; give a higher rate or a longer '
-                         'motion')
-    return simulate(read_model(given.model), motion, given.sample_rate, np.random.default_rng(seed), given.temperature), seed
+        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has less than '
+                         'two samples; give a higher rate or a longer motion')
+    return simulate(read_model(given.model), motion, given.sample_rate,
+                    np.random.default_rng(seed), given.temperature), seed

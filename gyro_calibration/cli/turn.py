@@ -1,4 +1,4 @@
-"""The verb turn: the error of a full turn over rate and temperature, with a static bias only and with a model."""
+"""The verb turn: the error of a full turn, with a static bias only and with a model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from gyro_calibration.cli.verb import Answer, add_log, digest, output_of, picture_file, positive, read, verb
+from gyro_calibration.cli.verb import (
+    Answer,
+    add_log,
+    digest,
+    output_of,
+    picture_file,
+    positive,
+    read,
+    verb,
+)
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.files import write_atomically
@@ -33,15 +42,18 @@ Bins: TypeAlias = 'list[tuple[float, float, Mask]]'
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'turn', _turn, 'error of a full turn over rate and temperature, with a static bias only and with a model',
+    parser = verb(verbs, 'turn', _turn, 'error of a full turn over rate and temperature, '
+                  'with a static bias only and with a model',
                   'table.csv --picture turn.png')
     add_log(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',
-                        help='used as it is; default: the effects that the data support, fitted for each sweep to the other sweeps')
+                        help='used as it is; default: the effects that the data support, '
+                        'fitted for each sweep to the other sweeps')
     parser.add_argument('--slowest', type=positive, default=SLOWEST / DEGREE, metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='the table, a row a turn, in SI')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the errors over the rate, .png or .svg')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE',
+                        help='draw the errors over the rate, .png or .svg')
     return parser
 
 
@@ -49,7 +61,8 @@ def _turn(given: argparse.Namespace) -> Answer:
     log = read(given)
     output_of(given, log)  # counts alone are wrong use here, as for other verbs
     found = dwells(log)
-    rate, kept, remarks, data = _fitted(found) if given.model is None else _as_given(given, read_model(given.model), log, found)
+    rate, kept, remarks, data = (_fitted(found) if given.model is None else
+                                 _as_given(given, read_model(given.model), log, found))
     errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
     if given.out:
         _write(given.out, errors)
@@ -57,38 +70,49 @@ def _turn(given: argparse.Namespace) -> Answer:
         draw_turn_errors(given.picture, errors, given.slowest * DEGREE)
     remarks = [*found.remarks, *errors.remarks, *remarks, *_outlying(found, kept)]
     written = [f'Written to {path}.' for path in (given.out, given.picture) if path]
-    return Answer('\n'.join([*_text(given, errors, remarks), *written]), {**_data(given, errors, remarks), **data})
+    return Answer('\n'.join([*_text(given, errors, remarks), *written]),
+                  {**_data(given, errors, remarks), **data})
 
 
 # rates by the model
 
 def _fitted(found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
-    """Return rates by models that never saw the sweep, which dwells are not outlying, and what to say of it."""
+    """Return rates by models not fitted to the sweep, the dwells not outlying, and remarks."""
     calibration = select_effects(found).calibration
     names = [effect.name for effect in calibration.effects]
-    remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted for each sweep to the other sweeps, '
-              'so that no turn is corrected by a model that has seen it')
-    return predicted_rates(calibration), calibration.scatter.kept, [remark], {'effects': names, 'left_out': True}
+    remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
+              'for each sweep to the other sweeps, so that no turn is corrected by a model that '
+              'has seen it')
+    return (predicted_rates(calibration), calibration.scatter.kept, [remark],
+            {'effects': names, 'left_out': True})
 
 
-def _as_given(given: argparse.Namespace, model: GyroModel, log: Log, found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
-    """Return rates by a given model, which dwells are not outlying, and what to say of it."""
+def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
+              found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+    """Return rates by a given model, the dwells not outlying, and remarks."""
     result = compensate(model, found.output, found.temperature)
     names = [term.effect.name for term in model.terms]
-    clipped, beyond = (int(np.count_nonzero(each)) for each in (result.temperature_clipped, result.beyond_range))
-    remarks = [f'the model is {given.model} as it is: {", ".join(names) or "no effects"}{_acquainted(model, given.log)}']
+    clipped, beyond = (int(np.count_nonzero(each))
+                       for each in (result.temperature_clipped, result.beyond_range))
+    remarks = [f'the model is {given.model} as it is: {", ".join(names) or "no effects"}'
+               f'{_acquainted(model, given.log)}']
     if found.temperature is None and model.looks_at('temperature'):
-        remarks.append('the log holds no temperature: the model was used at its reference temperature')
+        remarks.append('the log holds no temperature: '
+                       'the model was used at its reference temperature')
     if clipped:
-        remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated temperatures; the nearest end was used')
+        remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated '
+                       'temperatures; the nearest end was used')
     if beyond:
-        remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; the correction is extrapolated')
+        remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
+                       'the correction is extrapolated')
     rate = _around(model, log, found) if model.looks_around else result.rate
-    return rate, not_outlying(found), remarks, {'effects': names, 'left_out': False, 'temperature_clipped': clipped, 'beyond_range': beyond}
+    return rate, not_outlying(found), remarks, {
+        'effects': names, 'left_out': False, 'temperature_clipped': clipped,
+        'beyond_range': beyond}
 
 
 def _around(model: GyroModel, log: Log, found: Dwells) -> Array:
-    """Return rates by a model that looks at more than the means of dwells tell, such as the past: the log is compensated row by row."""
+    """Return rates by a model that depends on the past: the log is compensated row by row."""
     error = np.asarray(log.output) - compensate_log(model, log)
     return found.output - np.array([error[rows].mean() for rows in found.rows])
 
@@ -96,8 +120,10 @@ def _around(model: GyroModel, log: Log, found: Dwells) -> Array:
 def _acquainted(model: GyroModel, log: str) -> str:
     """Say whether the model was fitted to the log, by the sums of the files that it comes from."""
     if any(file.is_file() and digest(file) in str(model.origin) for file in files_of(log)):
-        return '; it was fitted to this log, so that these are errors of a fit, not of a prediction'
-    return '' if 'sha256' in str(model.origin) else '; if it was fitted to this log, these are errors of a fit, not of a prediction'
+        return ('; it was fitted to this log, '
+                'so that these are errors of a fit, not of a prediction')
+    return '' if 'sha256' in str(model.origin) else (
+        '; if it was fitted to this log, these are errors of a fit, not of a prediction')
 
 
 def _outlying(found: Dwells, kept: Mask) -> Iterator[str]:
@@ -109,14 +135,18 @@ def _outlying(found: Dwells, kept: Mask) -> Iterator[str]:
 # bins
 
 def _rate_bins(errors: TurnErrors, slowest: float) -> Bins:
-    """Return limits of 1, 2, 5, 10 and so on deg/s each way, rad/s, and which errors lie between them."""
+    """Return limits of 1, 2, 5, 10, ... deg/s each way, rad/s, and which errors lie between."""
     speed = np.abs(errors.rate)
-    steps = DEGREE * np.array([factor * 10.0 ** power for power in range(-3, 5) for factor in (1, 2, 5)])
+    steps = DEGREE * np.array([factor * 10.0 ** power
+                               for power in range(-3, 5) for factor in (1, 2, 5)])
     # A step just below the fastest turn would make a bin of next to nothing.
-    edges = np.concatenate([[slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
+    edges = np.concatenate([
+        [slowest], steps[(steps > 1.01 * slowest) & (steps < speed.max() / 1.2)], [speed.max()]])
     number = _numbers(edges, speed)
-    ways = [(-high, -low, (number == place) & (errors.rate < 0.0)) for place, (low, high) in enumerate(zip(edges, edges[1:]))][::-1]
-    ways += [(low, high, (number == place) & (errors.rate > 0.0)) for place, (low, high) in enumerate(zip(edges, edges[1:]))]
+    ways = [(-high, -low, (number == place) & (errors.rate < 0.0))
+            for place, (low, high) in enumerate(zip(edges, edges[1:]))][::-1]
+    ways += [(low, high, (number == place) & (errors.rate > 0.0))
+             for place, (low, high) in enumerate(zip(edges, edges[1:]))]
     return [each for each in ways if each[2].any()]
 
 
@@ -126,15 +156,17 @@ def _temperature_bins(errors: TurnErrors) -> Bins:
         return []
     low, high = float(errors.temperature.min()), float(errors.temperature.max())
     widths = [factor * 10.0 ** power for power in range(4) for factor in (1, 2, 5)]
-    width = next((width for width in widths if high - low <= (_TEMPERATURE_BINS - 1) * width), widths[-1])
+    width = next((width for width in widths if high - low <= (_TEMPERATURE_BINS - 1) * width),
+                 widths[-1])
     edges = np.arange(math.floor(low / width), math.floor(high / width) + 2) * width
     number = _numbers(edges, errors.temperature)
-    bins = [(low, high, number == place) for place, (low, high) in enumerate(zip(edges, edges[1:]))]
+    bins = [(low, high, number == place)
+            for place, (low, high) in enumerate(zip(edges, edges[1:]))]
     return [each for each in bins if each[2].any()]
 
 
 def _numbers(edges: Array, values: Array) -> Any:
-    """Return the number of the bin that each value lies in; the last bin holds its upper edge too."""
+    """Return the number of the bin of each value; the last bin holds its upper edge too."""
     return np.minimum(np.searchsorted(edges, values, side='right') - 1, len(edges) - 2)
 
 
@@ -142,14 +174,18 @@ def _numbers(edges: Array, values: Array) -> Any:
 
 def _text(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> Iterator[str]:
     before, after = size(errors.static), size(errors.modelled)
-    yield (f'Error of a turn of 360 deg: largest {_degrees(before.largest)} with the static bias only, {_degrees(after.largest)} with the '
-           f'model, {_ratio(before.largest, after.largest)} times less; rms {_degrees(before.rms)} and {_degrees(after.rms)}, '
+    yield (f'Error of a turn of 360 deg: largest {_degrees(before.largest)} with the static bias '
+           f'only, {_degrees(after.largest)} with the model, '
+           f'{_ratio(before.largest, after.largest)} times less; '
+           f'rms {_degrees(before.rms)} and {_degrees(after.rms)}, '
            f'{_ratio(before.rms, after.rms)} times less.')
-    yield f'{len(errors)} turns, {given.slowest:g} deg/s and faster, of {len(np.unique(errors.sweep))} sweeps in {given.log}.'
+    yield (f'{len(errors)} turns, {given.slowest:g} deg/s and faster, '
+           f'of {len(np.unique(errors.sweep))} sweeps in {given.log}.')
     for remark in remarks:
         yield f'{remark[0].upper()}{remark[1:]}.'
-    yield from _table('rate [deg/s]', errors, [(low / DEGREE, high / DEGREE, mask) for low, high, mask in _rate_bins(
-        errors, given.slowest * DEGREE)])
+    yield from _table('rate [deg/s]', errors, [
+        (low / DEGREE, high / DEGREE, mask)
+        for low, high, mask in _rate_bins(errors, given.slowest * DEGREE)])
     yield from _table('temperature [degC]', errors, _temperature_bins(errors))
 
 
@@ -171,19 +207,23 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
     for low, high, mask in bins:
         label = f'{low:.4g} to {high:.4g}'
         yield f'{label:20} {np.count_nonzero(mask):5d}' + ''.join(
-            f'  {value / DEGREE:7.3f} {100.0 * value / TURN:7.3f}' for each in (errors.static, errors.modelled)
+            f'  {value / DEGREE:7.3f} {100.0 * value / TURN:7.3f}'
+            for each in (errors.static, errors.modelled)
             for value in (size(each[mask]).rms, size(each[mask]).largest))
 
 
 def _data(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> dict[str, Any]:
     before, after = size(errors.static), size(errors.modelled)
-    ratios = {f'ratio_{name}': getattr(before, name) / getattr(after, name) if getattr(after, name) > 0.0 else None
-              for name in ('rms', 'largest')}
-    return {'turns': len(errors), 'slowest_rad_s': given.slowest * DEGREE, 'static': _figures(before), 'modelled': _figures(after),
-            **ratios, 'by_rate': _bin_data('rad_s', errors, _rate_bins(errors, given.slowest * DEGREE)),
+    ratios = {f'ratio_{name}': getattr(before, name) / getattr(after, name)
+              if getattr(after, name) > 0.0 else None for name in ('rms', 'largest')}
+    return {'turns': len(errors), 'slowest_rad_s': given.slowest * DEGREE,
+            'static': _figures(before), 'modelled': _figures(after), **ratios,
+            'by_rate': _bin_data('rad_s', errors, _rate_bins(errors, given.slowest * DEGREE)),
             'by_temperature': _bin_data('degc', errors, _temperature_bins(errors)),
-            'rate_rad_s': errors.rate.tolist(), 'temperature_degc': None if errors.temperature is None else errors.temperature.tolist(),
-            'static_rad_per_turn': errors.static.tolist(), 'modelled_rad_per_turn': errors.modelled.tolist(),
+            'rate_rad_s': errors.rate.tolist(), 'temperature_degc': None
+            if errors.temperature is None else errors.temperature.tolist(),
+            'static_rad_per_turn': errors.static.tolist(),
+            'modelled_rad_per_turn': errors.modelled.tolist(),
             'sweep': errors.sweep.tolist(), 'place': list(errors.place), 'remarks': remarks}
 
 
@@ -193,14 +233,17 @@ def _figures(of: Size) -> dict[str, float]:
 
 def _bin_data(unit: str, errors: TurnErrors, bins: Bins) -> list[dict[str, Any]]:
     return [{f'from_{unit}': low, f'to_{unit}': high, 'turns': int(np.count_nonzero(mask)),
-             'static': _figures(size(errors.static[mask])), 'modelled': _figures(size(errors.modelled[mask]))} for low, high, mask in bins]
+             'static': _figures(size(errors.static[mask])),
+             'modelled': _figures(size(errors.modelled[mask]))} for low, high, mask in bins]
 
 
 def _write(path: str, errors: TurnErrors) -> None:
-    temperature = np.full(len(errors), np.nan) if errors.temperature is None else errors.temperature
+    temperature = (np.full(len(errors), np.nan) if errors.temperature is None
+                   else errors.temperature)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc', 'static_rad_per_turn', 'modelled_rad_per_turn'))
-    writer.writerows(zip(errors.place, *(values.tolist() for values in (errors.sweep, errors.rate, temperature, errors.static,
-                                                                       errors.modelled))))
+    writer.writerow(('place', 'sweep', 'reference_rate_rad_s', 'temperature_degc',
+                     'static_rad_per_turn', 'modelled_rad_per_turn'))
+    writer.writerows(zip(errors.place, *(values.tolist() for values in (
+        errors.sweep, errors.rate, temperature, errors.static, errors.modelled))))
     write_atomically(path, text.getvalue().encode())

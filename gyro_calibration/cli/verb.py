@@ -36,28 +36,35 @@ class Answer:
     data: dict[str, Any]
 
 
-def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None], summary: str,
-          example: str) -> argparse.ArgumentParser:
-    parser = verbs.add_parser(name, help=summary, description=f'{summary[0].upper()}{summary[1:]}.',
+def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer | None],
+         summary: str, example: str) -> argparse.ArgumentParser:
+    parser = verbs.add_parser(name, help=summary,
+                              description=f'{summary[0].upper()}{summary[1:]}.',
                               epilog=f'example: gyro_calibration {name} {example}')
     parser.set_defaults(verb=function, name=name)
     return parser
 
 
 def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
-    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a ROS 2 recording: folder, .mcap or .db3',
-                        **how)
-    parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this rate; for logs without a usable time_s')
-    parser.add_argument('--sensitivity', type=positive, metavar='DPS', help='deg/s a count, for logs that hold gyro_counts alone')
-    parser.add_argument('--invert', action='store_true', help='the gyro counts clockwise turns positive')
+    parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a '
+                        'ROS 2 recording: folder, .mcap or .db3', **how)
+    parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this '
+                        'rate; for logs without a usable time_s')
+    parser.add_argument('--sensitivity', type=positive, metavar='DPS',
+                        help='deg/s a count, for logs that hold gyro_counts alone')
+    parser.add_argument('--invert', action='store_true',
+                        help='the gyro counts clockwise turns positive')
     add_topics(parser)
 
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--topic', metavar='TOPIC', help='of the gyro in a recording, sensor_msgs/Imu; default: the only one')
-    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference in a recording, nav_msgs/Odometry, sensor_msgs/Imu, '
+    parser.add_argument('--topic', metavar='TOPIC', help='of the gyro in a recording, '
+                        'sensor_msgs/Imu; default: the only one')
+    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference in a '
+                        'recording, nav_msgs/Odometry, sensor_msgs/Imu, '
                         'geometry_msgs/PoseStamped or TwistStamped; default: none')
-    parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; default: the one named most like that of the gyro')
+    parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; '
+                        'default: the one named most like that of the gyro')
 
 
 def positive(text: str) -> float:
@@ -91,13 +98,15 @@ def picture_file(text: str) -> str:
     if not text.endswith(('.png', '.svg')):
         raise argparse.ArgumentTypeError(f'{text}: a picture ends in .png or .svg; name it so')
     if importlib.util.find_spec('matplotlib') is None:
-        raise argparse.ArgumentTypeError('a picture needs matplotlib, which is not installed; install it, or leave the picture out')
+        raise argparse.ArgumentTypeError('a picture needs matplotlib, which is not installed; '
+                                         'install it, or leave the picture out')
     return text
 
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    log = _recorded(given) if is_recording(given.log) else read_log(given.log, _sensitivity(given), given.rate)
+    log = (_recorded(given) if is_recording(given.log)
+           else read_log(given.log, _sensitivity(given), given.rate))
     return _turned(given, log)
 
 
@@ -107,24 +116,26 @@ def say(text: object) -> None:
 
 
 def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
-    """Show on a terminal how far the work on some items is, if it takes longer than two seconds."""
+    """Show on a terminal the progress over some items, if it takes longer than two seconds."""
     return tqdm(items, desc=what, delay=2.0, leave=False, disable=None)
 
 
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:
     """Return what a model file says of where it comes from: logs, date, program."""
-    files = [{'name': plain(file.name), **({'sha256': digest(file)} if os.path.isfile(file) else {})}
+    files = [{'name': plain(file.name),
+              **({'sha256': digest(file)} if os.path.isfile(file) else {})}
              for path in paths for file in files_of(path)]
-    return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'), 'program': f'gyro_calibration {__version__}'}
+    return {'files': files, 'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+            'program': f'gyro_calibration {__version__}'}
 
 
 def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
-    """Return the model that --model gave as it is, or else the new one with the log that it comes from."""
+    """Return the model of --model as it is, or else the new one with the log as its origin."""
     return model if given.model else replace(model, origin=origin_of([given.log]))
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, which is no pipe: that was read already, and would be waited for."""
+    """Return the SHA-256 of a file, which must not be a pipe: that would block."""
     found = hashlib.sha256()
     with opened(path) as file:
         while piece := file.read(1 << 20):
@@ -144,9 +155,10 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
 
 @contextmanager
 def _bytes_of(path: str) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how many bytes of a log are read, and give the function that is to be told."""
+    """Show on a terminal how many bytes of a log are read, and give the function that counts."""
     size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
-    with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=2.0, leave=False, disable=None) as shown:
+    with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=2.0, leave=False,
+              disable=None) as shown:
         yield lambda place: _show_place(shown, place)
 
 
@@ -155,7 +167,7 @@ def _show_place(shown: Any, place: int) -> None:
 
 
 def _recorded(given: argparse.Namespace) -> Log:
-    """Read a recording, and say on standard error what was taken and mended: no answer of a verb shows the notes of a log."""
+    """Read a recording, and print on standard error what was taken and mended."""
     topics = Topics(given.topic, given.reference_topic, given.temperature_topic)
     with _bytes_of(given.log) as heard:
         return read_recording(given.log, topics, given.rate, heard, say)
@@ -171,11 +183,13 @@ def _turned(given: argparse.Namespace, log: Log) -> Log:
 
 def output_of(given: argparse.Namespace, log: Log) -> Array:
     if log.output is None:
-        raise UsageError(f'{given.log}: holds gyro_counts alone; say with --sensitivity how many deg/s a count is')
+        raise UsageError(f'{given.log}: holds gyro_counts alone; '
+                         'say with --sensitivity how many deg/s a count is')
     return log.output
 
 
 def time_of(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
-        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; say with --rate how many samples a second it holds')
+        raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; '
+                         'say with --rate how many samples a second it holds')
     return log.time
