@@ -1,13 +1,14 @@
 """
 Calibrate a gyro, so that a robot knows its heading.
 
-Words. The *output* is what the gyro reports, the *rate* is the true rate about its input axis, the *heading* is the integral of the
-rate. They hang together by ``output = rate + errors(rate, output, temperature) + noise``, and each error is one *effect*.
+Words. The *output* is what the gyro reports, the *rate* is the true rate about its input axis, the
+*heading* is the integral of the rate. Each error is one *effect*, and
+``output = rate + errors(rate, output, temperature) + noise``.
 
 Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise positive (REP-103).
 
-Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist only at the rim (files, wires, the
-command line), where the name says so: ``gyro_dps``.
+Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist
+only in files, wires and the command line, where the name says so: ``gyro_dps``.
 
 Reading order: `log`, `messages`, `storage`, `recording`, `stamps`, `effects`, `history`, `noise`,
 `noise_grid`, `model`, `settings_file`, `model_file`, `motion`, `simulation`, `compensation`,

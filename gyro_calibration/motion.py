@@ -1,4 +1,4 @@
-"""A known motion about one axis: the profile of a calibration, or the drive of a simulated robot."""
+"""A known motion about one axis: the profile of a calibration, or the drive of a robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class Motion:
     """
     A motion, known at some times.
 
-    Between them the rate is linear where the rates are known, and the heading is linear where only headings are known.
+    Between them the rate is linear where the rates are known, and the heading is linear where only
+    headings are known.
 
     Attributes
     ----------
@@ -91,34 +92,41 @@ def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
     return from_rates(np.array(time), np.array(rate))
 
 
-#: 20 s that part scale factor error from bias: both signs, two speeds, rests, gentle ramps, and back to the first heading.
-CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)])
+#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, gentle ramps,
+#: and back to the first heading.
+CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30),
+                     (1, 0)])
 #: 160 s of a robot on its way through rooms, half of it standing or going straight.
-ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10), (6, 0), (5, 20), (8, 0), (5, -20),
-               (7, 0), (5, -20), (8, 0), (5, 20), (7, 0), (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])
+ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10),
+               (6, 0), (5, 20), (8, 0), (5, -20), (7, 0), (5, -20), (8, 0), (5, 20), (7, 0),
+               (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])
 NAMED = {
     'calibration': CALIBRATION,
     'robot': ROBOT,
     'rest': from_rates(np.array([0.0, 60.0]), np.zeros(2)),
 }
 
-_WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE, 'reference_heading_rad': 1.0,
-          'rate_dps': DEGREE, 'rate_rad_s': 1.0, 'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
+_WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
+          'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,
+          'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
 
 
 def read_motion(path: str | Path) -> Motion:
     """
-    Read a motion profile, a CSV file with time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s.
+    Read a motion profile from a CSV file.
 
-    The reference of a log is one too: its heading where it has both, and without the rows where it was lost.
+    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
+    is a profile too: its heading where it has both, and without the rows where it was lost.
 
     Raises
     ------
-    MotionError : the file cannot be read, has other columns, a value that is no finite number, or times that do not increase
+    MotionError : the file cannot be read, has other columns, a value that is not a finite number,
+        or times that do not increase
 
     """
     try:
-        rows = csv.reader(line for line in _lines(path) if line.strip() and not line.startswith('#'))
+        rows = csv.reader(line for line in _lines(path)
+                          if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         name = _moving_column(path, header)
         columns = {each: header.index(each) for each in ('time_s', name)}
@@ -126,8 +134,8 @@ def read_motion(path: str | Path) -> Motion:
     except MotionError:
         raise
     except (OSError, ValueError, csv.Error) as error:
-        raise MotionError(f'{path}: cannot be read as a motion profile ({reason(error)}); wanted a CSV file with time_s and '
-                          'heading_deg') from error
+        raise MotionError(f'{path}: cannot be read as a motion profile ({reason(error)}); '
+                          'wanted a CSV file with time_s and heading_deg') from error
     known = np.isfinite(values)
     time, values = time[known], values[known] * _WORDS[name]
     if len(time) < 2 or not (np.diff(time) >= SHORTEST).all():
@@ -138,10 +146,12 @@ def read_motion(path: str | Path) -> Motion:
 def _moving_column(path: str | Path, header: list[str]) -> str:
     """Return the name of the column that holds the motion."""
     found = [name for name in _WORDS if name in header]
-    both = len(found) == 2 and found[0].startswith('reference_heading') and found[1].startswith('reference_rate')
+    both = (len(found) == 2 and found[0].startswith('reference_heading')
+            and found[1].startswith('reference_rate'))
     if 'time_s' not in header or not (len(found) == 1 or both):
         given = shown(','.join(header)) or 'nothing'
-        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s')
+        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
+                          'heading_deg, heading_rad, rate_dps, rate_rad_s')
     return found[0]
 
 
@@ -149,7 +159,8 @@ def _lines(path: str | Path) -> io.StringIO:
     return io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
 
 
-def _numbers(path: str | Path, rows: Iterable[list[str]], columns: dict[str, int]) -> Iterator[float]:
+def _numbers(path: str | Path, rows: Iterable[list[str]],
+             columns: dict[str, int]) -> Iterator[float]:
     """Give time and value of one row after the other, nan where a reference was lost."""
     for row in rows:
         for name, place in columns.items():
@@ -158,5 +169,6 @@ def _numbers(path: str | Path, rows: Iterable[list[str]], columns: dict[str, int
             except (IndexError, ValueError):
                 value = math.inf
             if not (abs(value) <= LARGEST or math.isnan(value) and name.startswith('reference_')):
-                raise MotionError(f'{path}: column {name} holds something that is not a finite number; mend or remove the row')
+                raise MotionError(f'{path}: column {name} holds something that is not a finite '
+                                  'number; mend or remove the row')
             yield value

@@ -1,12 +1,14 @@
 """
-The motion that calibrates best: within what a robot can do, the one after which the heading of a later drive errs least.
+The motion, within what a robot can do, after which the heading of a later drive errs least.
 
-What a run will tell is known before it is driven. `fit_likelihood` weighs increments of headings; the same columns, the same priors on
-delay and lag and the noise figures of the gyro give the covariance of scale factor error s and bias b, and with it that of the heading of
-any later drive that is integrated from them. Flicker and random walk of the bias, which the fit does not weigh, go through its weights.
+What a run determines is known before it is driven. `fit_likelihood` weighs increments of headings;
+the same columns, the same priors on delay and lag and the noise figures of the gyro give the
+covariance of scale factor error s and bias b, and with it that of the heading of any later drive
+that is integrated from them. Flicker and random walk of the bias, which the fit does not weigh, go
+through its weights.
 
-A motion that comes back has no net turn, so that s and b are estimated independently: the bias as well as white noise N allows in the
-time T, N / √T, whatever the motion. The motion decides on s.
+A motion that comes back has no net turn, so that s and b are estimated independently: the bias as
+well as white noise N allows in the time T, N / √T, whatever the motion. The motion decides on s.
 
 """
 
@@ -37,8 +39,10 @@ class Ability:
 
     Attributes
     ----------
-    rate, acceleration, jerk : at most so much either way, rad/s, rad/s², rad/s³; inf for a jerk that does not matter
-    slowest : no turn is slower than this between its ramps, rad/s, as where a drive does not turn smoothly
+    rate, acceleration, jerk : at most so much either way, rad/s, rad/s², rad/s³; inf for a jerk
+        that does not matter
+    slowest : no turn is slower than this between its ramps, rad/s, as where a drive does not turn
+        smoothly
     lowest, highest : the heading stays between them, rad, beginning at 0
     rest : the robot stands at least so long at the beginning and at the end, s
 
@@ -53,9 +57,10 @@ class Ability:
     rest: float = 1.0
 
     def rising(self, rate: Number) -> tuple[Number, Number]:
-        """Return how long a ramp from rest to a rate takes but for its rounding, and the rounding, s; no ramp to a low rate gets steep."""
+        """Return the time of a ramp from rest to a rate less its rounding, and the rounding, s."""
         jerked = np.sqrt(rate / self.jerk)
-        return np.maximum(rate / self.acceleration, jerked), np.minimum(self.acceleration / self.jerk, jerked)
+        return (np.maximum(rate / self.acceleration, jerked),
+                np.minimum(self.acceleration / self.jerk, jerked))
 
     def ramp(self, rate: Number) -> Number:
         """Return how long the robot takes from rest to a rate, s."""
@@ -63,15 +68,17 @@ class Ability:
         return rising + rounding
 
     def fastest(self, angle: float) -> float:
-        """Return the fastest rate, rad/s, of a turn through an angle above 0, rad: there is none left at it where rate times ramp is it."""
+        """Return the fastest rate, rad/s, whose ramps fit into a turn by an angle above 0, rad."""
         jerked = 0.5 * self.acceleration ** 2 / self.jerk
-        steep, low = math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked, (0.25 * angle ** 2 * self.jerk) ** (1.0 / 3.0)
+        steep, low = (math.sqrt(jerked ** 2 + self.acceleration * angle) - jerked,
+                      (0.25 * angle ** 2 * self.jerk) ** (1.0 / 3.0))
         return min(self.rate, low if low < 2.0 * jerked else steep)
 
     def reach(self, duration: float) -> float:
         """Return how far the robot turns in that time, s, from rest to rest, rad."""
         half, rounding = 0.5 * duration, self.acceleration / self.jerk
-        rate = min(self.rate, self.acceleration * (half - rounding) if half > 2.0 * rounding else 0.25 * self.jerk * half ** 2)
+        rate = min(self.rate, self.acceleration * (half - rounding) if half > 2.0 * rounding
+                   else 0.25 * self.jerk * half ** 2)
         return rate * (duration - float(self.ramp(rate)))
 
 
@@ -85,7 +92,8 @@ class Prediction:
     scale_deviation : standard deviation of s, 1
     bias_deviation : standard deviation of b against the mean bias of the drive that follows, rad/s
     heading_error : mean of the error of the heading over that drive, taken positive, rad
-    floor : what of that stays if s and the bias at every moment were known: white noise, integrated
+    floor : the part of it that white noise causes: what stays if s and the bias at every moment
+        were known
 
     """
 
@@ -113,51 +121,59 @@ class Forecast:
         self._noise, self._duration, self._length = noise, duration, length
         time = np.linspace(0.0, length, min(max(round(length), 1), _MOST) + 1)[1:]
         self._used = np.vstack([_heading(drive, time), time])
-        self.floor = math.sqrt(2.0 / math.pi) * noise.angle_random_walk * float(np.sqrt(time).mean())
+        self.floor = (math.sqrt(2.0 / math.pi) * noise.angle_random_walk
+                      * float(np.sqrt(time).mean()))
         self._noises: dict[int, _Noises] = {}
 
     def predict(self, motion: Motion) -> Prediction:
-        """Return what a run of the motion is worth; it turns, and its length is that of the forecast."""
+        """Return the prediction for a motion that turns and has the length of the forecast."""
         return self._predict(motion, round(self._duration / block_length(motion)))
 
     def error(self, motion: Motion) -> float:
         """
         Return the heading error, rad, by blocks of one length for all motions.
 
-        A fit takes shorter blocks where the motion is fast, and loses less at both ends: by 0.3 % a better bias. A search would find that,
-        and fall for motions that gain it while they lose of the scale.
+        A fit takes shorter blocks where the motion is fast, and loses less at both ends: the bias
+        is better by 0.3 %. A search would find that, and prefer motions that gain it at the cost
+        of the scale.
 
         """
-        return self._predict(motion, math.ceil(self._duration / min(BLOCK, self._duration / 40.0))).heading_error
+        return self._predict(
+            motion, math.ceil(self._duration / min(BLOCK, self._duration / 40.0))).heading_error
 
     def _predict(self, motion: Motion, blocks: int) -> Prediction:
         if blocks not in self._noises:
-            self._noises[blocks] = _noises(self._noise, self._duration, blocks, self._length, self._used.shape[1])
+            self._noises[blocks] = _noises(self._noise, self._duration, blocks, self._length,
+                                           self._used.shape[1])
         noises = self._noises[blocks]
         weights = self._weights(motion, blocks, noises)
         own, shared = weights @ noises.run @ weights.T, weights @ noises.shared
-        variance = noises.drive - 2.0 * (self._used * shared).sum(axis=0) + (self._used * (own @ self._used)).sum(axis=0)
+        variance = (noises.drive - 2.0 * (self._used * shared).sum(axis=0)
+                    + (self._used * (own @ self._used)).sum(axis=0))
         error = math.sqrt(2.0 / math.pi) * float(np.sqrt(np.maximum(variance, 0.0)).mean())
         # of the mean bias of the drive, white noise is no part
-        of_mean = float(noises.drive[-1]) / self._length ** 2 - self._noise.angle_random_walk ** 2 / self._length
+        of_mean = (float(noises.drive[-1]) / self._length ** 2
+                   - self._noise.angle_random_walk ** 2 / self._length)
         of_bias = own[1, 1] - 2.0 * shared[1, -1] / self._length + of_mean
         return Prediction(math.sqrt(own[0, 0]), math.sqrt(of_bias), error, self.floor)
 
     def _weights(self, motion: Motion, blocks: int, noises: _Noises) -> Array:
-        """Return what the fit makes of increments of the gyro's integral for (s, b), shape (2, n)."""
+        """Return the weights of (s, b) on increments of the gyro's integral, shape (2, n)."""
         count = blocks * _CELLS * _POINTS
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
         known = np.column_stack([motion.heading_at(point), point, rate, np.gradient(rate, point)])
         columns = np.diff(known.reshape(blocks, -1, 4).mean(axis=1), axis=0)
         weighted = noises.inverse @ columns
-        return np.linalg.solve(columns.T @ weighted + np.diag([0.0, 0.0, DELAY_DEVIATION ** -2, LAG_DEVIATION ** -2]), weighted.T)[:2]
+        return np.linalg.solve(
+            columns.T @ weighted + np.diag([0.0, 0.0, DELAY_DEVIATION ** -2, LAG_DEVIATION ** -2]),
+            weighted.T)[:2]
 
 
 @dataclass(frozen=True)
 class _Noises:
     """
-    What noise does to the increments of a run, between its blocks, and to the heading of the drive.
+    Noise of the increments between the blocks of a run, and of the heading of the drive.
 
     Attributes
     ----------
@@ -176,16 +192,18 @@ class _Noises:
 
 def _noises(noise: Noise, duration: float, blocks: int, length: float, later: int) -> _Noises:
     cells = blocks * _CELLS
-    edges = np.concatenate([np.linspace(0.0, duration, cells + 1), duration + np.linspace(0.0, length, later + 1)[1:]])
+    edges = np.concatenate([np.linspace(0.0, duration, cells + 1),
+                            duration + np.linspace(0.0, length, later + 1)[1:]])
     covariance, spread = _covariance(noise, edges), _spread(blocks, duration / blocks)
     sums = np.tril(np.full((later, later), length / later))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
-    return _Noises(np.linalg.inv(white), spread @ covariance[:cells, :cells] @ spread.T, spread @ covariance[:cells, cells:] @ sums.T,
+    return _Noises(np.linalg.inv(white), spread @ covariance[:cells, :cells] @ spread.T,
+                   spread @ covariance[:cells, cells:] @ sums.T,
                    ((sums @ covariance[cells:, cells:]) * sums).sum(axis=1))
 
 
 def _spread(blocks: int, length: float) -> Array:
-    """Return how far the mean headings of neighbouring blocks are apart for a unit rate in each cell, s, shape (blocks - 1, cells)."""
+    """Return heading between blocks for a unit rate in each cell, s, (blocks - 1, cells)."""
     rising = (np.arange(_CELLS) + 0.5) / _CELLS
     before, after = np.eye(blocks)[:-1], np.eye(blocks)[1:]
     return (np.kron(before, rising) + np.kron(after, rising[::-1])) * length / _CELLS
@@ -193,10 +211,11 @@ def _spread(blocks: int, length: float) -> Array:
 
 def _covariance(noise: Noise, edges: Array) -> Array:
     """
-    Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), in (rad/s)².
+    Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
 
-    Flicker and random walk have no variance, but their increments do: generalized covariances -B² / pi log|t| and -K² / 2 |t|. Sums
-    whose weights add up to zero, as the error of a bias against a later bias, have the right variance.
+    Flicker and random walk have no variance, but their increments do: generalized covariances
+    -B² / pi log|t| and -K² / 2 |t|. Sums whose weights add up to zero, as the error of a bias
+    against a later bias, have the right variance.
 
     """
     apart = np.abs(edges[:, None] - edges)
@@ -216,7 +235,7 @@ def _heading(drive: Motion, time: Array) -> Array:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn through an angle, rad, signed, at a rate above 0, rad/s, and the rest after it, s."""
+    """One turn through an angle, rad, signed, at a rate above 0, rad/s, and its rest after, s."""
 
     angle: float
     rate: float
@@ -224,11 +243,13 @@ class Turn:
 
 
 def profile(ability: Ability, turns: list[Turn], first_rest: float) -> Motion:
-    """Return the motion that rests and then makes the turns one after another; angles are large enough for their rates."""
+    """Return the motion of a rest and then turns; angles are large enough for their rates."""
     time, rate = [0.0, first_rest], [0.0, 0.0]
     for turn in turns:
-        ramp, steady = _ramp(ability, turn.rate), abs(turn.angle) / turn.rate - ability.ramp(turn.rate)
-        up, down = time[-1] + ramp[0][1:], time[-1] + ramp[0][1:] + ramp[0][-1] + max(steady, 0.0)
+        ramp, steady = (_ramp(ability, turn.rate),
+                        abs(turn.angle) / turn.rate - ability.ramp(turn.rate))
+        up, down = (time[-1] + ramp[0][1:],
+                    time[-1] + ramp[0][1:] + ramp[0][-1] + max(steady, 0.0))
         rates = math.copysign(turn.rate, turn.angle) * ramp[1]
         time += [*up, *([down[0] - ramp[0][1]] if steady > 1e-9 else []), *down]
         rate += [*rates[1:], *([rates[-1]] if steady > 1e-9 else []), *rates[-2::-1]]
@@ -239,12 +260,13 @@ def profile(ability: Ability, turns: list[Turn], first_rest: float) -> Motion:
 
 
 def _ramp(ability: Ability, rate: float) -> tuple[Array, Array]:
-    """Return times, s, and parts of the rate from rest to it; rounded where the jerk is limited."""
+    """Return times, s, and fractions of the rate from 0 to 1; rounded where jerk is limited."""
     rising, rounding = ability.rising(rate)
     if not rounding:
         return np.array([0.0, rising]), np.array([0.0, 1.0])
     time = np.linspace(0.0, rising + rounding, 17)
-    squares = [np.maximum(time - since, 0.0) ** 2 for since in (0.0, rising, rounding, rising + rounding)]
+    squares = [np.maximum(time - since, 0.0) ** 2
+               for since in (0.0, rising, rounding, rising + rounding)]
     return time, (squares[0] - squares[1] - squares[2] + squares[3]) / (2.0 * rising * rounding)
 
 
@@ -256,8 +278,9 @@ class _Family:
     """
     Motions to and fro between two headings, of one length, as points of a unit cube.
 
-    The axes: how many turns, which way first, how far up and down the place is used, the rates of one pair of turns and of the next, and
-    how much of the time is rest between turns. Angles are stretched until the time is used or the place ends.
+    The axes: how many turns, which way first, how far up and down the place is used, the rates of
+    one pair of turns and of the next, and how much of the time is rest between turns. Angles are
+    stretched until the time is used or the place ends.
 
     """
 
@@ -286,18 +309,23 @@ class _Family:
         angles = np.diff(ends)
         if not np.abs(angles).min() > _LEAST:
             return None
-        return self._timed(angles, np.where(np.arange(count) // 2 % 2, point[5], point[4]), point[6])
+        return self._timed(angles, np.where(np.arange(count) // 2 % 2, point[5], point[4]),
+                           point[6])
 
     def _timed(self, angles: Array, speeds: Array, resting: float) -> list[Turn] | None:
-        """Return turns through angles of these proportions at parts of the fastest rate, that use the time."""
+        """Return turns of these proportions, at fractions of the fastest rate, in the time."""
         ability, gaps = self._ability, len(angles) - 1
         ends = np.cumsum(angles)
-        room = min([place / end for place, end in ((self._up, ends.max()), (self._down, -ends.min())) if end > _LEAST])
-        rates = np.array([speed * ability.fastest(abs(angle) * room) for speed, angle in zip(speeds, angles)])
-        stretch = (self._moving * (1.0 - resting) - ability.ramp(rates).sum()) / (np.abs(angles) / rates).sum()
+        room = min([place / end for place, end
+                    in ((self._up, ends.max()), (self._down, -ends.min())) if end > _LEAST])
+        rates = np.array([speed * ability.fastest(abs(angle) * room)
+                          for speed, angle in zip(speeds, angles)])
+        stretch = ((self._moving * (1.0 - resting) - ability.ramp(rates).sum())
+                   / (np.abs(angles) / rates).sum())
         angles = angles * min(stretch, room)
         left = self._moving - float((np.abs(angles) / rates + ability.ramp(rates)).sum())
-        if stretch <= 0.0 or left < -1e-9 or rates.min() < ability.slowest or (np.abs(angles) < rates * ability.ramp(rates)).any():
+        if (stretch <= 0.0 or left < -1e-9 or rates.min() < ability.slowest
+                or (np.abs(angles) < rates * ability.ramp(rates)).any()):
             return None
         rests = np.append(np.full(gaps, max(left, 0.0) / gaps), ability.rest)
         return [Turn(*values) for values in zip(angles.tolist(), rates.tolist(), rests.tolist())]
@@ -311,9 +339,10 @@ class Plan:
     prediction: Prediction
 
 
-def best(ability: Ability, forecast: Forecast, duration: float, generator: np.random.Generator, generations: int = 60) -> Plan:
+def best(ability: Ability, forecast: Forecast, duration: float, generator: np.random.Generator,
+         generations: int = 60) -> Plan:
     """
-    Return the motion of that length, s, after which the heading of the drive of the forecast errs least.
+    Return the motion of that length, s, with the least heading error in the forecast's drive.
 
     Parameters
     ----------
@@ -331,10 +360,12 @@ def best(ability: Ability, forecast: Forecast, duration: float, generator: np.ra
     def cost(point: Array) -> float:
         motion = family.motion(point)
         return math.inf if motion is None else forecast.error(motion)
-    found = differential_evolution(cost, _BOUNDS, maxiter=generations, popsize=10, tol=0.0, seed=generator, polish=False)
+    found = differential_evolution(cost, _BOUNDS, maxiter=generations, popsize=10, tol=0.0,
+                                   seed=generator, polish=False)
     motion = family.motion(found.x)
     if motion is None:
-        raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: give more seconds or more place')
+        raise DataRefused(f'no motion of {duration:g} s that turns there and back was found: '
+                          'give more seconds or more place')
     return believed(Plan(motion, forecast.predict(motion)))
 
 
@@ -346,30 +377,39 @@ def _refuse(ability: Ability, duration: float) -> None:
     """Refuse what leaves no time or no place for a turn there and one back."""
     shortest = 2.0 * ability.rest + 4.0 * ability.ramp(ability.slowest)
     if duration <= shortest:
-        raise DataRefused(f'{duration:g} s are too short for rests of {ability.rest:g} s at both ends, a turn there and one back, which '
-                          f'take more than {shortest:.3g} s: give more seconds, or less rest')
-    angle, place = ability.slowest * ability.ramp(ability.slowest), max(ability.highest, -ability.lowest)
+        raise DataRefused(
+            f'{duration:g} s are too short for rests of {ability.rest:g} s at both ends, a turn '
+            f'there and one back, which take more than {shortest:.3g} s: give more seconds, or '
+            'less rest')
+    angle, place = (ability.slowest * ability.ramp(ability.slowest),
+                    max(ability.highest, -ability.lowest))
     if place <= angle:
-        raise DataRefused(f'the place leaves a turn of {place / DEGREE:.3g} deg, and at the slowest smooth rate the ramps alone need '
-                          f'{angle / DEGREE:.3g} deg: give more place or more acceleration')
+        raise DataRefused(
+            f'the place leaves a turn of {place / DEGREE:.3g} deg, and at the slowest smooth rate '
+            f'the ramps alone need {angle / DEGREE:.3g} deg: give more place or more acceleration')
 
 
 def believed(plan: Plan, limits: Limits | None = None) -> Plan:
     """Return the plan, or refuse one by which no self-calibration would be believed."""
     limits, motion = limits or Limits(), plan.motion
-    deviation, spread = plan.prediction.scale_deviation, float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
+    deviation, spread = (plan.prediction.scale_deviation,
+                         float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05)))))
     if deviation > limits.scale_standard_deviation or spread < limits.rate_spread:
-        raise DataRefused(f'the best motion of {motion.duration:g} s tells the scale to {100.0 * deviation:.2g} % and its rate varies by '
-                          f'{spread / DEGREE:.2g} deg/s, where {100.0 * limits.scale_standard_deviation:g} % and '
-                          f'{limits.rate_spread / DEGREE:g} deg/s are wanted: give more seconds, more place or faster turns')
+        raise DataRefused(
+            f'the best motion of {motion.duration:g} s tells the scale to '
+            f'{100.0 * deviation:.2g} % and its rate varies by {spread / DEGREE:.2g} deg/s, where '
+            f'{100.0 * limits.scale_standard_deviation:g} % and '
+            f'{limits.rate_spread / DEGREE:g} deg/s are wanted: give more seconds, more place or '
+            'faster turns')
     return plan
 
 
 def plain(ability: Ability, duration: float) -> Motion:
     """
-    Return the plain motion of that length, s: a rest, one turn there, a rest, one turn back, a rest.
+    Return the plain motion of that length, s: rest, one turn there, rest, one turn back, rest.
 
-    It turns at half of the robot's fastest rate, as far as time and place allow, to the wider side.
+    It turns at half of the robot's fastest rate, as far as time and place allow, to the wider
+    side.
 
     """
     _refuse(ability, duration)
@@ -378,7 +418,8 @@ def plain(ability: Ability, duration: float) -> Motion:
     angle = min(place, rate * (half - ability.ramp(rate)))
     between = 2.0 * (half - angle / rate - ability.ramp(rate))
     side = 1.0 if ability.highest == place else -1.0
-    return profile(ability, [Turn(side * angle, rate, between), Turn(-side * angle, rate, ability.rest)], ability.rest)
+    return profile(ability, [Turn(side * angle, rate, between),
+                             Turn(-side * angle, rate, ability.rest)], ability.rest)
 
 
 def able(ability: Ability, motion: Motion) -> bool:
@@ -386,6 +427,6 @@ def able(ability: Ability, motion: Motion) -> bool:
     heading = motion.heading_at(np.linspace(0.0, motion.duration, 2001))
     rate = motion.rate_at(motion.time)
     steepest = np.abs(np.diff(rate) / np.diff(motion.time)).max()
-    exceeds = (np.abs(rate).max() / ability.rate - 1.0, steepest / ability.acceleration - 1.0, heading.max() - ability.highest,
-               ability.lowest - heading.min())
+    exceeds = (np.abs(rate).max() / ability.rate - 1.0, steepest / ability.acceleration - 1.0,
+               heading.max() - ability.highest, ability.lowest - heading.min())
     return bool(max(exceeds) < 1e-9)

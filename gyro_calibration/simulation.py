@@ -12,7 +12,8 @@ from gyro_calibration.motion import Motion
 from gyro_calibration.noise import simulate_noise
 
 
-def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0, generator: np.random.Generator | None = None,
+def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,
+             generator: np.random.Generator | None = None,
              temperature: Number | None = None) -> Log:
     """
     Return the log of a simulated gyro.
@@ -23,31 +24,35 @@ def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0, gener
     motion : its true motion, kept in the log as the reference
     sample_rate : Hz
     generator : source of the noise; without one there is none
-    temperature : degC, of all samples or of each, shape (n,); the model's reference temperature where it is None
+    temperature : degC, of all samples or of each, shape (n,); default: the reference temperature
 
     """
     time = np.arange(round(motion.duration * sample_rate) + 1) / sample_rate
     rate, heading = motion.rate_at(time), motion.heading_at(time)
-    degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature, len(time)).astype(float)
+    degc = np.broadcast_to(model.reference_temperature if temperature is None else temperature,
+                           len(time)).astype(float)
     channels = History().follow(time, degc, heading=heading)
     output = respond(model, time, channels.moving(rate, rate), generator)
-    return Log(output=output, time=time, temperature=degc, reference_rate=rate, reference_heading=heading)
+    return Log(output=output, time=time, temperature=degc, reference_rate=rate,
+               reference_heading=heading)
 
 
-def respond(model: GyroModel, time: Array, channels: Channels, generator: np.random.Generator | None = None) -> Array:
+def respond(model: GyroModel, time: Array, channels: Channels,
+            generator: np.random.Generator | None = None) -> Array:
     """
-    Return the output, rad/s, shape (n,), of a gyro in a motion and surroundings, such as `history.channels_of` finds in a log.
+    Return the output, rad/s, shape (n,), of a gyro in a motion and its surroundings.
 
     Parameters
     ----------
     model : effects and noise of the gyro
     time : stamps, s, increasing, shape (n,); the noise is that of samples at their median interval
-    channels : true rate and surroundings at these times
+    channels : true rate and surroundings at these times, of a log by `history.channels_of`
     generator : source of the noise; without one there is none
 
     """
     rate = model.distorted('rate', channels.rate, time)
     output = model.output_in(channels.moving(rate, rate))
     if generator is not None:
-        output = output + simulate_noise(model.noise, len(time), float(np.median(np.diff(time))), generator)
+        output = output + simulate_noise(model.noise, len(time), float(np.median(np.diff(time))),
+                                         generator)
     return model.distorted('output', output, time)

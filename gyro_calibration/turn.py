@@ -1,8 +1,9 @@
 """
 What a gyro's error makes of a full turn of 360 degrees (Ojeda et al., section 4).
 
-A rate that is wrong by so many rad/s makes a turn wrong by so many rad a turn, the more the slower the turn is. Two errors are compared:
-with nothing but the bias that a rest before the mission gives, and with a model and then the bias that is left at rest.
+An error of the rate, rad/s, adds up to an error of the heading in each turn, rad, which is larger
+the slower the turn is. Two errors are compared: with the bias of a rest before the mission only,
+and with a model and then the bias that is left at rest.
 
 """
 
@@ -20,7 +21,7 @@ from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
 from gyro_calibration.self_calibration import refuse_scale
 
-#: Slower turns take so long that their error says more of the bias than of the gyro's scale; as published.
+#: rad/s; the error of slower turns is mostly bias, not scale; as published.
 SLOWEST = 5.0 * DEGREE
 #: A dwell that turns slower than this is a rest.
 AT_REST = 0.1 * DEGREE
@@ -62,12 +63,14 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
     Parameters
     ----------
     dwells : without those that are outlying
-    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); nan where there is none, as from `predicted_rates`
+    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); nan where there is none, as from
+        `predicted_rates`
     slowest : of a turn, rad/s
 
     Raises
     ------
-    DataRefused : nothing turns as fast as that with a rate by the model, nothing shows the static bias, or the gyro is upside down
+    DataRefused : nothing turns as fast as that with a rate by the model, nothing shows the static
+        bias, or the gyro is upside down
 
     """
     known = np.isfinite(rate)
@@ -75,15 +78,18 @@ def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnEr
     dwells, rate = take(dwells, known), rate[known]
     wanted = np.abs(dwells.rate) >= slowest
     if not wanted.any():
-        raise DataRefused(f'none of {len(known)} dwells turns at {slowest / DEGREE:g} deg/s or faster and has a rate by the model; '
+        raise DataRefused(f'none of {len(known)} dwells turns at {slowest / DEGREE:g} deg/s or '
+                          'faster and has a rate by the model; '
                           'record faster turns, or several sweeps')
     turns = take(dwells, wanted)
     _refuse_other_way(turns)
     rests, remark = _rests(dwells)
     nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
     # eq. 1 and 2, and eq. 13, 15 and 16
-    static, modelled = (_turned(dwells, error, wanted, nearest) for error in (dwells.output - dwells.rate, rate - dwells.rate))
-    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place, (remark, *_unknown(lost)))
+    static, modelled = (_turned(dwells, error, wanted, nearest)
+                        for error in (dwells.output - dwells.rate, rate - dwells.rate))
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place,
+                      (remark, *_unknown(lost)))
 
 
 def _refuse_other_way(turns: Dwells) -> None:
@@ -97,7 +103,7 @@ def _unknown(lost: int) -> Iterator[str]:
 
 
 def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
-    """Return what errors of a rate, rad/s, less those at rest, add up to in a turn, rad (eq. 14)."""
+    """Return the integral over a turn of errors of a rate, less those at rest, rad (eq. 14)."""
     bias = np.array([rest.bias(error) for rest in nearest])
     return (error[wanted] - bias) * 2.0 * math.pi / np.abs(dwells.rate[wanted])
 
@@ -106,7 +112,7 @@ def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) ->
 
 @dataclass(frozen=True)
 class _Rest:
-    """The dwells of a sweep that show the static bias, and what each of them counts, shape (k,)."""
+    """The dwells of a sweep that show the static bias, and their weights, shape (k,)."""
 
     sweep: int
     temperature: float
@@ -119,17 +125,19 @@ class _Rest:
 
 
 def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
-    """Return what shows the static bias: the rests of the sweeps, or where there is none the slowest turns both ways."""
+    """Return the rests of the sweeps, or where there is none the slowest turns both ways."""
     numbers = np.unique(dwells.sweep)
     for find, words in ((_at_rest, 'the static bias is from the rest of each sweep'),
-                        (_between_turns, 'no rest; the static bias is the error between the slowest turns both ways of each sweep')):
+                        (_between_turns, 'no rest; the static bias is the error between the '
+                         'slowest turns both ways of each sweep')):
         found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
         if found:
             others = len(numbers) - len(found)
-            more = f'; {others} of {len(numbers)} sweeps have none and take that of the nearest temperature' if others else ''
+            more = (f'; {others} of {len(numbers)} sweeps have none and take that of the nearest '
+                    'temperature' if others else '')
             return found, words + more
-    raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing shows the static bias; '
-                      'record a rest before each sweep')
+    raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing '
+                      'shows the static bias; record a rest before each sweep')
 
 
 def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
@@ -140,7 +148,8 @@ def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
 
 def _between_turns(dwells: Dwells, number: int) -> _Rest | None:
     """Return the slowest turn each way of a sweep: the line between their errors passes rest."""
-    ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0)) for way in (1.0, -1.0)]
+    ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0))
+            for way in (1.0, -1.0)]
     if not all(map(len, ways)):
         return None
     rows = np.array([rows[np.argmin(np.abs(dwells.rate[rows]))] for rows in ways])
@@ -153,20 +162,22 @@ def _rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _Rest:
 
 
 def _nearest(dwells: Dwells, place: int, rests: list[_Rest]) -> _Rest:
-    """Return the rest of a dwell's own sweep, or else the one nearest in temperature, and in order where no temperature tells."""
+    """Return the rest of a dwell's sweep, or else the nearest in temperature, then in order."""
     sweep = int(dwells.sweep[place])
     temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[place])
-    return min(rests, key=lambda rest: (rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
+    return min(rests, key=lambda rest: (
+        rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
 
 
 # rates by a model
 
 def predicted_rates(calibration: Calibration) -> Array:
     """
-    Return the rate of each dwell by a model that never saw its sweep, rad/s, shape (n,); nan where the other sweeps do not give one.
+    Return the rate of each dwell by a model not fitted to its sweep, rad/s, shape (n,).
 
-    The effects are those of the calibration, their values are fitted anew to the other sweeps. In a single sweep, it is the dwell alone
-    that is left out.
+    The effects are those of the calibration, their values are fitted anew to the other sweeps. In
+    a single sweep, only the dwell itself is left out. The rate is nan where the other sweeps do
+    not determine the model.
 
     """
     dwells, rates = calibration.dwells, np.full(len(calibration.dwells), np.nan)
@@ -185,7 +196,7 @@ def predicted_rates(calibration: Calibration) -> Array:
 
 @dataclass(frozen=True)
 class Size:
-    """How large some errors are: root mean square and largest absolute value, rad per turn, and how many they are."""
+    """Root mean square and largest absolute value of errors, rad per turn, and their count."""
 
     rms: float
     largest: float
