@@ -1,8 +1,9 @@
 """
 The demonstration: the whole graph on this machine, with a robot that exists in this file alone.
 
-The robot follows ``cmd_vel``; its gyro is emulated on a pseudo-terminal and tells of the motion that the robot really makes; driver
-and compensation run as processes of their own, as on a robot. The compensation drives the calibration, then a drive follows.
+The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
+motion of the robot; driver and compensation run as processes of their own, as on a robot. The
+compensation drives the calibration, then a drive follows.
 
 """
 
@@ -47,7 +48,8 @@ NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
 INTERVAL = 0.01  # s between samples
 ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 ATTEMPTS = 3  # to calibrate
-DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20), (4, 0), (1, 0)])
+DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20),
+               (4, 0), (1, 0)])
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Refused(OSError):
 @dataclass
 class Robot:
     """
-    A robot that turns as it is told, within what its wheels can do; its gyro sees the motion with the errors of a model.
+    A robot that turns as commanded, within what its wheels can do, with the gyro of a model.
 
     Attributes
     ----------
@@ -88,11 +90,13 @@ class Robot:
         rate, heading, begin = 0.0, 0.0, time.monotonic()
         for number, noise in enumerate(self.noise):
             time.sleep(max(0.0, begin + number * INTERVAL - time.monotonic()))
-            change = np.clip(self.command - rate, -ACCELERATION * INTERVAL, ACCELERATION * INTERVAL)
+            change = np.clip(self.command - rate, -ACCELERATION * INTERVAL,
+                             ACCELERATION * INTERVAL)
             heading += INTERVAL * (rate + 0.5 * change)
             rate += change
             self.truth.append((time.time(), heading))
-            yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise), time=number * INTERVAL)
+            yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
+                         time=number * INTERVAL)
 
 
 class Client:
@@ -101,7 +105,8 @@ class Client:
 
     Attributes
     ----------
-    raw, headings : time, s, with the raw rate, rad/s, and with the published heading, rad, of each message
+    raw, headings : of each message the time, s, with the raw rate, rad/s, and with the published
+        heading, rad
 
     """
 
@@ -131,7 +136,7 @@ class Client:
             self._executor.spin_once(timeout_sec=0.1)
 
     def call(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
-        """Call a service, wait a little again and again until it answers, and return its message."""
+        """Call a service, wait again and again until it answers, and return its message."""
         client = self._node.create_client(Trigger, name)
         if not client.wait_for_service(20.0):
             raise OSError(f'the service {name} did not appear within 20 s')
@@ -145,7 +150,7 @@ class Client:
         return answer.result().message
 
     def is_ready(self) -> bool:
-        """Return whether all is heard: the gyro, its heading, and who commands the robot beside this node."""
+        """Return whether gyro and heading come, and another node commands the robot."""
         return bool(self.raw and self.headings) and self._node.count_publishers('cmd_vel') > 1
 
     def turn(self, rate: float) -> None:
@@ -175,7 +180,8 @@ def _process(module: str, **parameters: object) -> Iterator[None]:
     """Run a node in a process of its own."""
     arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     quiet = ['-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error']
-    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}', '--ros-args', *arguments, *quiet])
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',
+                                '--ros-args', *arguments, *quiet])
     try:
         yield
     finally:
@@ -193,19 +199,25 @@ def run_demo(out: Path, seed: int) -> Demonstration:
 
     """
     out.mkdir(parents=True, exist_ok=True)
-    calibration_file, model_file, port = out / 'calibration.yaml', out / 'noise.yaml', out.absolute() / 'gyro'
+    calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
+                                          out.absolute() / 'gyro')
     calibration_file.unlink(missing_ok=True)
-    # Nothing of this is heard on the network of a robot, nor by other graphs on this machine; so it needs no rights in a secured one.
-    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
+    # The graph stays apart from the network of a robot and from other graphs on this machine; so
+    # it needs no rights in a secured one.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                      ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
     model = read_model(_share('config', 'xv3500.yaml'))
-    write_model(model_file, GyroModel(noise=model.noise))  # of the gyro its noise is known, and nothing else
+    write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
     generator = np.random.default_rng(seed)
-    noise = [simulate_noise(model.noise, length, INTERVAL, generator) for length in (12000, 6000)]  # the second for calibrations run again
+    noise = [simulate_noise(model.noise, length, INTERVAL, generator)
+             for length in (12000, 6000)]  # the second for calibrations run again
     robot = Robot(model, np.concatenate(noise))
     with ExitStack() as stack:
-        stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port, wait_for_reader=True))
+        stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port,
+                                     wait_for_reader=True))
         stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL))
-        stack.enter_context(_process('compensation_node', model_file=model_file, calibration_file=calibration_file,
+        stack.enter_context(_process('compensation_node', model_file=model_file,
+                                     calibration_file=calibration_file,
                                      **{'calibration.drive': True}))
         rclpy.init()
         stack.callback(rclpy.try_shutdown)
@@ -228,7 +240,8 @@ def _share(*parts: str) -> Path:
 def _perform(client: Client) -> float:
     """Calibrate and drive; return when the drive began, s."""
     total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
-    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s', disable=None) as bar:
+    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
+              disable=None) as bar:
         bar.set_description('starting driver and compensation')
         _until(client.is_ready, 20.0)
         bar.set_description('calibrating on the motion profile')
@@ -242,7 +255,7 @@ def _perform(client: Client) -> float:
 
 def calibrate(client: Client, bar: tqdm) -> None:
     """
-    Calibrate; a run that is refused is run again, as with any robot: this one turns late where the machine is busy elsewhere.
+    Calibrate; a refused run is repeated, since this robot turns late on a busy machine.
 
     Raises
     ------
@@ -264,7 +277,8 @@ def _until(condition: Callable[[], object], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
-            raise OSError(f'the nodes were not ready within {timeout:g} s; is another program using the port?')
+            raise OSError(f'the nodes were not ready within {timeout:g} s; '
+                          'is another program using the port?')
         time.sleep(0.02)
 
 
@@ -298,21 +312,27 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
         'both': integrate(time_, filter_rates(threshold, time_, corrected)),
         'rests tracked': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
     draw_headings(out / 'heading.png', time_ - begin, true - true[0], headings)
-    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0], reference_heading=true - true[0]))
-    errors = {name: np.abs(heading - (true - true[0])) / DEGREE for name, heading in headings.items()}
+    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0],
+                                   reference_heading=true - true[0]))
+    errors = {name: np.abs(heading - (true - true[0])) / DEGREE
+              for name, heading in headings.items()}
     table = _table(errors)
     write_atomically(out / 'table.md', table.encode())
-    text = f'{table}\nSelf-calibration: {calibration}.\nSeed {seed}. Picture, table and log are in {out}.'
+    text = (f'{table}\nSelf-calibration: {calibration}.\n'
+            f'Seed {seed}. Picture, table and log are in {out}.')
     means = {name: float(error.mean()) for name, error in errors.items()}
     return Demonstration(text, {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
 
 
 def _table(errors: dict[str, Array]) -> str:
     """Return the table as Markdown, beside that of Hong and Park."""
-    lines = ['| heading | mean error | standard deviation | off pure integration | Hong and Park, table 1 |', '|---|---|---|---|---|']
+    lines = ['| heading | mean error | standard deviation | off pure integration '
+             '| Hong and Park, table 1 |', '|---|---|---|---|---|']
     pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]
     for name, error in errors.items():
         mean, deviation = TABLE_1.get(name, (math.nan, math.nan))
-        theirs = '' if math.isnan(mean) else f'{mean:.3f} deg, {deviation:.3f} deg, {100 * (1 - mean / published):.0f} %'
-        lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg | {100 * (1 - error.mean() / pure):.0f} % | {theirs} |')
+        theirs = '' if math.isnan(mean) else (f'{mean:.3f} deg, {deviation:.3f} deg, '
+                                              f'{100 * (1 - mean / published):.0f} %')
+        lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg '
+                     f'| {100 * (1 - error.mean() / pure):.0f} % | {theirs} |')
     return '\n'.join(lines) + '\n'

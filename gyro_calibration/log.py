@@ -1,7 +1,8 @@
 """
 Read and write logs.
 
-A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header names each column with its unit.
+A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header
+names each column with its unit.
 
 """
 
@@ -24,7 +25,16 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gyro_calibration.files import GROWN, GROWTH, LARGEST, InputError, opened, plain, reason, replacing
+from gyro_calibration.files import (
+    GROWN,
+    GROWTH,
+    LARGEST,
+    InputError,
+    opened,
+    plain,
+    reason,
+    replacing,
+)
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -34,15 +44,18 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 
-#: So many samples of a dozen columns stay in the cache of a processor, which is twice as fast as to go through memory for each step.
+#: Samples of a dozen columns that fit into the cache of a processor, which is twice as fast as
+#: memory.
 CACHED = 1 << 14
 #: Rows of a block of a log that is read piece by piece.
 ROWS = 1 << 16
 #: No gyro gives samples closer than this, s.
 SHORTEST = 1e-9
-#: A heading that changes by full turns to this part of one, and faster than anything that bears a gyro turns, rad/s, is wrapped.
+#: A heading is wrapped if it changes by full turns, to this part of one, and faster than any
+#: vehicle turns, rad/s.
 _FULL, _FASTEST = 0.1, 35.0
-#: Characters of a line, of what is before the rows, and of a block of lines, or of one row that goes over several.
+#: Characters of a line, of what is before the rows, and of a block of lines, or of one row that
+#: goes over several.
 _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
 #: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
 _WHOLE, _TEXT = 1 << 29, 10
@@ -70,7 +83,8 @@ _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
 
 #: Quantity -> (place of its column in the file, factor to SI).
 Named = dict[str, tuple[int, float]]
-#: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns that are not ours as text.
+#: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
+#: that are not ours as text.
 Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
 
 
@@ -93,12 +107,14 @@ class Log:
     counts : the same before any scaling, 1
     time : s, increasing; without it the rows are dwells of a rate table
     temperature : the gyro's own sensor, degC
-    reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the heading is continuous
+    reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the
+        heading is continuous
     specific_force : along the input axis, m/s²
     supply : V
     moving : 1 or 0
     notes : the lines before the header, without their '#'
-    others : columns of the file that are not ours, as text, in their order; of one name, the second is called `name.1`
+    others : columns of the file that are not ours, as text, in their order; of one name, the
+        second is called `name.1`
 
     """
 
@@ -137,29 +153,35 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate)))
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
-    arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks]) for quantity in present}
-    others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks)) for name in first.others}
+    arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
+              for quantity in present}
+    others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks))
+              for name in first.others}
     return Log(**arrays, notes=first.notes, others=others)
 
 
 def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
     numbers = 0
     for block in blocks:
-        numbers += len(block) * (sum(getattr(block, quantity) is not None for quantity in QUANTITIES) + _TEXT * len(block.others))
+        numbers += len(block) * (sum(getattr(block, quantity) is not None
+                                     for quantity in QUANTITIES) + _TEXT * len(block.others))
         if numbers > _WHOLE:
-            raise LogError(f'{path}: holds more than {_WHOLE} numbers, which are too many to look at at once; cut it into pieces')
+            raise LogError(f'{path}: holds more than {_WHOLE} numbers, which are too many to look '
+                           'at at once; cut it into pieces')
         yield block
 
 
-def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None, rows: int = ROWS,
-                heard: Callable[[int], object] | None = None) -> Iterator[Log]:
+def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
+                    rows: int = ROWS,
+                    heard: Callable[[int], object] | None = None) -> Iterator[Log]:
     """
-    Read a log file row by row, and give blocks of it, so that one of any length needs little memory.
+    Read a log file row by row, and give blocks of it, so that any length needs little memory.
 
     Parameters
     ----------
     path, sensitivity, rate : as for `read_log`
-    rows : of a block, at least 2; the last one has less, and so have those with texts that go over several lines
+    rows : of a block, at least 2; the last block has less, and so have those with texts that go
+        over several lines
     heard : is told after each block how many bytes of the file are read, if it is not a pipe
 
     Raises
@@ -177,9 +199,10 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
         while block := _block(lines, rows):
             unfolded += sum(map(len, block))
             if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
-                raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log does; unpack it if that is what was '
-                               'recorded')
-            places, arrays, others = _quickly(block, first_line, header, named) or _carefully(path, block, lines, first_line, header, named)
+                raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log '
+                               'does; unpack it if that is what was recorded')
+            places, arrays, others = (_quickly(block, first_line, header, named)
+                                      or _carefully(path, block, lines, first_line, header, named))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
@@ -199,7 +222,8 @@ def _refusing(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f'{path}: cannot be read as a log ({reason(error)}); wanted a CSV file, .csv or .csv.gz') from error
+        raise LogError(f'{path}: cannot be read as a log ({reason(error)}); '
+                       'wanted a CSV file, .csv or .csv.gz') from error
 
 
 def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
@@ -242,7 +266,7 @@ def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
 
 
 def _head(path: str | Path, lines: Iterator[str]) -> tuple[tuple[str, ...], list[str], int]:
-    """Take notes and header off the lines, and return them with the number of the line after them."""
+    """Take notes and header off the lines, and return them with the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith('#'):
         notes.append(line[1:].strip())
@@ -250,7 +274,8 @@ def _head(path: str | Path, lines: Iterator[str]) -> tuple[tuple[str, ...], list
     rows = csv.reader(itertools.chain([line], lines))
     header = [_unix(name.strip()) for name in next(rows, [])]
     if not any(name in COLUMNS for name in header):
-        raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, such as time_s,gyro_dps,temperature_degc')
+        raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, '
+                       'such as time_s,gyro_dps,temperature_degc')
     return tuple(notes), header, len(notes) + rows.line_num + 1
 
 
@@ -261,10 +286,12 @@ def _named_columns(path: str | Path, header: list[str]) -> Named:
             continue
         quantity, factor = COLUMNS[name]
         if quantity in named:
-            raise LogError(f'{path}: columns {header[named[quantity][0]]} and {name} both give the {quantity}; keep one of them')
+            raise LogError(f'{path}: columns {header[named[quantity][0]]} and {name} both give '
+                           f'the {quantity}; keep one of them')
         named[quantity] = (index, factor)
     if not {'output', 'counts'} & set(named):
-        raise LogError(f'{path}: no gyro column among {shown(",".join(header))}; wanted gyro_dps, gyro_rad_s or gyro_counts')
+        raise LogError(f'{path}: no gyro column among {shown(",".join(header))}; '
+                       'wanted gyro_dps, gyro_rad_s or gyro_counts')
     return named
 
 
@@ -283,20 +310,23 @@ def _distinct(header: list[str]) -> list[str]:
 
 
 def _quickly(lines: list[str], first_line: int, header: list[str], named: Named) -> Parsed | None:
-    """Parse rows of numbers by numpy; None where there is anything else in them, which wants a closer look."""
+    """Parse rows of numbers by numpy; None where they hold anything else."""
     if not all(name in COLUMNS for name in header):
         return None
     try:
         table = np.loadtxt(lines, delimiter=',', comments=None, ndmin=2)
     except ValueError:
         return None
-    if table.shape != (len(lines), len(header)) or any(_wrong(table[:, index], quantity).any() for quantity, (index, _) in named.items()):
+    if table.shape != (len(lines), len(header)) or any(
+            _wrong(table[:, index], quantity).any() for quantity, (index, _) in named.items()):
         return None
-    arrays: dict[str, Array] = {quantity: table[:, index] * factor for quantity, (index, factor) in named.items()}
+    arrays: dict[str, Array] = {quantity: table[:, index] * factor
+                                for quantity, (index, factor) in named.items()}
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
-def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int, header: list[str], named: Named) -> Parsed:
+def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
+               header: list[str], named: Named) -> Parsed:
     """
     Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
 
@@ -307,7 +337,8 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     places, rows = [first_line], []
     for row in reader:
         if len(row) != len(header):
-            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has {len(header)}; mend or remove the line')
+            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
+                           f'{len(header)}; mend or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
         if reader.line_num >= len(lines) and len(rows) > 1:
@@ -315,20 +346,25 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     columns = list(zip(*rows))
     arrays = {quantity: _numbers(path, places, header[index], columns[index], quantity) * factor
               for quantity, (index, factor) in named.items()}
-    return places, arrays, {name: columns[index] for index, name in enumerate(_distinct(header)) if header[index] not in COLUMNS}
+    return places, arrays, {name: columns[index] for index, name in enumerate(_distinct(header))
+                            if header[index] not in COLUMNS}
 
 
-def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...], quantity: str) -> Array:
+def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
+             quantity: str) -> Array:
     try:
         values = np.array(texts, dtype=np.float64)
     except ValueError:
         row = next(number for number, text in enumerate(texts) if not _is_number(text))
-        raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} is not a number') from None
+        raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} '
+                       'is not a number') from None
     wrong = _wrong(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = f'beyond {_most(quantity):g}, which no gyro means' if np.isfinite(values[row]) else 'not a finite number'
-        raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} is {fault}; remove the row')
+        fault = (f'beyond {_most(quantity):g}, which no gyro means' if np.isfinite(values[row])
+                 else 'not a finite number')
+        raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} '
+                       f'is {fault}; remove the row')
     return values
 
 
@@ -354,15 +390,17 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None, before: float) -> float:
+def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
+                 before: float) -> float:
     """Refuse time that does not increase, from the block before on, and return the last one."""
     if time is None:
         return before
     late = ~(np.diff(time, prepend=before) >= SHORTEST)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come after '
-                       f'{time[row - 1] if row else before:g} s; sort the rows, or give --rate where the stamps are no use')
+        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come '
+                       f'after {time[row - 1] if row else before:g} s; sort the rows, or give '
+                       '--rate where the stamps are no use')
     return float(time[-1])
 
 
@@ -382,14 +420,15 @@ def refuse_wrapped(log: Log) -> None:
     turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL
     jumps = np.flatnonzero(turns & (np.abs(change) > _FASTEST * np.diff(time)))
     if len(jumps):
-        raise DataRefused(f'the reference heading jumps by a full turn from one sample to the next, the first time at '
-                          f'{time[jumps[0] + 1]:.3f} s; it must be continuous: add or take off 360 deg from each jump on, as numpy.unwrap '
-                          'does with rad')
+        raise DataRefused(
+            f'the reference heading jumps by a full turn from one sample to the next, the first '
+            f'time at {time[jumps[0] + 1]:.3f} s; it must be continuous: add or take off 360 deg '
+            'from each jump on, as numpy.unwrap does with rad')
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
     """
-    Write a log in SI columns, then its other columns, then more named columns; the file is complete or not there.
+    Write a log in SI columns, its other columns, and more named columns, completely or not at all.
 
     Parameters
     ----------
@@ -401,15 +440,17 @@ def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = Non
     write_log_blocks(path, [(log, more or {})])
 
 
-def write_log_blocks(path: str | Path, blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
-    """Write a log that comes in blocks, each with more named columns, as `write_log` does; the first block has the notes."""
-    with replacing(path) as file, _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data:
+def write_log_blocks(path: str | Path,
+                     blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
+    """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
+    with (replacing(path) as file,
+          _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
             data.write(_text(log, more, headed=number == 0).encode('utf-8', 'backslashreplace'))
 
 
 def _compressing(file: BinaryIO) -> gzip.GzipFile:
-    # Without a time in it, for the same log gives the same file.
+    # Without a time in it, since the same log must give the same file.
     return gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
 
 
@@ -420,7 +461,8 @@ def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
         if factor == 1.0 and values is not None:
             columns[name] = values.tolist()
     columns.update({name: list(map(_unix, texts)) for name, texts in log.others.items()})
-    columns.update({name: np.asarray(values, dtype=float).tolist() for name, values in more.items()})
+    columns.update({name: np.asarray(values, dtype=float).tolist()
+                    for name, values in more.items()})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     if headed:

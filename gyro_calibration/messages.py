@@ -1,8 +1,9 @@
 """
 The ROS 2 messages that a recording of a gyro is made of, as bytes; no ROS is needed for them.
 
-A message lies there in the common data representation (CDR): four bytes say in which order bytes stand, then come the fields, each
-aligned to its own size. All messages here are a header, perhaps another text, and then nothing but numbers of eight bytes.
+A message is in the common data representation (CDR): four bytes give the order of bytes, then come
+the fields, each aligned to its own size. All messages here are a header, perhaps another text, and
+then only numbers of eight bytes.
 
 """
 
@@ -18,11 +19,14 @@ from gyro_calibration.log import Number
 
 NSEC_PER_SEC = 1_000_000_000
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
-ODOMETRY, POSE, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/TwistStamped'
+ODOMETRY, POSE, TWIST = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
+                         'geometry_msgs/msg/TwistStamped')
 
-NOT_REPORTED = -1.0  # in element 0 of the covariance of a quantity that the message does not report (REP-145)
+#: In element 0 of the covariance of a quantity that the message does not report (REP-145).
+NOT_REPORTED = -1.0
 
-#: Where quantities stand among the numbers of an Imu: the quaternion x, y, z, w first, each quantity followed by its covariance.
+#: Places of quantities among the numbers of an Imu: the quaternion x, y, z, w first, each quantity
+#: followed by its covariance.
 ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE = 4, 15, 16, 27, 28
 
 
@@ -52,7 +56,8 @@ _QUATERNION_OF_POSE = (3, 4, 5, 6)
 
 #: Kind -> layout. A heading comes of four numbers, the quaternion x, y, z, w.
 LAYOUTS: Mapping[str, Layout] = {
-    IMU: Layout(0, 37, (0, 1, 2, 3, ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE)),
+    IMU: Layout(0, 37, (0, 1, 2, 3, ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z,
+                        FORCE_COVARIANCE)),
     TEMPERATURE: Layout(0, 2, (0,)),
     ODOMETRY: Layout(1, 85, (*_QUATERNION_OF_POSE, 48)),
     POSE: Layout(0, 7, _QUATERNION_OF_POSE),
@@ -79,20 +84,24 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
             place += -place % 4
             place += 4 + struct.unpack_from(f'{order}I', data, place)[0]
         # Aligned to eight bytes from the fifth on.
-        return seconds * NSEC_PER_SEC + nanoseconds, struct.unpack_from(f'{order}{layout.numbers}d', data, place + (4 - place) % 8)
+        return seconds * NSEC_PER_SEC + nanoseconds, struct.unpack_from(
+            f'{order}{layout.numbers}d', data, place + (4 - place) % 8)
     except struct.error as error:
-        raise MessageError(f'a message of {len(data)} bytes is too short for what it should hold') from error
+        raise MessageError(f'a message of {len(data)} bytes is too short for what it should '
+                           'hold') from error
 
 
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
-    """Return a message of a header, with the stamp in ns since 1970, and of numbers, as `parse` takes it."""
+    """Return a message of a header, with a stamp in ns since 1970, and of numbers, for `parse`."""
     text = frame.encode() + b'\0'
-    head = struct.pack(f'<4xiII{len(text)}s', stamp // NSEC_PER_SEC, stamp % NSEC_PER_SEC, len(text), text)
-    return b'\0\1\0\0' + head[4:] + bytes((4 - len(head)) % 8) + struct.pack(f'<{len(numbers)}d', *numbers)
+    head = struct.pack(f'<4xiII{len(text)}s', stamp // NSEC_PER_SEC, stamp % NSEC_PER_SEC,
+                       len(text), text)
+    return (b'\0\1\0\0' + head[4:] + bytes((4 - len(head)) % 8)
+            + struct.pack(f'<{len(numbers)}d', *numbers))
 
 
 def heading_of(x: Number, y: Number, z: Number, w: Number) -> Number:
-    """Return the rotation about z of a quaternion, rad, wrapped; nan for what is none, as where a reference was lost."""
+    """Return the rotation about z of a quaternion, rad, wrapped; nan if its norm is far from 1."""
     with np.errstate(invalid='ignore', over='ignore'):
         length = w * w + x * x + y * y + z * z
         heading = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
@@ -110,7 +119,8 @@ int32 sec
 uint32 nanosec
 """
 
-#: Kind -> its fields, as ROS 2 writes them; a recording carries them for programs that do not know the kind.
+#: Kind -> its fields, as ROS 2 writes them; a recording carries them for programs that do not know
+#: the kind.
 DEFINITIONS: Mapping[str, str] = {
     IMU: f"""std_msgs/Header header
 geometry_msgs/Quaternion orientation

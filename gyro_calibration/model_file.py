@@ -1,4 +1,4 @@
-"""A gyro's model as a YAML file that a person can read and write; what is wrong with one is said in a sentence with its place."""
+"""A gyro's model as a YAML file that a person can read and write."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from gyro_calibration.effects import CATALOGUE, Effect, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.effects import (
+    CATALOGUE,
+    Effect,
+    polynomial_from_matrix,
+    rate_temperature_polynomial,
+)
 from gyro_calibration.files import LARGEST, InputError, reason, write_atomically
 from gyro_calibration.log import Array, shown
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
@@ -38,15 +43,18 @@ def read_model(path: str | Path) -> GyroModel:
 
     Raises
     ------
-    ModelError : missing, empty, truncated, of a newer version, or no model; names file, place and remedy
+    ModelError : missing, empty, truncated, of a newer version, or no model; names file, place and
+        remedy
 
     """
     try:
         content = read_settings(path)
     except FileNotFoundError:
-        raise ModelMissing(f'{path}: there is no such file; calibrate first, or name another model file') from None
+        raise ModelMissing(f'{path}: there is no such file; calibrate first, or name another '
+                           'model file') from None
     except (OSError, ValueError) as error:
-        raise ModelError(f'{path}: cannot be read as YAML ({reason(error)}); restore the file or calibrate again') from error
+        raise ModelError(f'{path}: cannot be read as YAML ({reason(error)}); '
+                         'restore the file or calibrate again') from error
     try:
         return _from_content(content)
     except _PlaceError as error:
@@ -68,26 +76,32 @@ def _from_content(content: Any) -> GyroModel:
         raise _PlaceError('format', top['format'], f'{FORMAT}: this is not a model file')
     version = top.get('version', VERSION)
     if not isinstance(version, int) or version > VERSION:
-        raise _PlaceError('version', version, f'at most {VERSION}: install a newer gyro_calibration')
+        raise _PlaceError('version', version,
+                          f'at most {VERSION}: install a newer gyro_calibration')
     if 'effects' not in top:
-        raise _PlaceError('effects', None, 'the effects with their values, such as {bias: {bias: 0.01}}')
-    terms = tuple(_term(name, values) for name, values in _mapping('effects', top['effects'] or {}).items())
+        raise _PlaceError('effects', None,
+                          'the effects with their values, such as {bias: {bias: 0.01}}')
+    terms = tuple(_term(name, values)
+                  for name, values in _mapping('effects', top['effects'] or {}).items())
     valid = _mapping('valid', top.get('valid', {}))
     temperature_range = _range('valid.temperature', valid.get('temperature'))
     middle = sum(temperature_range) / 2.0 if all(map(math.isfinite, temperature_range)) else 25.0
-    noise = {name: _number(f'noise.{name}', value, low=0.0) for name, value in _mapping('noise', top.get('noise', {})).items()}
+    noise = {name: _number(f'noise.{name}', value, low=0.0)
+             for name, value in _mapping('noise', top.get('noise', {})).items()}
     _only('noise', noise, Noise.__dataclass_fields__)
     return GyroModel(
         terms, _covariance(top.get('covariance'), sum(len(term.fitted) for term in terms)),
         _range('valid.rate', valid.get('rate')), temperature_range,
         _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
-        {key: _text(f'gyro.{key}', value) for key, value in _mapping('gyro', top.get('gyro', {})).items()},
+        {key: _text(f'gyro.{key}', value)
+         for key, value in _mapping('gyro', top.get('gyro', {})).items()},
         _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')))
 
 
 def _mapping(place: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise _PlaceError(place, value, 'names with values (see docs/error_model.md), or calibrate again')
+        raise _PlaceError(place, value,
+                          'names with values (see docs/error_model.md), or calibrate again')
     return value
 
 
@@ -98,7 +112,8 @@ def _text(place: str, value: Any) -> str:
 
 
 def _number(place: str, value: Any, low: float = -math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST or value < low:
+    if (isinstance(value, bool) or not isinstance(value, (int, float))
+            or not abs(value) <= LARGEST or value < low):
         least = f' of at least {low:g}' if low > -math.inf else ''
         raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
     return float(value)
@@ -122,9 +137,11 @@ def _range(place: str, value: Any) -> tuple[float, float]:
 
 
 def _matrix(place: str, value: Any, size: int) -> Array:
-    if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1 for row in value] != [size] * size:
+    if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1
+                                       for row in value] != [size] * size:
         raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a fitted value')
-    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(value)]
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)]
+               for i, row in enumerate(value)]
     matrix = np.array(numbers).reshape(size, size)
     rounding = 1e-9 * np.abs(matrix).max(initial=0.0)
     smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + rounding)], default=0.0)
@@ -143,7 +160,8 @@ def _term(name: str, values: Any) -> Term:
     if name == POLYNOMIAL:
         return _polynomial(place, given)
     if name not in CATALOGUE:
-        raise _PlaceError(place, given, f'an effect that this version knows: {", ".join([*CATALOGUE, POLYNOMIAL])}')
+        raise _PlaceError(place, given, 'an effect that this version knows: '
+                          f'{", ".join([*CATALOGUE, POLYNOMIAL])}')
     return Term(CATALOGUE[name], _values(place, CATALOGUE[name], given))
 
 
@@ -154,7 +172,8 @@ def _values(place: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float
         value = _number(f'{place}.{parameter.name}', given.get(parameter.name, parameter.default))
         low, high = parameter.bounds
         if not low <= value <= high:
-            raise _PlaceError(f'{place}.{parameter.name}', value, f'{low:g} to {high:g} {parameter.unit}')
+            raise _PlaceError(f'{place}.{parameter.name}', value,
+                              f'{low:g} to {high:g} {parameter.unit}')
         values.append(value)
     return tuple(values)
 
@@ -165,16 +184,21 @@ def _polynomial(place: str, given: Mapping[str, Any]) -> Term:
         _only(place, given, ['matrix_dps'])
         return _polynomial_from_matrix(f'{place}.matrix_dps', given['matrix_dps'])
     orders = given.get('orders')
-    if not isinstance(orders, list) or len(orders) != 2 or not all(type(order) is int and 0 <= order <= _HIGHEST for order in orders):
-        raise _PlaceError(f'{place}.orders', orders, 'the orders in rate and temperature, such as [3, 2], or matrix_dps')
+    if not isinstance(orders, list) or len(orders) != 2 or not all(
+            type(order) is int and 0 <= order <= _HIGHEST for order in orders):
+        raise _PlaceError(f'{place}.orders', orders,
+                          'the orders in rate and temperature, such as [3, 2], or matrix_dps')
     effect = rate_temperature_polynomial(*orders)
-    return Term(effect, _values(place, effect, {name: value for name, value in given.items() if name != 'orders'}))
+    return Term(effect, _values(
+        place, effect, {name: value for name, value in given.items() if name != 'orders'}))
 
 
 def _polynomial_from_matrix(place: str, rows: Any) -> Term:
-    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows) or max(map(len, [rows, *rows])) > _HIGHEST + 1:
+    if (not isinstance(rows, list) or not all(isinstance(row, list) for row in rows)
+            or max(map(len, [rows, *rows])) > _HIGHEST + 1):
         raise _PlaceError(place, rows, f'rows of finite numbers, up to order {_HIGHEST}')
-    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)] for i, row in enumerate(rows)]
+    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)]
+               for i, row in enumerate(rows)]
     try:
         return Term(*polynomial_from_matrix(numbers))
     except ValueError as error:
@@ -196,8 +220,9 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
         _text(f'{place}.method', given.get('method', '')))
 
 
-def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Read the covariance of (s, b), or else their standard deviations; without both it is not known."""
+def _calibration_covariance(place: str, given: Mapping[str, Any]
+                            ) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Read the covariance of (s, b), or else their standard deviations; None without both."""
     if 'covariance' in given:
         (a, b), (_, c) = _matrix(f'{place}.covariance', given['covariance'], 2).tolist()
         return (a, b), (b, c)
@@ -211,7 +236,7 @@ def _calibration_covariance(place: str, given: Mapping[str, Any]) -> tuple[tuple
 
 
 def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
-    """Write a model file, which is complete or not there, and return its version, as `files.write_atomically` does."""
+    """Write a model file, completely or not at all, and return its version (see `files`)."""
     return write_atomically(path, model_text(model).encode())
 
 
@@ -226,7 +251,8 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
     if model.covariance is not None:
         content['covariance'] = model.covariance.tolist()
     ranges = {'rate': model.rate_range, 'temperature': model.temperature_range}
-    content['valid'] = {name: list(values) for name, values in ranges.items() if all(map(math.isfinite, values))}
+    content['valid'] = {name: list(values) for name, values in ranges.items()
+                        if all(map(math.isfinite, values))}
     content['reference_temperature'] = model.reference_temperature
     content['noise'] = dict(vars(model.noise))
     content['gyro'] = dict(model.gyro)
@@ -241,13 +267,16 @@ def _self_calibration_content(calibration: SelfCalibration) -> dict[str, Any]:
     covariance = content.pop('covariance')
     if covariance is not None:
         content['covariance'] = [list(row) for row in covariance]
-        content['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'), calibration.standard_deviations))
+        content['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'),
+                                                  calibration.standard_deviations))
     return content
 
 
 def _term_content(term: Term) -> dict[str, Any]:
-    named = {parameter.name: value for parameter, value in zip(term.effect.parameters, term.values)}
+    named = {parameter.name: value
+             for parameter, value in zip(term.effect.parameters, term.values)}
     if term.effect.name != POLYNOMIAL:
         return named
-    temperature_order, rate_order = (int(text) for text in term.effect.coefficients[-1].name[1:].split('w'))
+    temperature_order, rate_order = (
+        int(text) for text in term.effect.coefficients[-1].name[1:].split('w'))
     return {'orders': [rate_order, temperature_order], **named}

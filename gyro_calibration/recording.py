@@ -1,8 +1,9 @@
 """
-A ROS 2 recording as a `Log`: an Imu is the gyro, a Temperature and a reference are brought onto its stamps.
+A ROS 2 recording as a `Log`: Imu is the gyro, Temperature and a reference come onto its stamps.
 
-Times are those of the headers, at which something was measured. Times at which messages were received are taken only where headers have
-none, and a note says so. Everything else that was mended is said in a note as well.
+Times are the stamps of the headers, at which something was measured. Times of receiving are taken
+only where headers have no stamps, and a note says so. Everything else that was mended is in a note
+as well.
 
 """
 
@@ -44,11 +45,13 @@ ROLES = {
     'reference': ('--reference-topic', REFERENCES),
 }
 
-#: s; a stamp that lies so much before an earlier one tells of a clock that was set, not of messages that overtook each other.
+#: s; a stamp so much before an earlier one shows that a clock was set; a smaller step shows that
+#: messages overtook each other.
 _LARGEST_STEP_BACK = 1.0
 #: Share of samples that may have the stamp of another one and be left out.
 _DOUBLED = 0.01
-#: A reference is lost between two values that are further apart than so many of its intervals, and than so many s.
+#: A reference is lost between two values that are further apart than so many of its intervals, and
+#: than so many s.
 _LOST_INTERVALS, _LOST_TIME = 5.0, 0.1
 #: Topics that a sentence names at most.
 _MOST_LISTED = 20
@@ -61,7 +64,7 @@ _ORIENTATION_VARIANCE, _RATE, _RATE_VARIANCE, _FORCE, _FORCE_VARIANCE = 4, 5, 6,
 
 @dataclass(frozen=True)
 class Topics:
-    """Which topics of a recording are meant; None is the only one there is, or for the reference none at all."""
+    """Which topics of a recording are meant; None is the only one, or for the reference none."""
 
     gyro: str | None = None
     reference: str | None = None
@@ -75,7 +78,7 @@ def wrong_kind(role: str, topic: str, kind: str) -> str:
 
 
 class _Series:
-    """What came on one topic, kept as it grows: stamps and times of receiving in ns, and the numbers that matter."""
+    """Messages of one topic as they come: stamps and times of receiving, ns, and numbers kept."""
 
     def __init__(self, topic: str, kind: str):
         self.topic, self.kind, self.damaged = topic, kind, 0
@@ -100,14 +103,16 @@ class _Series:
         """Return what came, in the order in which it was received."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
-        course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received, numbers)
+        course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received,
+                         numbers)
         # Long recordings are hardly ever out of order, and need no copy then.
-        return course if (received[1:] >= received[:-1]).all() else course.taken(np.argsort(received, kind='stable'))
+        return (course if (received[1:] >= received[:-1]).all()
+                else course.taken(np.argsort(received, kind='stable')))
 
 
 @dataclass(frozen=True)
 class _Course:
-    """Stamps and times of receiving of one topic, in ns, shape (n,), and its numbers, shape (n, kept)."""
+    """Stamps and times of receiving of a topic, ns, shape (n,), and numbers, shape (n, kept)."""
 
     topic: str
     kind: str
@@ -120,11 +125,12 @@ class _Course:
 
     @property
     def has_stamps(self) -> bool:
-        """Whether the headers say when; a publisher that never sets them leaves zeros, or always the same."""
+        """Return whether the headers have stamps; else they are zero or all the same."""
         return bool(self.stamps.any()) and (len(self) < 2 or int(np.ptp(self.stamps)) > 0)
 
     def taken(self, which: Mask | NDArray[np.intp]) -> _Course:
-        return replace(self, stamps=self.stamps[which], received=self.received[which], numbers=self.numbers[which])
+        return replace(self, stamps=self.stamps[which], received=self.received[which],
+                       numbers=self.numbers[which])
 
     def timed(self, use_stamps: bool) -> _Course:
         """Return it with the times that are to be used as its stamps."""
@@ -133,7 +139,8 @@ class _Course:
         return self if self.stamps.all() else self.taken(self.stamps != 0)
 
 
-def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None, heard: Heard = lambda place: None,
+def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
+                   heard: Heard = lambda place: None,
                    say: Callable[[str], object] = lambda note: None) -> Log:
     """
     Read a ROS 2 recording: a folder, or a file .mcap or .db3.
@@ -166,14 +173,16 @@ def blocks_of(log: Log, rows: int = ROWS) -> Iterator[Log]:
     """Give a log in blocks, as a log file is read."""
     for begin in range(0, len(log), rows):
         here = slice(begin, begin + rows)
-        pieces: dict[str, Any] = {name: values[here] for name, values in vars(log).items() if isinstance(values, np.ndarray)}
+        pieces: dict[str, Any] = {name: values[here] for name, values in vars(log).items()
+                                  if isinstance(values, np.ndarray)}
         yield replace(log, **pieces)
 
 
 class _Reader:
     """Makes a log of what was read of a recording, and notes what had to be done for it."""
 
-    def __init__(self, path: str | Path, topics: Topics, contents: Contents, series: dict[str, _Series]):
+    def __init__(self, path: str | Path, topics: Topics, contents: Contents,
+                 series: dict[str, _Series]):
         self._path, self._topics, self._contents, self._series = path, topics, contents, series
         self._notes = [f'ROS 2 recording {Path(path).name}']
 
@@ -181,16 +190,19 @@ class _Reader:
         gyro, reference, temperature = self._gyro(), self._reference(), self._temperature_topic()
         use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
         if not use_stamps:
-            self._notes.append('headers have no stamps: times are those at which messages were received')
+            self._notes.append('headers have no stamps: times are those at which messages were '
+                               'received')
         gyro = self._in_order(gyro.timed(use_stamps), rate)
         time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
-        self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, time_s from {_seconds(gyro.stamps[0])} s on')
+        self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
+                           f'time_s from {_seconds(gyro.stamps[0])} s on')
         log = Log(output=self._output(gyro), time=time, specific_force=self._force(gyro))
         if temperature is not None:
             times = temperature.timed(use_stamps and temperature.has_stamps)
             log = replace(log, temperature=self._temperature(times, gyro.stamps[0], time))
         if reference is not None:
-            log = replace(log, **self._referred(reference.timed(use_stamps), gyro, time, log.output))
+            log = replace(log, **self._referred(reference.timed(use_stamps), gyro, time,
+                                                log.output))
         if rate is not None:
             log = replace(log, time=np.arange(len(gyro)) / rate)
         return replace(log, notes=(*self._notes, *self._contents.notes))
@@ -202,24 +214,30 @@ class _Reader:
         found = self._named(wanted, 'gyro') if wanted else self._only_imu()
         course = self._course(found)
         if (course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
-            raise LogError(f'{self._path}: {found} says that it reports no angular velocity; name another by --topic')
+            raise LogError(f'{self._path}: {found} says that it reports no angular velocity; '
+                           'name another by --topic')
         return course
 
     def _only_imu(self) -> str:
-        found = [topic for topic in self._of_kind((IMU,)) if topic.strip('/') != (self._topics.reference or '').strip('/')]
+        found = [topic for topic in self._of_kind((IMU,))
+                 if topic.strip('/') != (self._topics.reference or '').strip('/')]
         if len(found) == 1:
             return found[0]
         if found:
-            raise LogError(f'{self._path}: several gyros, {_listed(found)}; say by --topic which one is meant')
+            raise LogError(f'{self._path}: several gyros, {_listed(found)}; '
+                           'say by --topic which one is meant')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
-        raise LogError(f'{self._path}: no message of {IMU} in it{reasons}{self._what_there_is()}; record the topic of the gyro')
+        raise LogError(f'{self._path}: no message of {IMU} in it{reasons}'
+                       f'{self._what_there_is()}; record the topic of the gyro')
 
     def _reference(self) -> _Course | None:
         wanted = self._topics.reference
         if wanted is None:
-            found = [topic for topic in self._of_kind(REFERENCES) if self._series[topic].kind != IMU]
+            found = [topic for topic in self._of_kind(REFERENCES)
+                     if self._series[topic].kind != IMU]
             if found:
-                self._notes.append(f'no reference was asked for; --reference-topic may be {_listed(found)}')
+                self._notes.append('no reference was asked for; --reference-topic may be '
+                                   f'{_listed(found)}')
             return None
         return self._course(self._named(wanted, 'reference'))
 
@@ -231,15 +249,19 @@ class _Reader:
         if not found:
             return None
         gyro = self._topics.gyro or self._only_imu()
-        near = max(found, key=lambda topic: len(os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
+        near = max(found, key=lambda topic: len(
+            os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
         if len(found) > 1:
-            self._notes.append(f'of the temperatures {_listed(found)}, the one named most like the gyro is taken')
+            self._notes.append(f'of the temperatures {_listed(found)}, '
+                               'the one named most like the gyro is taken')
         return self._course(near)
 
     def _named(self, wanted: str, role: str) -> str:
-        topic = next((topic for topic in self._contents.topics if topic.strip('/') == wanted.strip('/')), None)
+        topic = next((topic for topic in self._contents.topics
+                      if topic.strip('/') == wanted.strip('/')), None)
         if topic is None:
-            raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; name one of them by {ROLES[role][0]}')
+            raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
+                           f'name one of them by {ROLES[role][0]}')
         if wrong := wrong_kind(role, topic, self._contents.topics[topic]):
             raise LogError(f'{self._path}: {wrong}')
         if topic not in self._series or not len(self._series[topic]):
@@ -247,7 +269,8 @@ class _Reader:
         return topic
 
     def _of_kind(self, kinds: Sequence[str]) -> list[str]:
-        return sorted(topic for topic, series in self._series.items() if series.kind in kinds and len(series))
+        return sorted(topic for topic, series in self._series.items()
+                      if series.kind in kinds and len(series))
 
     def _what_there_is(self) -> str:
         topics = [f'{topic} ({kind})' for topic, kind in sorted(self._contents.topics.items())]
@@ -256,19 +279,21 @@ class _Reader:
     def _course(self, topic: str) -> _Course:
         series = self._series[topic]
         if series.damaged:
-            self._notes.append(f'{series.damaged} messages of {topic} could not be read and were left out')
+            self._notes.append(f'{series.damaged} messages of {topic} could not be read and were '
+                               'left out')
         return series.by_arrival()
 
     # The gyro
 
     def _in_order(self, gyro: _Course, rate: float | None) -> _Course:
-        """Sort samples that overtook each other, and leave out those that came twice; refuse where times are no use."""
+        """Sort samples that overtook each other, leave out doubled ones, refuse unusable times."""
         if rate is None:
             gyro = self._single(self._sorted(gyro))
         else:
             gyro = replace(gyro, stamps=np.maximum.accumulate(gyro.stamps))
         if len(gyro) < 2:
-            raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; a log has at least two: record more')
+            raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
+                           'a log has at least two: record more')
         return gyro
 
     def _sorted(self, gyro: _Course) -> _Course:
@@ -277,8 +302,10 @@ class _Reader:
             return gyro
         if back.max() > _LARGEST_STEP_BACK * NSEC_PER_SEC:
             place = int(np.argmax(back > _LARGEST_STEP_BACK * NSEC_PER_SEC))
-            raise LogError(f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s at sample {place + 1}, as of '
-                           'a clock that was set; cut the recording there, or give --rate')
+            raise LogError(
+                f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s '
+                f'at sample {place + 1}, as of a clock that was set; cut the recording there, or '
+                'give --rate')
         self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
         return gyro.taken(np.argsort(gyro.stamps, kind='stable'))
 
@@ -290,21 +317,24 @@ class _Reader:
         same[1:] &= gyro.numbers[1:, _RATE] == gyro.numbers[:-1, _RATE]
         other = int(np.count_nonzero(doubled & ~same))
         if other > 1 + _DOUBLED * len(gyro):
-            raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have the stamp of another sample, so nobody '
-                           'knows when they were taken; give --rate')
-        self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one were left out')
+            raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
+                           'the stamp of another sample, so nobody knows when they were taken; '
+                           'give --rate')
+        self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
+                           'were left out')
         return gyro.taken(~doubled)
 
     def _output(self, gyro: _Course) -> Array:
         output = gyro.numbers[:, _RATE].copy()
         lost = ~np.isfinite(output)
         if lost.any():
-            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count as lost')
+            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
+                               'as lost')
             output[lost] = np.nan
         return output
 
     def _force(self, gyro: _Course) -> Array | None:
-        """Return the specific force along z, unless the message says that it has none, or is never filled in."""
+        """Return the specific force along z, or None if it is not reported or never filled in."""
         force = gyro.numbers[:, _FORCE]
         if (gyro.numbers[:, _FORCE_VARIANCE] == NOT_REPORTED).any() or not force.any():
             return None
@@ -317,48 +347,61 @@ class _Reader:
 
     def _temperature(self, course: _Course, begin: np.int64, time: Array) -> Array | None:
         """
-        Return the temperature at the samples: on the line between readings, and before the first and after the last as these are.
+        Return the temperature at the samples, by linear interpolation between readings.
 
-        A housing takes minutes to warm up, so a line between readings is nearer than the last reading, which only a robot has to take.
+        Before the first reading and after the last it is held. A housing takes minutes to warm up,
+        so interpolation is nearer than the last reading, which a robot has to take.
 
         """
         course = _rising(course.taken(np.isfinite(course.numbers[:, 0])))
         at = (course.stamps - begin) / NSEC_PER_SEC
-        if not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE or at[-1] < -_LONG_WITHOUT_TEMPERATURE:
-            self._notes.append(f'temperature: {course.topic} says none at the times of the gyro, and was left out')
+        if (not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE
+                or at[-1] < -_LONG_WITHOUT_TEMPERATURE):
+            self._notes.append(f'temperature: {course.topic} says none at the times of the gyro, '
+                               'and was left out')
             return None
         self._notes.append(f'temperature: {course.topic} ({course.kind}), {len(at)} readings')
         inside = at[(at >= 0.0) & (at <= time[-1])]
         longest = float(np.diff(np.concatenate([[0.0], inside, time[-1:]])).max())
         if longest > _LONG_WITHOUT_TEMPERATURE:
-            self._notes.append(f'no temperature came for up to {longest:.0f} s; it was interpolated, or held at the ends')
+            self._notes.append(f'no temperature came for up to {longest:.0f} s; '
+                               'it was interpolated, or held at the ends')
         return np.interp(time, at, course.numbers[:, 0])
 
-    def _referred(self, course: _Course, gyro: _Course, time: Array, output: Array | None) -> dict[str, Any]:
-        """Return heading and rate of a reference at the samples of the gyro; nan where it was lost."""
+    def _referred(self, course: _Course, gyro: _Course, time: Array,
+                  output: Array | None) -> dict[str, Any]:
+        """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
         if course.topic == gyro.topic:
-            raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; name another by --reference-topic')
+            raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
+                           'name another by --reference-topic')
         course = _rising(course)
-        at, wrapped, rate = (course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course), _rates(course)
+        at, wrapped, rate = ((course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course),
+                             _rates(course))
         heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
-        if rate is not None and heading is not None and not rate.any() and np.nanmax(heading) - np.nanmin(heading) > 0.1:
+        if (rate is not None and heading is not None and not rate.any()
+                and np.nanmax(heading) - np.nanmin(heading) > 0.1):
             self._notes.append('the rates of the reference are never filled in, and were left out')
             rate = None
-        found: dict[str, Any] = {name: _at(time, at, values) for name, values in (('reference_heading', heading), ('reference_rate', rate))
-                 if values is not None and np.isfinite(values).sum() > 1}
+        found: dict[str, Any] = {
+            name: _at(time, at, values)
+            for name, values in (('reference_heading', heading), ('reference_rate', rate))
+            if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{self._path}: {course.topic} says no heading and no rate at the times of the gyro; name another reference, or '
-                           'see whether both clocks agree')
+            raise LogError(f'{self._path}: {course.topic} says no heading and no rate at the '
+                           'times of the gyro; name another reference, or see whether both '
+                           'clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
-        self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, lost for {100 * lost:.1f} % of the samples')
+        self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, '
+                           f'lost for {100 * lost:.1f} % of the samples')
         return found
 
     def _continuous(self, at: Array, wrapped: Array, time: Array, output: Array | None) -> Array:
         """
         Return a heading without its jumps by whole turns.
 
-        Where the reference was lost or is slow, it may turn by more than half a turn from one value to the next. How many turns these
-        were, the gyro itself tells: its own sign and bias against the reference are found where the values lie close together.
+        Where the reference was lost or is slow, it may turn by more than half a turn from one
+        value to the next. The integral of the gyro gives the number of turns, with its sign and
+        bias against the reference, which are found where the values lie close together.
 
         """
         known = np.isfinite(wrapped)
@@ -373,7 +416,8 @@ class _Reader:
         expected = sign * turned + bias * at[known]
         heading[known] = expected + np.unwrap(wrapped[known] - expected)
         if np.abs(np.diff(heading[known]) - np.diff(plain)).max() > np.pi:
-            self._notes.append('the reference turned by more than half a turn between two values; the gyro says by how much')
+            self._notes.append('the reference turned by more than half a turn between two values; '
+                               'the gyro says by how much')
         return heading
 
 
@@ -383,7 +427,7 @@ def _rising(course: _Course) -> _Course:
 
 
 def _headings(course: _Course) -> Array | None:
-    """Return the rotation about z, wrapped, and nan where there is none; None for what never says one."""
+    """Return the rotation about z, wrapped, nan where there is none; None without any."""
     if course.kind == TWIST:
         return None
     if course.kind == IMU and not _knows_heading(course):
@@ -393,15 +437,17 @@ def _headings(course: _Course) -> Array | None:
 
 
 def _knows_heading(course: _Course) -> bool:
-    """Return whether an Imu has a heading; without one it says so by its covariance, or leaves the quaternion as a new message has it."""
+    """Return whether an Imu has a heading: neither declared unknown nor left at its default."""
     variance = course.numbers[:, _ORIENTATION_VARIANCE]
-    untouched = not (course.numbers[:, :3].any() or variance.any()) and bool((course.numbers[:, 3] == 1.0).all())
+    untouched = (not (course.numbers[:, :3].any() or variance.any())
+                 and bool((course.numbers[:, 3] == 1.0).all()))
     return not untouched and not (variance == NOT_REPORTED).all()
 
 
 def _rates(course: _Course) -> Array | None:
     place: dict[str, Any] = {IMU: _RATE, ODOMETRY: 4, TWIST: 0}
-    if course.kind not in place or course.kind == IMU and (course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
+    if course.kind not in place or course.kind == IMU and (
+            course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
         return None
     rate = course.numbers[:, place[course.kind]].copy()
     rate[~np.isfinite(rate)] = np.nan
@@ -409,7 +455,7 @@ def _rates(course: _Course) -> Array | None:
 
 
 def _at(time: Array, at: Array, values: Array) -> Array:
-    """Return values at other times: on the line between two of them, and nan where they are too far apart."""
+    """Return values interpolated at other times; nan where two values are too far apart."""
     at, values = at[np.isfinite(values)], values[np.isfinite(values)]
     longest = max(_LOST_INTERVALS * float(np.median(np.diff(at))), _LOST_TIME)
     place = np.clip(np.searchsorted(at, time, 'right') - 1, 0, len(at) - 2)

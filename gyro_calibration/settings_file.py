@@ -1,5 +1,7 @@
 """
-Files of settings: models, bias tables, limits. They are YAML as people write it, and data alone: nothing in them is run or names a file.
+Files of settings: models, bias tables, limits.
+
+They are YAML as people write it, and data alone: nothing in them is run or names a file.
 
 """
 
@@ -16,7 +18,8 @@ from gyro_calibration.files import read_bytes
 
 #: Bytes of such a file: a model with the covariance of 150 values has half of it.
 BYTES = 1_000_000
-#: How deep lists and names may be nested, and how many there may be, since YAML takes 30 us for each.
+#: How deep lists and names may be nested, and how many there may be, since YAML takes 30 us for
+#: each.
 _DEEPEST, _MOST = 10, 50_000
 
 
@@ -61,9 +64,10 @@ def settings_text(content: Any) -> str:
 
 class _Loader(yaml.SafeLoader):
     """
-    Reads what files of settings are made of, and refuses the rest of YAML: aliases, tags, names that are given twice.
+    Reads names, texts, numbers and lists, and refuses aliases, tags and names given twice.
 
-    A few lines with aliases unfold to gigabytes; a deep nest is more than the stack of Python holds.
+    A few lines with aliases unfold to gigabytes; a deep nest is more than the stack of Python
+    holds.
 
     """
 
@@ -100,14 +104,16 @@ class _Loader(yaml.SafeLoader):
 class _Dumper(yaml.SafeDumper):
     """Puts a text in quotes that would be read as a number."""
 
-    yaml_implicit_resolvers: dict[Any, Any] = {first: list(each) for first, each in yaml.SafeDumper.yaml_implicit_resolvers.items()}
+    yaml_implicit_resolvers: dict[Any, Any] = {
+        first: list(each) for first, each in yaml.SafeDumper.yaml_implicit_resolvers.items()}
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
     def represent_str(self, data: str) -> Any:
         # Outside of double quotes these would be read as ends of lines.
-        return self.represent_scalar('tag:yaml.org,2002:str', data, '"' if re.search('[\x85\u2028\u2029]', data) else None)
+        return self.represent_scalar('tag:yaml.org,2002:str', data,
+                                     '"' if re.search('[\x85\u2028\u2029]', data) else None)
 
 
 def _number(dumper: Any, value: float) -> Any:
@@ -124,12 +130,15 @@ def _float(loader: Any, node: Any) -> float:
     return float(node.value.lower().replace('.inf', 'inf').replace('.nan', 'nan'))
 
 
-#: Name -> (pattern, first characters, constructor). A number of more than 400 digits is none, and would take long to read.
+#: Name -> (pattern, first characters, constructor). A number of more than 400 digits is none, and
+#: would take long to read.
 _KINDS: dict[str, tuple[str, list[str], Any]] = {
     'null': ('~|null|Null|NULL|', ['~', 'n', 'N', ''], lambda loader, node: None),
-    'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'), lambda loader, node: node.value.lower() == 'true'),
+    'bool': ('true|True|TRUE|false|False|FALSE', list('tTfF'),
+             lambda loader, node: node.value.lower() == 'true'),
     'int': ('[-+]?[0-9]{1,400}', list('-+0123456789'), lambda loader, node: int(node.value)),
-    'float': (r'[-+]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][-+]?[0-9]{1,9})?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)',
+    'float': (r'[-+]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][-+]?[0-9]{1,9})?|'
+              r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)',
               list('-+.0123456789'), _float),
     'str': ('', [], lambda loader, node: node.value),
     'seq': ('', [], yaml.SafeLoader.construct_yaml_seq),

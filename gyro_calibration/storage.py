@@ -1,9 +1,9 @@
 """
 What a ROS 2 recording holds: the messages of a folder, of an .mcap file or of a .db3 file.
 
-A recording whose program was killed lacks its closing part and the index, so neither is looked at: the records are gone through from the
-beginning, up to the end or the tear. Nothing in a file is believed that could take more memory than `LARGEST`, or that grows to more than
-`GROWTH` times the file.
+A recording whose program was killed lacks its closing part and the index, so neither is used: the
+records are read from the beginning, up to the end or the tear. No length in a file is trusted that
+could take more memory than `LARGEST`, or that grows to more than `GROWTH` times the file.
 
 """
 
@@ -31,7 +31,8 @@ from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
 from gyro_calibration.log import LogError, shown
 from gyro_calibration.messages import LAYOUTS
 
-#: Bytes of a record or of a chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
+#: Bytes of a record or of a chunk, beyond which it is left out; recorders make chunks of 1 to
+#: 10 MB.
 LARGEST = 1 << 28
 _PIECE = 1 << 20
 
@@ -39,12 +40,13 @@ _MAGIC = b'\x89MCAP0\r\n'
 _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 2, 3, 4, 5, 6, 12, 15
 _READ = _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA
-#: Closing part of an MCAP file that has no index and no checksum: the end of the data, a footer of zeros.
+#: Closing part of an MCAP file without index and checksum: the end of the data, a footer of zeros.
 MCAP_END = struct.pack('<BQ4x', _DATA_END, 4) + struct.pack('<BQ20x', _FOOTER, 20) + _MAGIC
-#: Name of what a recorder of this program says of a recording; and how many characters of a text are told.
+#: Name of the metadata of a recorder of this program, and the most characters shown of a text.
 ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
 
-#: SQLite tells of a damaged file in its words, which need not be text, or that a length in it asks for more memory than there may be.
+#: The errors of SQLite in a damaged file: its own, whose words need not be text, and a length that
+#: asks for more memory than there may be.
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 #: Is told how many bytes of all files are read.
@@ -53,7 +55,7 @@ Heard = Callable[[int], object]
 
 @dataclass(frozen=True)
 class Message:
-    """One message as it was recorded: its topic, its kind, when it was received, in ns, and its bytes."""
+    """A message as recorded: its topic, its kind, the time of receiving, ns, and its bytes."""
 
     topic: str
     kind: str
@@ -63,7 +65,7 @@ class Message:
 
 @dataclass
 class Contents:
-    """What turned out of a recording while it was read: topic -> kind, what its recorder says of it, and remarks for people."""
+    """The contents of a recording so far: topic -> kind, notes of its recorder, and remarks."""
 
     topics: dict[str, str] = field(default_factory=dict)
     about: list[str] = field(default_factory=list)
@@ -72,7 +74,7 @@ class Contents:
 
 
 def said(text: object) -> str:
-    """Return a text of a file as it may stand in a sentence: in one line, not too long, and without what a terminal would obey."""
+    """Return a text of a file for a sentence: one line, not too long, no control characters."""
     return plain(' '.join(str(text).split()))[:_MOST_CHARACTERS]
 
 
@@ -98,15 +100,18 @@ def files_of(path: str | Path) -> list[Path]:
     try:
         found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
     except OSError as error:
-        raise LogError(f'{path}: cannot be read ({reason(error)}); {remedy(error, path)}') from error
+        raise LogError(f'{path}: cannot be read ({reason(error)}); '
+                       f'{remedy(error, path)}') from error
     if not found:
-        raise LogError(f'{path}: a folder without an .mcap or .db3 file; name the folder of a ROS 2 recording, or a log file')
+        raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
+                       'name the folder of a ROS 2 recording, or a log file')
     return sorted(found, key=_natural)
 
 
-def read_messages(path: str | Path, contents: Contents, heard: Heard = lambda place: None) -> Iterator[Message]:
+def read_messages(path: str | Path, contents: Contents,
+                  heard: Heard = lambda place: None) -> Iterator[Message]:
     """
-    Give the messages of a recording that may be of use for a gyro, and fill in its contents meanwhile.
+    Give the messages of a recording that may be of use for a gyro, and fill in its contents.
 
     Parameters
     ----------
@@ -127,9 +132,11 @@ def read_messages(path: str | Path, contents: Contents, heard: Heard = lambda pl
                 yield from read(source, file, contents, partial(_shifted, heard, done))
             done += file.stat().st_size
         except OSError as error:
-            raise LogError(f'{file}: cannot be read ({reason(error)}); {remedy(error, file)}') from error
+            raise LogError(f'{file}: cannot be read ({reason(error)}); '
+                           f'{remedy(error, file)}') from error
     if contents.left_out:
-        parts = 'part of the recording was' if contents.left_out == 1 else 'parts of the recording were'
+        parts = ('part of the recording was' if contents.left_out == 1
+                 else 'parts of the recording were')
         contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
 
 
@@ -179,14 +186,16 @@ class _Budget:
         """
         self._left -= size
         if self._left < 0:
-            raise LogError(f'{self._path}: grows to more than {GROWTH} times its size, as no recording does; record again, or unpack it if '
-                           'that is what was recorded')
+            raise LogError(f'{self._path}: grows to more than {GROWTH} times its size, as no '
+                           'recording does; record again, or unpack it if that is what was '
+                           'recorded')
 
 
 def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
     """Give what Zstandard made smaller piece by piece, up to a tear or damage."""
     zstandard = _library('zstandard')
-    reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(packed, read_across_frames=True)
+    reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(
+        packed, read_across_frames=True)
     try:
         while piece := reader.read(_PIECE):
             yield piece
@@ -200,7 +209,8 @@ def _library(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         package = name.partition('.')[0]
-        raise LogError(f'the recording is compressed, which needs the Python package {package}: pip install {package}') from None
+        raise LogError(f'the recording is compressed, which needs the Python package {package}: '
+                       f'pip install {package}') from None
 
 
 # MCAP
@@ -219,11 +229,12 @@ def _from_mcap(source: Path, path: Path, contents: Contents, heard: Heard) -> It
             if file.tell() - told > _PIECE:
                 told = file.tell()
                 heard(told)
-        contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, and was read up to there')
+        contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
+                              'and was read up to there')
 
 
 def _records(stream: BinaryIO, end: int, contents: Contents) -> Iterator[tuple[int, bytes]]:
-    """Give code and content of each record of a file or of a chunk; what is torn is given as far as it goes if it is a chunk."""
+    """Give code and content of each record of a file or a chunk; a torn chunk is cut short."""
     while len(head := stream.read(9)) == 9:
         code, length = struct.unpack('<BQ', head)
         left = end - stream.tell()
@@ -282,7 +293,8 @@ class _McapReader:
     def _message(self, body: bytes) -> Iterator[Message]:
         number, _, received, _ = struct.unpack_from('<HIQQ', body)
         if number in self._channels:
-            yield Message(*self._channels[number], received, _message_data(body[22:], self._budget))
+            yield Message(*self._channels[number], received,
+                          _message_data(body[22:], self._budget))
 
 
 class _Damaged(ValueError):
@@ -361,7 +373,8 @@ def _message_data(data: bytes, budget: _Budget) -> bytes:
 # SQLite
 
 
-def _from_database(source: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+def _from_database(source: Path, path: Path, contents: Contents,
+                   heard: Heard) -> Iterator[Message]:
     with _database(source, path, contents) as database:
         channels, budget = _topics(database, path, contents), _Budget(path)
         size, last, count = path.stat().st_size, _last_row(database), 0
@@ -377,20 +390,24 @@ def _from_database(source: Path, path: Path, contents: Contents, heard: Heard) -
                     continue
                 yield Message(*channels[topic], received, _message_data(data, budget))
         except _DATABASE_ERRORS as error:
-            contents.notes.append(f'{path.name} is damaged after {count} messages ({_why(error)}), and was read up to there')
+            contents.notes.append(f'{path.name} is damaged after {count} messages '
+                                  f'({_why(error)}), and was read up to there')
 
 
 @contextmanager
 def _database(source: Path, path: Path, contents: Contents) -> Iterator[sqlite3.Connection]:
     """
-    Open a database for reading only: with what a killed writer left beside it, without, and at last as much as is there of it.
+    Open a database for reading only.
 
-    Its tables are read as they lie there: nothing in its schema is computed, whose cost nothing in the file would bound.
+    It is tried with the files that a killed writer left beside it, without them, and at last as
+    the part that is there. Its tables are read as they are stored: nothing in its schema is
+    computed, since nothing in the file would bound the cost.
 
     """
     with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
         reason: Exception | None = None
-        ways = ('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source), ('mode=ro', lambda: _shortened(source, Path(folder)))
+        ways = (('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source),
+                ('mode=ro', lambda: _shortened(source, Path(folder))))
         for how, file in ways:
             try:
                 database, tables = _opened(file(), how)
@@ -399,10 +416,12 @@ def _database(source: Path, path: Path, contents: Contents) -> Iterator[sqlite3.
                 continue
             with closing(database):
                 if not {'topics', 'messages'} <= tables:
-                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables of stored columns; name a recording')
+                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables '
+                                   'of stored columns; name a recording')
                 yield database
                 return
-    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); name a recording, or record again')
+    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); '
+                   'name a recording, or record again')
 
 
 def _why(error: Exception | None) -> str:
@@ -418,9 +437,11 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
         if sys.version_info >= (3, 11):
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _PIECE)
         database.execute('PRAGMA trusted_schema = OFF')
-        tables = {name for name, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        tables = {name for name, in database.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table'")}
         stored = {name for name in sorted(tables & {'topics', 'messages'})
-                  if not any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({name})'))}
+                  if not any(hidden for *_, hidden
+                             in database.execute(f'PRAGMA table_xinfo({name})'))}
         database.set_authorizer(_authorized)
         return database, stored
     except BaseException:
@@ -429,7 +450,12 @@ def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
 
 
 class _Steps:
-    """Ends what takes more steps of SQLite than the rows of a file can: the smallest row has a dozen bytes and takes some 30 steps."""
+    """
+    Ends a query that takes more steps of SQLite than the rows of a file can.
+
+    The smallest row has a dozen bytes and takes some 30 steps.
+
+    """
 
     AT_ONCE, A_BYTE, ANYWAY = 1000, 10, 1_000_000
 
@@ -441,8 +467,9 @@ class _Steps:
         return self._left < 0
 
 
-def _authorized(action: int, first: str | None, second: str | None, _: str | None, within: str | None) -> int:
-    """Let SQLite read the two tables of a recording, with the functions that are used here, and nothing that a view asks for."""
+def _authorized(action: int, first: str | None, second: str | None, _: str | None,
+                within: str | None) -> int:
+    """Allow SQLite to read both tables, with the functions used here, and nothing of a view."""
     reads = action == sqlite3.SQLITE_READ and first in ('topics', 'messages')
     computes = action == sqlite3.SQLITE_FUNCTION and second in ('length', 'max', 'typeof')
     allowed = within is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
@@ -450,7 +477,7 @@ def _authorized(action: int, first: str | None, second: str | None, _: str | Non
 
 
 def _shortened(source: Path, folder: Path) -> Path:
-    """Return a copy of a torn database that says itself how long it is, for none is opened that is shorter than it says."""
+    """Return a copy of a torn database with its true length, as SQLite refuses a shorter file."""
     copy = Path(shutil.copy(source, folder))
     with open(copy, 'r+b') as file:
         head = file.read(100)
@@ -462,16 +489,19 @@ def _shortened(source: Path, folder: Path) -> Path:
     return copy
 
 
-def _topics(database: sqlite3.Connection, path: Path, contents: Contents) -> dict[int, tuple[str, str]]:
+def _topics(database: sqlite3.Connection, path: Path,
+            contents: Contents) -> dict[int, tuple[str, str]]:
     channels = {}
     try:
-        for number, topic, kind, encoding in database.execute('SELECT id, name, type, serialization_format FROM topics'):
+        for number, topic, kind, encoding in database.execute(
+                'SELECT id, name, type, serialization_format FROM topics'):
             topic, kind = shown(str(topic)), shown(str(kind))
             contents.topics[topic] = kind
             if kind in LAYOUTS and encoding == 'cdr':
                 channels[number] = topic, kind
     except _DATABASE_ERRORS as error:
-        raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); record again') from error
+        raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); '
+                       'record again') from error
     return channels
 
 
@@ -484,7 +514,7 @@ def _last_row(database: sqlite3.Connection) -> int:
 
 
 def _rows(database: sqlite3.Connection) -> Iterator[Any]:
-    """Give row, topic, time and data of the messages; none of those that are wanted here is large, and nothing else is loaded."""
+    """Give row, topic, time and data of the messages; data of 64 KiB and more are not loaded."""
     return database.execute("""
         SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
                CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
