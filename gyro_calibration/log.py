@@ -44,8 +44,7 @@ Number = Any  # a float, or an array of shape (n,): most formulas serve both
 
 DEGREE = math.pi / 180.0
 
-#: Samples of a dozen columns that fit into the cache of a processor, which is twice as fast as
-#: memory.
+#: Samples of a dozen columns that fit into the cache of a processor, twice as fast as memory.
 CACHED = 1 << 14
 #: Rows of a block of a log that is read piece by piece.
 ROWS = 1 << 16

@@ -110,7 +110,7 @@ def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[flo
                        temperature_range: tuple[float, float],
                        dwells: Dwells | None = None) -> None:
     """
-    Draw the error by a model over output and temperature (as figure 6 of Ojeda et al.).
+    Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
 
     Parameters
     ----------

@@ -50,8 +50,7 @@ ROLES = {
 _LARGEST_STEP_BACK = 1.0
 #: Share of samples that may have the stamp of another one and be left out.
 _DOUBLED = 0.01
-#: A reference is lost between two values that are further apart than so many of its intervals, and
-#: than so many s.
+#: A reference is lost between values further apart than so many of its intervals and so many s.
 _LOST_INTERVALS, _LOST_TIME = 5.0, 0.1
 #: Topics that a sentence names at most.
 _MOST_LISTED = 20

@@ -18,8 +18,7 @@ from gyro_calibration.files import read_bytes
 
 #: Bytes of such a file: a model with the covariance of 150 values has half of it.
 BYTES = 1_000_000
-#: How deep lists and names may be nested, and how many there may be, since YAML takes 30 us for
-#: each.
+#: How deep lists and names may be nested, and how many there may be; YAML takes 30 us for each.
 _DEEPEST, _MOST = 10, 50_000
 
 

@@ -2,8 +2,8 @@
 What a ROS 2 recording holds: the messages of a folder, of an .mcap file or of a .db3 file.
 
 A recording whose program was killed lacks its closing part and the index, so neither is used: the
-records are read from the beginning, up to the end or the tear. No length in a file is trusted that
-could take more memory than `LARGEST`, or that grows to more than `GROWTH` times the file.
+records are read from the beginning, up to the end or the tear. Nothing in a file may take
+more memory than `LARGEST`, or grow to more than `GROWTH` times the file.
 
 """
 
@@ -31,8 +31,7 @@ from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
 from gyro_calibration.log import LogError, shown
 from gyro_calibration.messages import LAYOUTS
 
-#: Bytes of a record or of a chunk, beyond which it is left out; recorders make chunks of 1 to
-#: 10 MB.
+#: Bytes of a record or chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
 LARGEST = 1 << 28
 _PIECE = 1 << 20
 

@@ -7,18 +7,18 @@ to an `Answer`. Units that people use are converted here.
 """
 
 from gyro_calibration.cli import (
-         allan,
-         compensate,
-         demo,
-         diagnose,
-         emulate,
-         fit,
-         plan,
-         record,
-         reproduce,
-         self_calibrate,
-         simulate,
-         turn,
+    allan,
+    compensate,
+    demo,
+    diagnose,
+    emulate,
+    fit,
+    plan,
+    record,
+    reproduce,
+    self_calibrate,
+    simulate,
+    turn,
 )
 
 VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, simulate, emulate, record,

@@ -34,7 +34,7 @@ from gyro_calibration.tracking import Settings, Track, track
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'compensate', _compensate,
                   'add compensated rates, and for samples in time the heading, to a log',
-                   'drive.csv --model model.yaml --out compensated.csv')
+                  'drive.csv --model model.yaml --out compensated.csv')
     add_log(parser)
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')

@@ -33,7 +33,7 @@ from gyro_calibration.log import DEGREE, Array, DataRefused
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'emulate', _emulate, 'be a gyro on a pseudo-terminal, from a model and '
                   'a motion or from a log; prints its path',
-                   '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
+                  '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
@@ -88,6 +88,7 @@ def _emulate(given: argparse.Namespace) -> None:
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults,
                         generator)
     _handle_signals(lambda *_: emulator.stop())
+
     def answer(path: str) -> None:
         print(json.dumps({'path': path, 'protocol': protocol.name}) if given.json
               else plain(path), flush=True)

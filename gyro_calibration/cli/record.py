@@ -45,7 +45,7 @@ _PATIENCE = 5.0  # s; without a message, until it is said what is waited for
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'record', _record,
                   'record a gyro, from its port or from topics, until Ctrl-C',
-                   '--port /dev/ttyUSB0 --out drive.csv')
+                  '--port /dev/ttyUSB0 --out drive.csv')
     parser.add_argument('--out', required=True, metavar='FILE',
                         help=f'a new file, {", ".join(KINDS)}')
     parser.add_argument('--seconds', type=positive, metavar='N',

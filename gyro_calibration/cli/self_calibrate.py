@@ -45,7 +45,7 @@ NEAREST = 'nearest'
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'self-calibrate', _self_calibrate,
                   'find scale factor error and bias from about 20 s of known motion',
-                   'run.csv --profile profile.csv --out model.yaml')
+                  'run.csv --profile profile.csv --out model.yaml')
     add_log(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')

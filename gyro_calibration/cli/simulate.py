@@ -40,7 +40,7 @@ def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'simulate', _simulate, 'write the log of a simulated gyro',
-                   '--model model.yaml --motion robot --out log.csv --seed 1')
+                  '--model model.yaml --motion robot --out log.csv --seed 1')
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     add_motion(parser, required=True)
     parser.add_argument('--out', required=True, metavar='LOG.csv', help='.csv or .csv.gz')
