@@ -461,7 +461,8 @@ def _bin(entry: Entry) -> int:
 
 def _possible(entry: Entry) -> bool:
     """Tell whether this may be a bias of a gyro; nan never is."""
-    return ((entry.temperature, entry.time) == _bounded(entry.temperature, entry.time)
+    temperature, time = _bounded(entry.temperature, entry.time)
+    return (entry.temperature == temperature and entry.time == time
             and abs(entry.bias) <= 1e4 and _LEAST <= entry.variance <= 1e8
             and 0 <= entry.run <= 1e9)
 

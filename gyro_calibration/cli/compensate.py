@@ -128,7 +128,9 @@ def _compensated(given: argparse.Namespace, model: GyroModel,
 def _refuse_infinite(given: argparse.Namespace, piece: _Piece) -> None:
     """Refuse a sample for which the model gives no finite rate or heading."""
     for name, values in piece.columns.items():
-        if not (finite := np.isfinite(values)).all():
+        # a standard deviation may be unknown, nan
+        finite = ~np.isinf(values) if '_std_' in name else np.isfinite(values)
+        if not finite.all():
             row = int(np.argmin(finite))
             output = float(np.asarray(piece.log.output)[piece.known][row])
             at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
