@@ -215,12 +215,11 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
 
 # units, limit and steps
 
-def test_a_model_of_a_mended_output_says_so(tmp_path):
-    log = drive(gyro=GyroModel(LINEAR[:1]))
-    found = diagnosed(replace(log, output=-log.output))
-    write_model(tmp_path / 'model.yaml', found.model)
-    assert names(found) == ['unit_error'] and read_model(tmp_path / 'model.yaml').origin['output_multiplied_by'] == [-1.0]
-    assert any('multiplied by -1' in remark and '--invert' in remark for remark in found.remarks)
+def test_an_output_of_the_other_sense_is_the_only_finding_and_the_model_stays_as_it_is():
+    log, model = drive(gyro=GyroModel(LINEAR[:1])), GyroModel(LINEAR[:1], noise=NOISE)
+    found = diagnosed(replace(log, output=-log.output), model)
+    assert found.verdict == 'mismatched' and names(found) == ['unit_error'] and found.model is model
+    assert '--invert' in found.findings[0].remedy
 
 
 @pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)], ids=['no model', 'a model'])

@@ -2,8 +2,9 @@
 Diagnosis: what a simulation of a gyro gets wrong, why, and what is gained when its model is extended.
 
 Reading order, each imports only from those before it: `finding` (what is found, as records), `causes` (that can be named), `compared`
-(output and reference), `codes` (of a digital output), `stuck` (samples), `wild` (samples), `factors` (of units), `door` (where logs are
-refused), `hygiene` (of a record), `spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what has
+(output and reference), `codes` (of a digital output), `stuck` (samples), `wild` (samples), `factors` (of units), `gates` (gyro and
+reference belong together), `door` (where logs are refused), `hygiene` (of a record), `spectrum` (of the noise), `replay` (of a log),
+`candidates` (columns of causes), `probes` (of what has
 no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes), `units` (of people), `menu` (of experiments),
 `experiment` (that parts causes), `outcome` (of a search, in values), `figures` (of noise), `extension` (of the model), `gain` (on what
 was held out), `curves` (for people to see), `naming` (of findings), `steps` (of a diagnosis, in order), `dwell_fit` (of what a model

@@ -10,7 +10,7 @@ from gyro_calibration.log import Array
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
 
-SCHEMA = 'gyro_calibration/diagnosis/1'
+SCHEMA = 'gyro_calibration/diagnosis/2'
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,32 @@ class Estimate:
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}
+
+
+@dataclass(frozen=True)
+class Gate:
+    """
+    What was checked before anything is named.
+
+    Attributes
+    ----------
+    name : wrapped_heading, motion, tilt, sense, unit or time_unit
+    passed : None where the log does not show it
+    said : what was seen, in numbers
+    remedy : what to do where it failed
+    factor : of the output over the reference and its interval of 95 %, where it failed by that
+
+    """
+
+    name: str
+    passed: bool | None
+    said: str
+    remedy: str = ''
+    factor: tuple[float, tuple[float, float]] | None = None
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'name': self.name, 'passed': self.passed, 'said': self.said, 'remedy': self.remedy}
 
 
 @dataclass(frozen=True)
@@ -42,6 +68,11 @@ class Finding:
     separate_by : the experiment that would part them; '' where there is nothing to part
     evidence : what in the data shows it, one sentence with numbers in units of people
     along : the variable along which it shows, a key of `Diagnosis.curves`; '' where there is none
+    status : 'established', or 'suspected' where it is not confirmed on stretches that took no part in choice and fit
+    probability : of it and of those that may be in its place, by name; empty where it was not computed
+    share_of_heading_error : part of the mean square of the heading error over 60 s that it explains; None where it was not computed
+    where : from and to, s, of an effect in part of the log; None of the whole log
+    remedy : what to do about it
 
     """
 
@@ -54,13 +85,20 @@ class Finding:
     separate_by: str = ''
     evidence: str = ''
     along: str = ''
+    status: str = 'established'
+    probability: Mapping[str, float] = field(default_factory=dict)
+    share_of_heading_error: float | None = None
+    where: tuple[float, float] | None = None
+    remedy: str = ''
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'effect': self.effect, 'cause': self.cause,
                 'parameters': {name: value.figures() for name, value in self.parameters.items()},
                 'p_value': self.p_value, 'minimum_detectable': self.minimum_detectable,
-                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by, 'evidence': self.evidence}
+                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by, 'evidence': self.evidence,
+                'status': self.status, 'probability': dict(self.probability), 'share_of_heading_error': self.share_of_heading_error,
+                'where': None if self.where is None else list(self.where), 'remedy': self.remedy}
 
 
 @dataclass(frozen=True)
@@ -118,6 +156,7 @@ class Gain:
     rate : of the simulated against the measured rate, rad/s
     heading : of the simulated against the measured change of heading over windows, rad; None where no window is as long
     window : s
+    models : name -> root mean square of the heading error of given, plain (bias, scale factor and delay alone) and extended model, rad
 
     """
 
@@ -125,6 +164,7 @@ class Gain:
     rate: Change
     heading: Change | None
     window: float = 60.0
+    models: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def worse(self) -> bool:
@@ -134,7 +174,7 @@ class Gain:
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         heading = None if self.heading is None else {'window_s': self.window, **self.heading.figures()}
-        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(), 'heading_rms': heading}
+        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(), 'heading_rms': heading, **self.models}
 
 
 @dataclass(frozen=True)
@@ -202,6 +242,28 @@ class NoiseCurve:
 
 
 @dataclass(frozen=True)
+class Reference:
+    """
+    What a log is compared with.
+
+    Attributes
+    ----------
+    kind : rate_command, encoder, motion_capture, course, odometry, gyro or rest
+    known : how the kind is known, in words
+    noise : name -> size in SI of the reference's own errors; empty where the reference is taken as exact
+
+    """
+
+    kind: str
+    known: str
+    noise: Mapping[str, float] = field(default_factory=dict)
+
+    def figures(self) -> dict[str, Any]:
+        """Return it as data."""
+        return {'kind': self.kind, 'known': self.known, 'noise': dict(self.noise)}
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """
     All that was found.
@@ -221,6 +283,9 @@ class Diagnosis:
     false_alarm_rate : of the whole diagnosis, a log
     logs : names of the files
     method : how it was computed, for people; where it is empty, as a log in time is
+    gates : what was checked before anything was named
+    reference : what the log was compared with; None where several logs or a rate table were given
+    heading_shares : cause, 'reference' or 'left' -> part of the mean square of the heading error over 60 s; empty where not computed
 
     """
 
@@ -240,13 +305,18 @@ class Diagnosis:
     logs: tuple[str, ...] = ()
     trace: Trace | None = None
     method: str = ''
+    gates: tuple[Gate, ...] = ()
+    reference: Reference | None = None
+    heading_shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
-        """Return adequate, extended or unexplained."""
+        """Return mismatched, adequate, extended or unexplained."""
+        if any(gate.passed is False for gate in self.gates):
+            return 'mismatched'
         if self.unexplained:
             return 'unexplained'
-        return 'extended' if self.findings else 'adequate'
+        return 'extended' if any(each.status == 'established' for each in self.findings) else 'adequate'
 
     def figures(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
@@ -255,7 +325,9 @@ class Diagnosis:
                 'unexplained': [each.figures() for each in self.unexplained],
                 'noise': _noise(self.noise), 'simulated_noise': _noise(self.simulated),
                 'gain': None if self.gain is None else self.gain.figures(),
-                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks), 'logs': list(self.logs)}
+                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks), 'logs': list(self.logs),
+                'gates': [gate.figures() for gate in self.gates], 'heading_shares': dict(self.heading_shares),
+                'reference': None if self.reference is None else self.reference.figures()}
 
 
 def _noise(noise: Noise) -> dict[str, float]:

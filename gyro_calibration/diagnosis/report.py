@@ -42,7 +42,8 @@ _SLOW = 2e-3 * DEGREE
 #: The curve that holds amplitudes in place of means.
 SPECTRUM = 'frequency'
 _VERDICTS = {'adequate': 'Adequate: nothing was found', 'extended': 'Extended: all that was found has a name',
-             'unexplained': 'Unexplained: something is left without a name'}
+             'unexplained': 'Unexplained: something is left without a name',
+             'mismatched': 'Mismatched: gyro and reference do not belong together'}
 
 _METHOD = (
     '{logs} replayed through the simulation: the motion and the temperature as recorded, the output as the model has it.',

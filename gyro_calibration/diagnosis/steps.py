@@ -17,8 +17,9 @@ from gyro_calibration.diagnosis.experiment import separating
 from gyro_calibration.diagnosis.extension import calibrated, doubts_scale, extended, left_out, noted, with_findings
 from gyro_calibration.diagnosis.field import Named, filtered, work
 from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figures
-from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
 from gyro_calibration.diagnosis.gain import gain
+from gyro_calibration.diagnosis.gates import gates, mismatch
 from gyro_calibration.diagnosis.hygiene import Hygiene, decided, inspect
 from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
@@ -66,8 +67,15 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : the logs allow no diagnosis
 
     """
-    say('hygiene')
+    say('gates')
     given, model = model, None if model is None else calibrated(model)
+    checked = [gates(log, model) for log in logs]
+    for place, each in enumerate(checked):
+        if (failed := mismatch(each)) is not None:
+            if failed.effect != 'wrapped_heading':
+                refuse(logs[place])
+            return _mismatched(failed, each, given or GyroModel(), names[place:place + 1], rate)
+    say('hygiene')
     for log in logs:
         refuse(log, model)
     hygiene = [decided(inspect(log, model)) for log in logs]
@@ -89,8 +97,13 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     won = gain(search, causes, model is not None) if (causes or changed) and not doubts_scale(found) else None
     say('report')
     known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won, _cannot_show(search, logs))
-    told = _told(known, hygiene, model, rate, names, generator)
+    told = replace(_told(known, hygiene, model, rate, names, generator), gates=tuple(gate for each in checked for gate in each))
     return replace(told, before=given, model=given) if given is not None and told.model is model else told
+
+
+def _mismatched(failed: Finding, checked: tuple[Gate, ...], model: GyroModel, names: Sequence[str], rate: float) -> Diagnosis:
+    """Return the diagnosis of a log whose gyro and reference do not belong together: that alone, and the model as it is."""
+    return Diagnosis((failed,), (), Noise(), model.noise, None, model, model, false_alarm_rate=rate, logs=tuple(names), gates=checked)
 
 
 @dataclass(frozen=True)

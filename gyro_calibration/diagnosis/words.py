@@ -43,6 +43,9 @@ def sentence(text: str) -> str:
 
 def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     """Return the finding in two sentences: what is wrong, and what is won by mending it."""
+    if diagnosis.verdict == 'mismatched':
+        (found,) = diagnosis.findings
+        return found.cause, f'Nothing else can be named before that is mended: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
                 f'The model is left as it is; of logs without any cause, {100.0 * diagnosis.false_alarm_rate:.2g} % would give an alarm '

@@ -1,0 +1,107 @@
+"""What keeps gyro and reference from being compared is the only finding, with its remedy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gyro_calibration.diagnosis.gates import gates
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.log import DEGREE, Log
+
+TIME = np.arange(0.0, 120.0, 0.01)
+MOTION = 0.6 * np.sin(0.7 * TIME) + 0.3 * np.sin(1.9 * TIME + 1.0) + 0.1 * np.sin(0.11 * TIME)
+HEADING = np.cumsum(MOTION) * 0.01
+
+
+def drive(seed=0, heading_noise=0.0):
+    """Return a log of a gyro with a bias and a heading as its reference."""
+    generator = np.random.default_rng(seed)
+    output = 1.01 * MOTION + 0.005 + 2e-3 * generator.standard_normal(len(TIME))
+    return Log(
+        output=output,
+        time=TIME,
+        reference_heading=HEADING + heading_noise * generator.standard_normal(len(TIME)),
+    )
+
+
+def other_motion():
+    generator = np.random.default_rng(7)
+    other = np.repeat(generator.standard_normal(len(TIME) // 200), 200)
+    return np.cumsum(other) * 0.01
+
+
+def tumbling(log):
+    """Return a log whose axis tilts: the gyro sees a part of the turns, and other turns."""
+    tilt = np.cos(0.9 * TIME)
+    return replace(
+        log, output=log.output * tilt + 1.5 * np.sin(0.13 * TIME) * np.sqrt(1.0 - tilt**2)
+    )
+
+
+WRONG = {
+    'sense': lambda log: replace(log, output=-log.output),
+    'output in deg': lambda log: replace(log, output=log.output / DEGREE),
+    'output in rad': lambda log: replace(log, output=log.output * DEGREE),
+    'heading in deg': lambda log: replace(log, reference_heading=log.reference_heading / DEGREE),
+    'heading in rad': lambda log: replace(log, reference_heading=log.reference_heading * DEGREE),
+    'factor 2': lambda log: replace(log, output=2.0 * log.output),
+    'factor 1e12': lambda log: replace(log, output=1e12 * log.output),
+    'stamps in ms': lambda log: replace(log, time=1e3 * log.time),
+    'stamps ten times too slow': lambda log: replace(log, time=10.0 * log.time),
+    'wrapped': lambda log: replace(
+        log, reference_heading=(log.reference_heading + 3.0) % (2.0 * np.pi)
+    ),
+    'other motion': lambda log: replace(log, reference_heading=other_motion()),
+    'tumbling': tumbling,
+}
+FAILED = {
+    'sense': 'sense',
+    'stamps in ms': 'time_unit',
+    'stamps ten times too slow': 'time_unit',
+    'wrapped': 'wrapped_heading',
+    'other motion': 'motion',
+    'tumbling': ('tilt', 'motion'),
+}
+
+
+@pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE], ids=['exact', 'course'])
+@pytest.mark.parametrize('wrong', WRONG)
+def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
+    if wrong == 'wrapped' and noise:
+        noise = 1e-4
+    log = WRONG[wrong](drive(heading_noise=noise))
+    found = diagnose([log], np.random.default_rng(0))
+    (finding,) = found.findings
+    failed = [gate.name for gate in found.gates if gate.passed is False]
+    assert (
+        found.verdict == 'mismatched' and finding.remedy and failed[0] in FAILED.get(wrong, 'unit')
+    ), (failed, finding.evidence)
+    assert (
+        found.figures()['gates'][-1]['passed'] is False
+        and found.figures()['findings'][0]['remedy'] == finding.remedy
+    )
+    assert finding.remedy in ' '.join(' '.join(lines(found)).split())
+
+
+@pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE, 3.0 * DEGREE])
+def test_a_gyro_that_follows_passes_all_gates(noise):
+    assert all(gate.passed for gate in gates(drive(1, noise)))
+
+
+def test_a_late_reference_passes_all_gates():
+    log = drive(2, 1.0 * DEGREE)
+    assert all(
+        gate.passed
+        for gate in gates(
+            replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading))
+        )
+    )
+
+
+def test_a_gyro_at_rest_beside_a_noisy_reference_is_not_told_to_move_otherwise():
+    generator = np.random.default_rng(3)
+    output, heading = (size * generator.standard_normal(len(TIME)) for size in (1e-3, DEGREE))
+    log = Log(output=output, time=TIME, reference_heading=heading)
+    assert not any(gate.passed is False for gate in gates(log))
