@@ -24,6 +24,7 @@ from gyro_calibration.cli.verb import (
 )
 from gyro_calibration.diagnosis.extension import calibrated
 from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.reference import KINDS
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.table import diagnose_table
@@ -34,7 +35,7 @@ from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import model_text, read_model
 
 #: Steps of a diagnosis, for the bar that shows how far it is.
-_STEPS = 6
+_STEPS = 8
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -44,6 +45,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
+    parser.add_argument('--reference-kind', choices=KINDS,
+                        help='what the reference is; default: as the log shows it')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
     parser.add_argument('--seed', type=whole, default=0, metavar='N',
@@ -79,7 +82,7 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
             def say(step: str) -> None:
                 bar.set_description(step)
                 bar.update()
-            found = diagnose(logs, generator, model, names=given.log, say=say)
+            found = diagnose(logs, generator, model, names=given.log, say=say, kind=given.reference_kind)
     return _with_origin(replace(found, logs=tuple(given.log)), model)
 
 

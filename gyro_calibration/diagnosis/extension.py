@@ -60,6 +60,14 @@ def extended(model: GyroModel, found: Outcome, bias_deviation: float) -> GyroMod
                    temperature_range=wider(model.temperature_range, temperatures, bool(model.terms)))
 
 
+def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Array, temperatures: Array | None) -> GyroModel:
+    """Return a model with more terms, the covariance of whose values is `spread`, for the outputs and temperatures of a log, too."""
+    known = [] if temperatures is None else [temperatures]
+    return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
+                   rate_range=wider(model.rate_range, [outputs], bool(model.terms)),
+                   temperature_range=wider(model.temperature_range, known, bool(model.terms)))
+
+
 def noted(new: GyroModel, given: GyroModel, hygiene: Sequence[Hygiene], findings: Sequence[Finding] = ()) -> GyroModel:
     """Return a new model whose origin says what it may be instead, for which output it is, and what the one that was given came from."""
     used = {term.effect.name for term in new.terms if term not in given.terms}

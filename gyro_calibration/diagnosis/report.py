@@ -13,8 +13,9 @@ import gyro_calibration
 from gyro_calibration.diagnosis.charts import Chart, Line, draw
 from gyro_calibration.diagnosis.finding import Change, Curve, Diagnosis, Estimate, Finding, Gain, HeadingCurve, NoiseCurve, Trace
 from gyro_calibration.diagnosis.markup import Markup, element, joined
-from gyro_calibration.diagnosis.units import amount, chance, for_people, number, quantity, span
+from gyro_calibration.diagnosis.units import amount, for_people, number, quantity, span
 from gyro_calibration.diagnosis.words import (
+    certainty,
     change,
     clean,
     doubt,
@@ -29,6 +30,7 @@ from gyro_calibration.diagnosis.words import (
     sizes,
     smallest,
     spoken,
+    todo,
     unknown,
 )
 from gyro_calibration.log import DEGREE, Array
@@ -249,7 +251,7 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
 
 def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
     inside = is_inside(found, diagnosis)
-    facts = [f'By noise alone: {chance(found.p_value)}.', smallest(found), 'It is in the extended model.' if inside else '']
+    facts = [*certainty(found), smallest(found), 'It is in the extended model.' if inside else '', todo(found)]
     uncertain = element('p', doubt(found), class_='doubt') if found.ambiguous_with else None
     title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect), ' ', _code(found.effect))
     return element('article', title,

@@ -20,10 +20,12 @@ from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figure
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
 from gyro_calibration.diagnosis.gain import gain
 from gyro_calibration.diagnosis.gates import gates, mismatch
+from gyro_calibration.diagnosis.heading_reference import diagnose_heading
 from gyro_calibration.diagnosis.hygiene import Hygiene, decided, inspect
 from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
+from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.search import MOST_OF, Search, alternatives, begin, evidence_of, polished, pruned, searched
 from gyro_calibration.diagnosis.units import amount
@@ -49,7 +51,7 @@ Say = Callable[[str], object]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None, rate: float = 0.01,
-             names: Sequence[str] = (), say: Say = lambda step: None) -> Diagnosis:
+             names: Sequence[str] = (), say: Say = lambda step: None, kind: str | None = None) -> Diagnosis:
     """
     Say what a simulation gets wrong, and why.
 
@@ -61,6 +63,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     rate : of false alarms a diagnosis
     names : of the logs, for people
     say : is told each step as it begins
+    kind : of the reference, one of `reference.KINDS`; found where it is None
 
     Raises
     ------
@@ -75,9 +78,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             if failed.effect != 'wrapped_heading':
                 refuse(logs[place])
             return _mismatched(failed, each, given or GyroModel(), names[place:place + 1], rate)
-    say('hygiene')
     for log in logs:
         refuse(log, model)
+    told = [reference_of(log, kind) for log in logs]
+    if len(logs) == 1 and limits(told[0]) and logs[0].reference_heading is not None:
+        say('search')
+        answer = diagnose_heading(replace(logs[0], reference_rate=None), told[0], model, rate)
+        return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
+    say('hygiene')
     hygiene = [decided(inspect(log, model)) for log in logs]
     say('replay')
     replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, clean.step, model)
@@ -97,8 +105,14 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     won = gain(search, causes, model is not None) if (causes or changed) and not doubts_scale(found) else None
     say('report')
     known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won, _cannot_show(search, logs))
-    told = replace(_told(known, hygiene, model, rate, names, generator), gates=tuple(gate for each in checked for gate in each))
-    return replace(told, before=given, model=given) if given is not None and told.model is model else told
+    result = replace(_told(known, hygiene, model, rate, names, generator), gates=tuple(gate for each in checked for gate in each),
+                     reference=told[0] if len(logs) == 1 else None)
+    return _checked_answer(result, model, given)
+
+
+def _checked_answer(found: Diagnosis, model: GyroModel | None, given: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis that has a model that is left as it is in the words in which it was given."""
+    return replace(found, before=given, model=given) if given is not None and found.model is model else found
 
 
 def _mismatched(failed: Finding, checked: tuple[Gate, ...], model: GyroModel, names: Sequence[str], rate: float) -> Diagnosis:

@@ -140,6 +140,19 @@ def shown_by(found: Finding) -> list[str]:
     return [sentence(text) for text in (found.cause, found.evidence) if text.strip()]
 
 
+def certainty(found: Finding) -> list[str]:
+    """Return whether a cause is confirmed and by what chance noise alone shows as much; nothing of units, which need no chance."""
+    if not found.p_value and found.remedy:
+        return []
+    suspected = ['It is suspected, not established.'] if found.status == 'suspected' else []
+    return [*suspected, f'By noise alone: {chance(found.p_value)}.']
+
+
+def todo(found: Finding) -> str:
+    """Return what to do about a cause, as a sentence; empty where nothing is known."""
+    return f'What to do: {clean(found.remedy).rstrip(".")}.' if found.remedy else ''
+
+
 def doubt(found: Finding) -> str:
     """Return what else it could be, and what would part them; empty where it is sure."""
     if not found.ambiguous_with:
@@ -197,7 +210,7 @@ def _finding_lines(mark: str, found: Finding) -> Iterator[str]:
     indent = len(mark)
     parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}' for name, size in sizes(found).items()]
     yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}{", ".join(parameters)}', indent)
-    for text in (' '.join([*shown_by(found), f'By noise alone: {chance(found.p_value)}.', smallest(found)]), doubt(found)):
+    for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]), doubt(found), todo(found)):
         if text:
             yield _wrapped(' ' * indent + text, indent)
 

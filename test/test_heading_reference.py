@@ -1,0 +1,145 @@
+"""The diagnosis by a course over ground: gaps, side slip, fixes and another clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from gyro_calibration.diagnosis.reference import limits, reference_of
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.words import lines
+from gyro_calibration.effects import BIAS
+from gyro_calibration.log import DEGREE, Log
+from gyro_calibration.model import GyroModel, Term
+
+RATE, BIAS_TRUE, SCALE, DELAY = 25.0, 0.3 * DEGREE, 0.004, 0.4
+
+
+def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 0.0):
+    """Return a log of a drive with a course, and its temperature."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, duration, 1.0 / RATE)
+    rate, begin = np.zeros(len(time)), 0.0
+    while begin < duration:
+        begin += generator.exponential(4.0)
+        length, size = (
+            generator.uniform(1.5, 5.0),
+            generator.choice([-1.0, 1.0]) * generator.uniform(0.1, 0.9),
+        )
+        turns = (time >= begin) & (time < begin + length)
+        rate[turns] += size * np.sin(np.pi * (time[turns] - begin) / length) ** 2
+        begin += length
+    heading, temperature = np.cumsum(rate) / RATE, 25.0 + 10.0 * np.sin(2.0 * np.pi * time / 90.0)
+    noise = 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time))
+    output = (1.0 + SCALE) * rate + BIAS_TRUE + hidden(time, rate, heading, temperature) + noise
+    wanders = lfilter(
+        [1.0], [1.0, -np.exp(-1.0 / (3.0 * RATE))], generator.standard_normal(len(time))
+    )
+    slip = wanders * np.sqrt(2.0 / (3.0 * RATE)) * 0.4 * DEGREE * (1.0 + 2.0 * np.abs(rate))
+    fixes = np.arange(0.0, duration, 0.2)
+    course = np.interp(
+        fixes + DELAY, time, heading + slip
+    ) + 0.3 * DEGREE * generator.standard_normal(len(fixes))
+    course = np.interp(time, fixes, course)
+    for lost in generator.uniform(10.0, duration - 20.0, 3):
+        course[(time > lost) & (time < lost + 5.0)] = np.nan
+    return Log(output=output, time=time, reference_heading=course, temperature=temperature)
+
+
+def diagnosed(log, model=None, kind=None):
+    return diagnose([log], np.random.default_rng(0), model, kind=kind)
+
+
+def value(model, name):
+    return next(term.values[-1] for term in model.terms if term.effect.name == name)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed):
+    found = diagnosed(drive(seed))
+    named = {each.effect: each for each in found.findings if each.status == 'established'}
+    assert found.reference.kind == 'course' and set(named) <= {'time_offset'}, lines(found)
+    assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
+    assert value(found.model, 'scale_factor_error') == pytest.approx(SCALE, abs=0.012)
+    assert named['time_offset'].parameters['time_offset'].estimate == pytest.approx(
+        DELAY, abs=0.05
+    )
+    assert 'time_offset' not in {term.effect.name for term in found.model.terms}
+
+
+HIDDEN = {
+    'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
+    'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0),
+}
+
+
+@pytest.mark.parametrize('name', HIDDEN)
+def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_heading(name):
+    found = diagnosed(drive(5, hidden=HIDDEN[name]))
+    first = next(each for each in found.findings if each.effect not in ('time_offset',))
+    assert name in (first.effect, *first.ambiguous_with) and first.status == 'established', lines(
+        found
+    )
+    assert (
+        sum(first.probability.values()) == pytest.approx(1.0, abs=0.05)
+        and first.share_of_heading_error is not None
+    )
+    assert found.gain.models['extended'] < 0.7 * found.gain.models['plain']
+    assert first.effect in {term.effect.name for term in found.model.terms}
+
+
+def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
+    found = diagnosed(
+        drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (time > 140.0))
+    )
+    assert not {'bias_step', 'reference_slip'} & {term.effect.name for term in found.model.terms}
+    assert all(
+        each.status == 'suspected' and each.where
+        for each in found.findings
+        if each.effect in ('bias_step', 'reference_slip')
+    )
+
+
+def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
+    log = drive(7)
+    right = diagnosed(log).model
+    again = diagnosed(log, right)
+    assert again.model is right and not {'bias', 'scale_factor_error'} & {
+        each.effect for each in again.findings
+    }
+    wrong = GyroModel((Term(BIAS, (BIAS_TRUE + 0.3 * DEGREE,)),))
+    found = diagnosed(log, wrong)
+    assert 'bias' in {each.effect for each in found.findings}
+    assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
+
+
+def test_the_answer_is_about_heading_and_is_told_in_all_files():
+    found = diagnosed(drive(8))
+    told = found.figures()
+    assert (
+        told['schema'].endswith('/2')
+        and told['reference']['kind'] == 'course'
+        and told['reference']['noise']['reference'] > 0.0
+    )
+    assert (
+        sum(told['heading_shares'].values()) == pytest.approx(1.0, abs=0.02)
+        and told['heading_shares']['bias'] > 0.5
+    )
+    assert {'given', 'plain', 'extended'} <= set(told['gain']) and all(
+        gate['passed'] for gate in told['gates']
+    )
+    assert 'course over ground' in ' '.join(lines(found)) and 'course over ground' in report(found)
+
+
+def test_the_kind_of_a_reference_is_told_or_found():
+    log = drive(9)
+    exact = replace(log, reference_heading=np.cumsum(log.output) / RATE)
+    assert reference_of(log).kind == 'course' and limits(reference_of(log))
+    assert reference_of(exact).kind == 'motion_capture' and not limits(reference_of(exact))
+    assert reference_of(exact, 'odometry').kind == 'odometry' and limits(
+        reference_of(exact, 'odometry')
+    )
+    assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
+    assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
