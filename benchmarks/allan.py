@@ -1,12 +1,14 @@
 """
-The Allan deviation beside allantools: same averaging times, same numbers, and how long each takes; and how true the noise figures are.
+Compare the Allan deviation and its speed with allantools, and check the fitted noise figures.
 
     python benchmarks/allan.py [--study RUNS] [LOG.csv.gz]
 
-The record is LOG at 100 Hz (such as the ADIS16405 of GYRO_CALIBRATION_DATA, which is taken if it is there), or else a million simulated
-samples. The peers are allantools (``pip install allantools``; left out, saying so, where it is missing) and plain numpy on cumulative
-sums. Medians of some repeats, taken in turn. With --study, N, B, K, Q and R are fitted to simulated records of 200 000 samples: how often
-each is seen, and how often its 95 % bounds hold. Prints tables in Markdown.
+The record is LOG at 100 Hz (by default the ADIS16405 of GYRO_CALIBRATION_DATA), or a million
+simulated samples if there is none. The peers are allantools (``pip install allantools``; a message
+says where it is missing) and plain numpy on cumulative sums. Times are medians of several repeats,
+taken in turn. With --study, N, B, K, Q and R are fitted to simulated records of 200 000 samples;
+the table states how often each is detected and how often its 95 % bounds hold. Prints tables in
+Markdown.
 
 """
 

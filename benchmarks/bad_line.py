@@ -1,11 +1,13 @@
 """
-What passes a bad line: of each wire format, how many samples arrive, and how many of those hold a rate that was never sent.
+Count the samples that arrive over a bad line, and those with a wrong rate, for each wire format.
 
     python benchmarks/bad_line.py
 
-Of all bytes a share is struck: a third of those is lost, a third comes twice, a third has a bit flipped. The gyro turns at one rate, so
-each other rate is wrong. Formats with a CRC let nothing wrong through, sums little, and lines of text whatever still reads as a number;
-there a full scale that fits the robot, here 1.5 rad/s, throws away the wildest. No port and no ROS is needed; it takes a minute.
+A share of all bytes is hit: a third of those is lost, a third is doubled, a third has a bit
+flipped. The gyro turns at one rate, so each other rate is wrong. Formats with a CRC pass no wrong
+rate, those with a sum few, and lines of text any that still reads as a number; there a full scale
+that fits the robot, here 1.5 rad/s, rejects the largest. Needs neither port nor ROS; takes a
+minute.
 
 """
 

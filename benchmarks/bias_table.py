@@ -1,12 +1,14 @@
 """
-How right a table of biases is: intervals of 95 %, the gain over none, outliers and jumps, and a calibration that is carried on.
+Measure the accuracy of a bias table: coverage, gain, outliers, jumps, updated calibrations.
 
     python benchmarks/bias_table.py [GYROS]
 
-Gyros of known truth, each with one run a day of 12 minutes in which it warms up by 3 to 20 K; a rest of 10 s each minute. The bias has
-flicker (18 deg/h), a random walk, ageing, another turn-on bias each day (0.05 deg/s unless said), and a temperature coefficient drawn with
-0.03 deg/s/K (unless said), the same at all temperatures (linear) or a parabola over 0 to 50 degC (cubic). 2 % of the rests are outliers,
-off by 0.1 to 1 deg/s. The table is asked at the begin of each run, and in its middle up to 8 K away from the temperature there. Prints two
+Gyros of known truth have one run a day of 12 minutes, in which the gyro warms up by 3 to 20 K,
+with a rest of 10 s each minute. The bias has flicker (18 deg/h), a random walk, ageing, another
+turn-on bias each day (0.05 deg/s by default), and a temperature coefficient with a standard
+deviation of 0.03 deg/s/K (by default), constant over temperature (linear) or a parabola over 0 to
+50 degC (cubic). 2 % of the rests are outliers, off by 0.1 to 1 deg/s. The table is evaluated at
+the start of each run, and in its middle up to 8 K away from the temperature there. Prints two
 tables in Markdown, in percent and deg/s. Each row has noise of its own.
 
 """

@@ -1,9 +1,9 @@
 """
-What no program can do better: headings by who knows more than a program can.
+Bound the accuracy of headings: estimators that know more than a program can.
 
-A Kalman filter is told exactly when the robot rests. It takes what there is to know of scale factor, bias and flicker from the
-calibration and from the rests, and so bounds what a program can make of them that has to find the rests by itself. It shares nothing with
-the package but the noise figures.
+A Kalman filter is given the exact times of rest. It takes what there is to know of scale factor,
+bias and flicker from the calibration and from the rests. So it bounds the accuracy of a program
+that must detect the rests by itself. It shares nothing with the package but the noise figures.
 
 """
 
@@ -29,12 +29,12 @@ _SIZE = _FLICKER + len(_CONSTANTS)
 
 
 def knows_errors(drive: Drive) -> Array:
-    """Return the heading of who knows scale factor and bias at any time, but not when the robot rests."""
+    """Return the heading with scale factor and bias known at any time, but not the rests."""
     return integrate(drive.time, _true_rate(drive))
 
 
 def knows_errors_and_rests(drive: Drive) -> Array:
-    """Return the heading of who knows scale factor and bias at any time, and when the robot rests."""
+    """Return the heading with scale factor, bias and rests known at any time."""
     return integrate(drive.time, np.where(drive.rate == 0.0, 0.0, _true_rate(drive)))
 
 
@@ -88,7 +88,7 @@ def _calibrated(drive: Drive) -> tuple[Array, Array]:
 
 
 def _corners(time: Array, rests: Array) -> Array:
-    """Return the samples between which the filter steps: where a rest begins or ends, and no more than a block apart."""
+    """Return the samples between which the filter steps: ends of rests, at most a block apart."""
     changes = np.flatnonzero(np.diff(rests)) + 1
     count = round(_BLOCK / (time[1] - time[0]))
     return np.unique(np.concatenate([[0], changes, np.arange(0, len(time), count), [len(time) - 1]]))

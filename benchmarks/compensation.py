@@ -1,12 +1,13 @@
 """
-Samples per second of the compensation of a whole log, beside what numpy offers and beside what the machine allows.
+Compare the speed of the compensation of a log, in samples per second, with numpy and a floor.
 
     python benchmarks/compensation.py [--long]
 
-A polynomial of orders (3, 2) over output and temperature, then the integration to the heading, over ten million samples. Beside it:
-numpy's `polyval2d`, and Horner's rule in place on blocks that fit the cache, with nothing else done, which is the floor. All sides take
-turns in one run, and medians count. Then the cost of a sample for logs of 1e4 to 1e7, and of a sample that comes alone, as on the robot.
-With --long, a hundred million samples go through in blocks. Prints tables in Markdown.
+A polynomial of orders (3, 2) over output and temperature and the integration to the heading run
+over ten million samples. Compared with: numpy's `polyval2d`, and the floor, Horner's rule in place
+on blocks that fit the cache, with nothing else done. All take turns in one run, and medians count.
+Then follows the cost of a sample for logs of 1e4 to 1e7, and of single samples, as on the robot.
+With --long, a hundred million samples are processed in blocks. Prints tables in Markdown.
 
 """
 
@@ -49,7 +50,7 @@ def polyval2d(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> 
 
 
 def floor(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    """Return the heading by Horner's rule and trapezoids, nothing checked or marked, no memory taken but for rate and heading."""
+    """Return the heading by Horner's rule and trapezoids, with no checks and least memory."""
     rate, heading, work = np.empty(len(time)), np.empty(len(time)), np.empty((4, BLOCK))
     for begin in range(0, len(time), BLOCK):
         block = slice(begin, min(begin + BLOCK, len(time)))
@@ -94,7 +95,7 @@ SIDES: Mapping[str, Callable[..., np.ndarray]] = {
 
 
 def seconds(work: Callable[[], object], times: int = 1) -> float:
-    """Return the processor time that a piece of work takes; all sides run in one thread, and other programs shall not count."""
+    """Return the processor time of a piece of work in one thread, without other programs."""
     begin = clock.process_time()
     for _ in range(times):
         work()
@@ -114,7 +115,7 @@ def side_by_side(count: int = 10 ** 7, repeats: int = 9) -> str:
 
 
 def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7), repeats: int = 9) -> str:
-    """Return a table of the cost of a sample in logs of several lengths, and of one that comes alone."""
+    """Return a table of the cost of a sample in logs of several lengths, and of single samples."""
     logs = [samples(count, np.random.default_rng(0)) for count in counts]
     taken = [[seconds(lambda: package(*log), max(10 ** 6 // len(log[0]), 1)) for log in logs] for _ in range(repeats)]  # noqa: B023
     costs = np.median(taken, axis=0) / counts
@@ -125,7 +126,7 @@ def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7), re
 
 
 def long_log(count: int = 10 ** 8, block: int = 10 ** 6) -> str:
-    """Return what it takes to compensate and integrate a log that never is in memory as a whole."""
+    """Return the cost of compensating and integrating a log block by block."""
     generator, heading, taken = np.random.default_rng(0), 0.0, 0.0
     for first in range(0, count, block):
         time, output, temperature = samples(block, generator, first)

@@ -1,31 +1,35 @@
 """
-How well a diagnosis finds what is hidden: false alarms, names, sets, estimates, gain, and what it says of effects that it does not know.
+Measure how well a diagnosis finds hidden effects: false alarms, names, sets, estimates, gain.
 
-    python benchmarks/diagnosis.py [--logs N] [--part PART ...] [--processes 2] [--verbose] [--out CASES.jsonl] [--only TEXT] [--seed N]
-                                   [--with-model]
+    python benchmarks/diagnosis.py [--logs N] [--part PART ...] [--processes 2] [--verbose]
+                                   [--out CASES.jsonl] [--only TEXT] [--seed N] [--with-model]
 
-Each log has 15 min at 50 Hz of a random gyro in random motion, made by `test/hidden`, which shares nothing with the package. Sizes are
-multiples of what is just detectable. Every case is named, as ``effects/warm_up/2/mixed/rate/0``, and its random numbers come of its name
-and the seed alone: ``--only`` with a part of a name runs those cases again, ``--verbose`` prints each one that fails, and ``--out`` keeps
-all of them as JSON, one a line. Parts:
+Each log has 15 min at 50 Hz of a random gyro in random motion, made by `test/hidden`, which shares
+nothing with the package. Sizes are multiples of the minimum detectable effect. Every case has a
+name, such as ``effects/warm_up/2/mixed/rate/0``, and its random numbers depend on its name and the
+seed alone: ``--only`` with a part of a name runs those cases again, ``--verbose`` prints each
+failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
 
-    nothing   with N logs of each noise: where anything is found, it is a false alarm
-    effects   with N logs of each effect of the catalogue at 1.2, 2 and 5 times what is just detectable
-    pairs     with N pairs of random effects that leave each other visible, at each of these multiples
-    triples   the same with three
-    outside   with N logs of each effect outside the catalogue, at 3 times
-    sets      with N logs of each pair of twins, either of them hidden where they cannot be told apart
+        nothing   N logs of each noise: any finding is a false alarm
+        effects   N logs of each effect of the catalogue at 1.2, 2 and 5 times the detectable size
+        pairs     N pairs of random effects that leave each other visible, at each multiple
+        triples   the same with three
+        outside   N logs of each effect outside the catalogue, at 3 times
+        sets      N logs of each pair of twins, either of them hidden where they are confounded
 
-The figures: `detected`, something is reported; `first`, the strongest finding has the right name; `in set`, each hidden cause is a
-finding or in the set of one; `set size`, of the findings that hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
-structures without a name, a log; `right`, each hidden cause is found or in a set of at most three, and nothing else is reported;
-`interval`, the size lies in its interval of 95 %, of those that are named and are numbers; `gain`, what is won on the parts held out,
-over what is won there by who knows the truth but the bias; `heading`, the same of the change of heading over 60 s; `time`, of a
-processor a log.
+    The figures: `detected`, something is reported; `first`, the strongest finding has the right
+    name; `in set`, each hidden cause is a finding or in the set of one; `set size`, of the
+    findings that hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
+    structures without a name, a log; `right`, each hidden cause is found or in a set of at most
+    three, and nothing else is reported; `interval`, the size lies in its 95 % interval, of those
+    that are named and are numbers; `gain`, the improvement on held-out parts over that with all
+    known but the bias; `heading`, the same of the change of heading over 60 s; `time`, of a
+    processor a log.
 
-A scale factor error of the gyro and one of the reference are the same in any log, and count as one. The diagnosis is given no model, but
-for what shows only beside one: bias, scale factor, and noise; then it is one that is right but for what is hidden. `--with-model` gives
-such a model always.
+    A scale factor error of the gyro and one of the reference are the same in any log, and count as
+    one. The diagnosis is given no model, except for effects that show only against one: bias,
+    scale factor, and noise; that model is right but for what is hidden. `--with-model` always
+    gives such a model.
 
 """
 
@@ -134,7 +138,7 @@ def _turn(choices: Sequence[str], number: int) -> str:
 
 
 def _reference(names: Sequence[str], number: int) -> str:
-    """Choose a reference; figures of the noise are sized without the steps of an encoder, which hide them."""
+    """Choose a reference; figures of the noise are sized without encoder steps."""
     return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise' for name in names) else _turn(REFERENCES, number)
 
 

@@ -54,7 +54,7 @@ GYROS = {
 
 @dataclass(frozen=True)
 class Path:
-    """True rate, rad/s, heading, rad, and whether the wheels turn, every `STEP` s, shape (n,) each; it begins and ends at rate zero."""
+    """True rate, rad/s, heading, rad, and wheels turning, every `STEP` s; zero at the ends."""
 
     rate: Array
     heading: Array
@@ -93,7 +93,7 @@ def path(rate: Array, moving: NDArray[np.bool_]) -> Path:
 
 
 def of_motion(motion: Motion) -> Path:
-    """Return a motion as a path; who knows that the wheels turn is told so where the rate is not zero."""
+    """Return a motion as a path; the wheels turn where the rate is not zero."""
     time = np.arange(round(motion.duration / STEP) + 1) * STEP
     rate = motion.rate_at(time)
     return Path(rate, motion.heading_at(time), rate != 0.0)
@@ -111,7 +111,7 @@ def _flank(count: int, ramp: float) -> Array:
 
 
 def _wobble(count: int, generator: np.random.Generator) -> Array:
-    """Return what a robot yaws by that holds its direction: a shake of 0.5 to 2 deg/s at 0.5 to 2 Hz, and a wander of the heading."""
+    """Return the yaw on a straight line: shake of 0.5 to 2 deg/s at 0.5 to 2 Hz, and wander."""
     time = np.arange(count) * STEP
     shake = generator.uniform(0.5, 2.0) * np.sin(2.0 * np.pi * (generator.uniform(0.5, 2.0) * time + generator.uniform()))
     knots = np.arange(0.0, time[-1] + 1.0)
@@ -148,7 +148,7 @@ STRETCHES: tuple[tuple[float, Callable[[np.random.Generator], Array]], ...] = (
 
 
 def random_path(duration: float, generator: np.random.Generator) -> Path:
-    """Return a path of stretches in random order; where its time is over, the robot stops within 0.3 s and rests for `GRID`."""
+    """Return a path of random stretches; at the end it stops within 0.3 s and rests for `GRID`."""
     count, shares = round((duration - GRID) / STEP), [share for share, _ in STRETCHES]
     rates, moving, length = [], [], 0
     while length < count:
@@ -172,7 +172,7 @@ def begun_any_time(way: Path, generator: np.random.Generator) -> Path:
     """
     Return a path that begins up to `GRID` later.
 
-    Who looks at blocks of samples would otherwise find each corner at the edge of one, where robots do not put them.
+    So corners are not at the edges of blocks of samples, where a robot would not put them.
 
     """
     late = int(generator.integers(round(GRID / STEP)))

@@ -1,19 +1,23 @@
 """
-How near estimators of scale factor error and bias come to the Cramér-Rao bound, on 20 s of known motion with an encoder.
+Compare estimators of scale factor error and bias with the Cramér-Rao bound, on 20 s of motion.
 
     python benchmarks/efficiency.py [RUNS]
 
-The built-in motion at 100 Hz, the encoder read with each sample and standing anywhere within a step at the beginning, s = 3 %,
-b = 0.5 deg/s. Four cases: a fine and a coarse encoder, low and high noise of a sample of the rate. Prints a table in Markdown: the mean
-square of the errors over each bound, for s and for b; n runs tell it to sqrt(2 / n), 400 to 7 %. Each case has noise of its own.
+The built-in motion at 100 Hz against an encoder, which is read with each sample and starts
+anywhere within a step; s = 3 %, b = 0.5 deg/s. Four cases: a fine and a coarse encoder, low and
+high noise of the rate. Prints a table in Markdown: the mean square of the errors over each bound,
+for s and for b; n runs determine it to sqrt(2 / n), 400 runs to 7 %. Each case has noise of its
+own.
 
-The bounds are those of Gaussian noise: white noise of the rate, which is a random walk of the heading, and an error of the encoder with
-the variance step²/12, and a heading at the start, a time offset and a lag that are not known. The nominal bound takes the encoder's
-errors for independent from sample to sample. Where the encoder rests, its error is one and the same: that shows less of the heading than
-the nominal bound takes for granted, and more of the bias. The other bound has one error a rest, independent from rest to rest.
+The bounds are those of Gaussian noise: white noise of the rate, which is a random walk of the
+heading, an error of the encoder with the variance step²/12, and an unknown heading at the start,
+time offset and lag. The nominal bound takes the encoder's errors for independent from sample to
+sample. While the encoder rests, its error is constant: this gives less information on the heading
+than in the nominal bound, and more on the bias. The other bound has one error for each rest,
+independent from rest to rest.
 
-An encoder's errors are of neither kind while it moves: they are known where it steps. So an estimator that looks at the steps may be
-better than both.
+While an encoder moves, its errors are of neither kind: they are known where it steps. So an
+estimator that uses the steps may be better than both.
 
 """
 
@@ -41,7 +45,7 @@ CASES = {'0.088 deg, 0.02 deg/s': (0.088 * DEGREE, 0.02 * DEGREE), '0.088 deg, 0
 
 
 def fit_increments(time: Array, rate: Array, motion: Motion) -> tuple[float, float]:
-    """Return (s, b) by least squares of the rate's increments on those of the encoder, as they stand."""
+    """Return (s, b) by least squares of the rate's increments on the raw ones of the encoder."""
     heading = motion.heading_at(time)
     turned = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
     scale, bias = np.linalg.lstsq(np.column_stack([np.diff(heading), np.diff(time)]), turned, rcond=None)[0]
@@ -61,9 +65,11 @@ METHODS = {'likelihood': _of(fit_likelihood), 'cumulative least squares (Hong an
 
 def bound(step: float, noise: float, rests: bool) -> Array:
     """
-    Return the Cramér-Rao bound of the variances of (s, b), shape (2,), with one error of the encoder a rest or with one a sample.
+    Return the Cramér-Rao bounds of the variances of (s, b), shape (2,).
 
-    The integral of the rate by the trapezoid rule has the noise of a random walk, but that each sample counts half at either side.
+    The encoder has one error for each rest, or one for each sample. The integral of the rate by
+    the trapezoid rule has the noise of a random walk, except that each sample counts half at
+    either side.
 
     """
     half = np.eye(len(TIME)) + np.eye(len(TIME), k=-1)
@@ -86,7 +92,7 @@ def errors(step: float, noise: float, seed: int) -> Array:
 
 
 def table(runs: int) -> str:
-    """Return mean squares of the errors of s and b over the bounds, the nominal one and that of one error a rest, as a table."""
+    """Return a table of mean squares of the errors of s and b over the nominal and other bound."""
     lines = ['| encoder step, noise | method | s over nominal bound | b | one error a rest: s | b | mean error of s |',
              '|---|---|---|---|---|---|---|']
     with ProcessPoolExecutor() as pool:

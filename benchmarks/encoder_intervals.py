@@ -1,11 +1,12 @@
 """
-How often the 95 % intervals of scale factor error and bias hold the truth, for logs against an encoder with a bias that wanders.
+Measure the coverage of 95 % intervals of scale factor error and bias with a wandering bias.
 
     python benchmarks/encoder_intervals.py [RUNS]
 
-Ten minutes at 20 Hz on a swing, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning, white noise of
-0.3 deg/sqrt(h). Prints a table in Markdown. The truth of the bias is what was put in, about which it wanders, or for the drift with
-temperature its mean over the log, which is what a model without a term for it can hold.
+Ten minutes at 20 Hz to and fro, an encoder of 0.088 deg, s = 2 %, b = 0.3 deg/s at the beginning,
+white noise of 0.3 deg/sqrt(h). Prints a table in Markdown. The true bias is the one at the
+beginning, from which it wanders; for the drift with temperature it is the mean over the log, which
+is the best for a model without a term for it.
 
 """
 
@@ -32,7 +33,7 @@ CASES = {'white': (Noise(WHITE), 0.0), 'white, flicker': (Noise(WHITE, FLICKER),
 
 
 def swing(duration: float, generator: np.random.Generator, half: float = 4.0) -> Motion:
-    """Return the motion to and fro at 55 to 65 deg/s, each way in `half` s with ramps of 0.3 s, and a rest of 0.4 s at each end."""
+    """Return a motion to and fro at 55 to 65 deg/s, each way in `half` s, with rests of 0.4 s."""
     starts = np.arange(0.0, duration, half)
     knots = (starts[:, None] + (0.0, 0.3, half - 0.7, half - 0.4)).ravel()
     speeds = np.where(np.arange(len(starts)) % 2, -1.0, 1.0) * generator.uniform(55.0, 65.0, len(starts)) * DEGREE

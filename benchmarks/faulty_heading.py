@@ -1,15 +1,18 @@
 """
-What lost samples and bursts of a USB adapter cost a heading: drives of 30 minutes, clean and with faults on the line.
+Measure the heading error due to lost samples and bursts of a USB adapter, in drives of 30 min.
 
     python benchmarks/faulty_heading.py [--drives 16] [--rate 100] [--minutes 30]
 
-Random drives of `drives.py`, with a calibration of 20 s before each, are followed by the program from rest to rest: once with all samples
-and exact stamps, and again with faults. Samples are lost singly, on the way to an adapter that hands bytes over every 16 ms to a host that
-wakes up a little late. Their stamps are those of the driver's `SampleClock`, by the sequence of the gyro or without one; or what other
-drivers do: the time of arrival, or the usual interval for each sample that came, which takes lost time for none.
+The program follows random drives of `drives.py`, each after a calibration of 20 s, from rest to
+rest: once with all samples and exact stamps, and again with faults. Samples are lost singly on the
+way to an adapter that delivers bytes every 16 ms to a host that wakes up slightly late. Stamps are
+those of the driver's `SampleClock`, with or without a sequence number of the gyro; or those of
+other drivers: the time of arrival, or the nominal interval for each sample received, which ignores
+lost time.
 
-An error is the root mean square over all drives and all minutes of a drive. Its growth is paired with the clean run of the same drive, and
-the interval of 95 % is by bootstrap over the drives. What was added is the root mean square of the difference to the clean run.
+An error is the root mean square over all drives and all minutes of a drive. Its growth is paired
+with the clean run of the same drive; its 95 % interval is by bootstrap over the drives. The added
+error is the root mean square of the difference from the clean run.
 
 """
 
@@ -43,7 +46,7 @@ LOOK = 60.0  # s
 
 @dataclass(frozen=True)
 class Fault:
-    """Share of samples that are lost, and who stamps the others: 'gyro', 'sequence', 'no sequence', 'arrival' or 'interval'."""
+    """Share of lost samples; stamps 'gyro', 'sequence', 'no sequence', 'arrival', 'interval'."""
 
     lost: float
     stamps: str
@@ -63,7 +66,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Drive:
-    """Times, s, compensated rates, rad/s, true headings, rad, shape (n,) each, and the calibrated model."""
+    """Times, s, compensated rates, rad/s, true headings, rad, shape (n,) each, and the model."""
 
     time: Array
     rate: Array
@@ -136,7 +139,7 @@ def one(job: tuple[str, float, float, int, tuple[str, ...]]) -> dict[str, tuple[
 
 
 def growth(clean: Array, faulty: Array, generator: np.random.Generator) -> tuple[float, float, float]:
-    """Return by how much the error grows, %, and an interval of 95 %, of errors of shape (drives, looks)."""
+    """Return the growth of the error, %, and its 95 % interval, for errors (drives, looks)."""
     squares = np.array([np.mean(each ** 2, axis=1) for each in (clean, faulty)])
     drawn = squares[:, generator.integers(0, len(clean), (4000, len(clean)))].mean(axis=2)
     low, high = np.quantile(np.sqrt(drawn[1] / drawn[0]), [0.025, 0.975])

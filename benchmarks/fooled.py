@@ -1,12 +1,14 @@
 """
-How often a self-calibration that is fooled is refused, and one that is not is accepted, at three noise levels.
+Measure how often false and good self-calibrations are refused, at three noise levels.
 
     python benchmarks/fooled.py [RUNS]
 
-The gyro is that of Hong and Park (XV3500) with 0.3, 1 and 3 times its noise, s of 3 % and b of 0.05 deg/s (standard deviations), at
-100 Hz, on the built-in motion of 20 s, recorded from 1 s before it to 1 s after it; the model always states the noise of the XV3500. The
-seed of a run is its number. Each robot is late by 0 to 1 s, follows by a first-order lag of 0 to 0.2 s, wobbles by the turn of its wheels
-(0 to 0.1 deg at 0.5 to 2 Hz while it turns) and shakes (0 to 0.5 deg/s at 5 to 30 Hz). Prints tables in Markdown.
+The gyro is that of Hong and Park (XV3500) with 0.3, 1 and 3 times its noise, s of 3 % and b of
+0.05 deg/s (standard deviations), at 100 Hz, on the built-in motion of 20 s, recorded from 1 s
+before it to 1 s after it; the model always states the noise of the XV3500. The seed of a run is
+its number. Each robot has a delay of 0 to 1 s, a first-order lag of 0 to 0.2 s, a wobble from the
+turn of its wheels (0 to 0.1 deg at 0.5 to 2 Hz while it turns) and a shake (0 to 0.5 deg/s at 5 to
+30 Hz). Prints tables in Markdown.
 
 """
 
@@ -35,7 +37,7 @@ TIME = np.arange(-100, 2101) * INTERVAL
 
 @dataclass(frozen=True)
 class Run:
-    """What one run is drawn from, and what it was: s, b, the robot's true rate over `TIME`, rad/s, and the noise of the gyro."""
+    """Draws of one run: s and b, true rate over `TIME`, rad/s, and noise of the gyro."""
 
     generator: np.random.Generator
     s: float
@@ -45,7 +47,7 @@ class Run:
     noise: Array
 
     def follow(self, wanted: Array) -> Array:
-        """Return the rate, rad/s, of a robot that is told one: later, softer, wobbling and shaking."""
+        """Return the rate, rad/s, of a robot for a commanded one: delay, lag, wobble and shake."""
         delayed = np.interp(TIME - self.late, TIME, wanted, left=0.0, right=wanted[-1])
         kept = np.exp(-INTERVAL / self.lag) if self.lag else 0.0
         followed = lfilter([1.0 - kept], [1.0, -kept], delayed)
@@ -72,7 +74,7 @@ def drawn(number: int, level: float) -> Run:
 
 
 def profile(motion: Motion = CALIBRATION, speed: float = 1.0) -> Array:
-    """Return the rates over `TIME` of a motion that is played faster; with its rates as they are."""
+    """Return the rates over `TIME` of a motion that is played faster, at unchanged rates."""
     return motion.rate_at(speed * TIME)
 
 
@@ -87,7 +89,7 @@ def as_the_profile_says(run: Run) -> Array:
 
 
 def slip(run: Run) -> Array:
-    """Lose 2 to 15 deg of a turn, within 0.1 to 2 s, where the robot turns by at least that much."""
+    """Lose 2 to 15 deg of a turn, within 0.1 to 2 s, where the robot turns at least that far."""
     rate = run.follow(profile())
     degrees = run.generator.uniform(2.0, 15.0)
     while True:
@@ -99,7 +101,7 @@ def slip(run: Run) -> Array:
 
 
 def bump(run: Run) -> Array:
-    """Push the robot by 2 to 15 deg either way, within 0.05 to 0.5 s, at any time from 0.5 s after it began to 1 s before it ends."""
+    """Push the robot by 2 to 15 deg either way, within 0.05 to 0.5 s, at any time of the run."""
     start, duration = run.late + run.generator.uniform(0.5, 19.0), run.generator.uniform(0.05, 0.5)
     inside = (start <= TIME) & (start + duration > TIME)
     degrees = run.generator.uniform(2.0, 15.0) * run.generator.choice([-1.0, 1.0])
@@ -112,7 +114,7 @@ def early_end(run: Run) -> Array:
 
 
 def another_profile(run: Run) -> Array:
-    """Drive four to six legs of 2 to 5 s at 15 to 60 deg/s either way, with rests of 1 s between."""
+    """Drive four to six legs of 2 to 5 s at 15 to 60 deg/s either way, with rests of 1 s."""
     legs: list[tuple[float, float]] = [(1.0, 0.0)]
     for _ in range(run.generator.integers(4, 7)):
         legs += [(run.generator.uniform(2.0, 5.0), run.generator.uniform(15.0, 60.0) * run.generator.choice([-1.0, 1.0])), (1.0, 0.0)]
@@ -129,7 +131,7 @@ def twice_the_rate(run: Run) -> Array:
 
 
 def twice_as_fast(run: Run) -> Array:
-    """Play the profile in half its time, with its rates as they are, or so that it turns as far."""
+    """Play the profile in half its time, at unchanged rates or through unchanged angles."""
     return run.gyro(run.follow(run.generator.choice([1.0, 2.0]) * profile(speed=2.0)))
 
 
@@ -208,7 +210,7 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
 
 
 def tried(case: tuple[str, int, float]) -> tuple[str, tuple[float, ...]]:
-    """Return the refusal of a run, '' where it was accepted, and then the errors of s and b over their standard deviations, and chance."""
+    """Return the refusal ('' if accepted), normalized errors of s and b, and the chance."""
     name, number, level = case
     way, motion, _ = WAYS[name]
     run = drawn(number, level)
@@ -222,7 +224,7 @@ def tried(case: tuple[str, int, float]) -> tuple[str, tuple[float, ...]]:
 
 
 def table(runs: int) -> Iterator[str]:
-    """Give the lines of the table: how many of the runs were refused at each level, and how many by the right name."""
+    """Yield the lines of the table: runs refused at each level, and those with the right name."""
     yield '| run | ' + ' | '.join(f'refused of {runs}, {level:g} times the noise (named right)' for level in LEVELS) + ' |'
     yield '|---|' + '---|' * len(LEVELS)
     accepted: dict[tuple[str, float], list[tuple[float, ...]]] = {}

@@ -1,15 +1,17 @@
 """
-Fuzzing, guided by coverage: bytes that libFuzzer makes up, by atheris, for every target of `test/fuzzed.py`.
+Fuzz every target of `test/fuzzed.py` with bytes from libFuzzer (atheris), guided by coverage.
 
-    python benchmarks/fuzz.py --seconds 60                    a minute for all targets together, as the tests do
-    python benchmarks/fuzz.py --seconds 1800 --corpus DIR     longer, on top of what earlier runs found, which is kept in DIR
+    python benchmarks/fuzz.py --seconds 60              a minute for all targets, as in the tests
+    python benchmarks/fuzz.py --seconds 1800 --corpus DIR     longer, from inputs kept in DIR
     python benchmarks/fuzz.py --only 'decoder kvh_1750'       one target
-    python benchmarks/fuzz.py --repeat 'model' 7b7d           an input in hex, as a fault is printed, with its traceback
+    python benchmarks/fuzz.py --repeat 'model' 7b7d           one input in hex, with its traceback
 
-A fault is an exception that is not the documented one, an input that takes more than 5 s of a processor, or a gigabyte. Each target runs in
-a process of its own; it ends at its first fault, of which the input is printed in hex. Ends with 1 where there is a fault.
+A fault is an exception that is not the documented one, an input that takes more than 5 s of a
+processor, or a gigabyte. Each target runs in a process of its own; it ends at its first fault,
+whose input is printed in hex. The exit code is 1 if there is a fault.
 
-The share of lines is that of the files of a target, as far as the inputs that were kept reach them when they are run once more.
+The share of lines is that of a target's files reached by the inputs that were kept, when they are
+run once more.
 
 """
 
@@ -103,7 +105,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _instrumented():
-    """Import the targets, with what they fuzz watched by atheris; to watch all takes a third of a minute."""
+    """Import the targets, with only their code watched by atheris; watching all takes 20 s."""
     import atheris
     watched = {file for files in FILES.values() for file in files}
     others = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob('*.py') if str(path.relative_to(PACKAGE)) not in watched]

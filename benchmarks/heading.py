@@ -1,22 +1,25 @@
 """
-How far headings are off after 20 s of calibration: this program, its peers, the paper, and who knows more than a program can.
+Compare heading errors after 20 s of calibration: this program, its peers, the paper and bounds.
 
-    python benchmarks/heading.py [--drives N] [--gyros NAME ...] [--courses TEXT] [--only TEXT] [--part drives slow] [--processes 2]
-                                 [--seed N]
+    python benchmarks/heading.py [--drives N] [--gyros NAME ...] [--courses TEXT] [--only TEXT]
+                                 [--part drives slow] [--processes 2] [--seed N]
 
-The gyros and courses are those of `drives`: the built-in motion `robot`, and random drives of 160 s and 30 min with turns, slow turns,
-wobble on straight ways, rests, and rests too short to notice; about half of the time the robot rests or goes straight. Each drive has
-noise of its own. It begins with the built-in motion `calibration`, of which all rows make what they can; a calibration that is refused is
+The gyros and courses are those of `drives`: the built-in motion `robot`, and random drives of 160
+s and 30 min with turns, slow turns, wobble on straight lines, rests, and rests too short to
+detect; in about half of the time the robot rests or goes straight. Each drive has noise of its
+own. It begins with the built-in motion `calibration`, which all rows use; a refused calibration is
 run again, as a robot would.
 
-The first table has the mean over the drives of the mean error of the heading over a drive, without its sign, and its standard error; the
-second the error that 95 % of the samples keep; the third how often the heading is inside of its own 95 %: at the end of a drive, at a
-random time, and of all samples. The settings of the peers (`peers`) are the published ones, and the best on drives of their own.
+The first table has the mean over the drives of a drive's mean absolute heading error, and its
+standard error; the second the error that 95 % of the samples keep; the third how often the heading
+is inside of its own 95 %: at the end of a drive, at a random time, and of all samples. The
+settings of the peers (`peers`) are the published ones, and the best on drives of their own.
 
-Slow turns: the share of a turn of ten minutes, after a rest of 30 s, that is lost or too much at its end.
+Slow turns: the share of a turn of ten minutes, after a rest of 30 s, that is missing or in excess
+at its end.
 
-`--only` takes the rows in whose names a regular expression is found, `--courses` courses alike. A package that is missing makes a row
-that says so. Prints tables in Markdown.
+`--only` selects the rows whose names match a regular expression, `--courses` courses alike. The
+row of a missing package says so. Prints tables in Markdown.
 
 """
 
@@ -64,7 +67,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Headings of all samples, rad, and variances every `LOOK` s, rad²; None where there are none."""
+    """Headings of all samples, rad, and variances every `LOOK` s, rad², or None."""
 
     heading: Array
     variance: Array | None = None
@@ -184,13 +187,13 @@ def makers(settings: Mapping[str, Mapping[str, float]]) -> dict[Row, tuple[str, 
 @dataclass(frozen=True)
 class Score:
     """
-    How good a heading was over a drive.
+    Accuracy of a heading over a drive.
 
     Attributes
     ----------
-    mean : of the error without its sign, rad
-    errors : without their sign, at some times, rad
-    inside : whether the heading is inside its 95 % at the end and at a random time, and of how many looks; nan without a variance
+    mean : mean absolute error, rad
+    errors : absolute errors at some times, rad
+    inside : share inside the 95 % at the end, a random time and all looks; nan without a variance
 
     """
 
@@ -302,7 +305,7 @@ SLOW_ROWS = ('likelihood', 'likelihood, threshold on 0.2 s', 'this program, live
 
 
 def slow_table(given: argparse.Namespace) -> str:
-    """Return the table of the slow turns; the peers have the settings that are best for random drives of 30 min."""
+    """Return the table of slow turns; peers have the best settings for random drives of 30 min."""
     peers = ('VQF', 'x-io Fusion')
     lines = [f'| mean error of a turn of 10 min, % of the turn, {given.slow_drives} drives | '
              + ' | '.join(f'{gyro}, {rate:g} deg/s' for gyro in given.gyros for rate in SLOW) + ' |',

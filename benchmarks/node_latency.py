@@ -1,15 +1,17 @@
 """
-What the nodes cost: the compensation node beside a bare relay of the same messages, and the driver on a gyro.
+Measure the cost of the nodes: the compensation node against a relay, and the driver on a gyro.
 
     python benchmarks/node_latency.py
 
-This process publishes ``imu/data_raw`` and waits for ``imu/data``, now from the compensation node, now from a relay that publishes each
-message as it comes. The two alternate in blocks, so that whatever else the machine does meets both; a row shows the medians of the blocks
-and the median of their ratios. Latency is counted from before the publish here until the message is taken here, so both hops are in it.
-Both have the same topics: four are heard, and three messages a sample are published, which all have a
-subscriber. The relay computes nothing.
+This process publishes ``imu/data_raw`` and waits for ``imu/data``, either from the compensation
+node or from a relay that publishes each message as it comes. The two alternate in blocks, so that
+other load of the machine affects both; a row shows the medians of the blocks and the median of
+their ratios. Latency is counted from before the publication here until the message is taken here,
+so it includes both hops. Both have the same topics: four subscriptions, and three messages a
+sample, each with a subscriber. The relay computes nothing.
 
-Then the driver reads an emulated DSP-3000 on a pseudo-terminal. It takes 80 s in all, needs two idle cores, and nothing leaves the machine.
+Then the driver reads an emulated DSP-3000 on a pseudo-terminal. It takes 80 s in all and needs two
+idle cores; nothing leaves the machine.
 
 """
 
@@ -101,7 +103,7 @@ def relay() -> None:
 
 
 def model() -> GyroModel:
-    """Return the model of a good fibre-optic gyro from a rate table, with all that the node can be asked to compute."""
+    """Return the model of a good fibre-optic gyro from a rate table, with all node options."""
     polynomial = rate_temperature_polynomial(3, 2)
     coefficients = 1e-4 * np.random.default_rng(1).standard_normal(len(polynomial.coefficients))
     terms = (Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(polynomial, (0.0, 1.7, 20.0, 30.0, *coefficients.tolist())))
@@ -139,7 +141,7 @@ class Probe:
         self._latencies: list[float] = []
 
     def _listen_idly(self) -> None:
-        """Have the other messages sent as well, but take no time here to read them: nobody serves these subscriptions."""
+        """Have the other messages sent too, at no cost of time here: these are never read."""
         self._listener = rclpy.create_node('listener', namespace=self._subject)
         for topic in ('heading', 'yaw_rate'):
             self._listener.create_subscription(PUBLISHED[topic], topic, print, SENSOR_QOS)

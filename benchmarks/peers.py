@@ -1,9 +1,10 @@
 """
-Headings by other programs: VQF (``pip install vqf``), x-io Fusion (``pip install imufusion``), and bias averages as in ROS packages.
+Headings by other programs: VQF (vqf), x-io Fusion (imufusion), and bias averages of ROS packages.
 
-None of them knows a scale factor. So they are given the rates after the calibration, and told that the bias is that well known; and also
-the rates as they come, for them to learn the bias by themselves. The gyro's axis is vertical, and the accelerometer says so without error.
-The settings are the published ones, and the best that `tuned` finds.
+Install them by ``pip install vqf imufusion``. None of them knows a scale factor. So they are given
+the rates after the calibration, and its uncertainty of the bias; and also the raw rates, from
+which they estimate the bias by themselves. The gyro's axis is vertical, and the accelerometer has
+no error. The settings are the published ones, and the best that `tuned` finds.
 
 """
 
@@ -55,7 +56,7 @@ class Peer:
         return not self.package or _module(self.package) is not None
 
     def run(self, drive: Drive, calibration: SelfCalibration, settings: Mapping[str, float]) -> Array:
-        """Return the heading; the setting 'calibrated' says whether it is given calibrated rates."""
+        """Return the heading; the setting 'calibrated' selects calibrated rates."""
         if not settings['calibrated']:
             return self.heading(drive, drive.output, None, settings)
         return self.heading(drive, np.asarray(calibration.correct(drive.output)), calibration.standard_deviations[1], settings)
@@ -80,8 +81,8 @@ def _yaw(quaternions: Array) -> Array:
     """
     Return the heading at the samples, rad, from quaternions after each.
 
-    The programs take each rate for that of the interval before it. The mean of two headings is that of the trapezoid rule, which spares
-    them a delay of half an interval.
+    The programs take each rate for that of the interval before it. The mean of two headings is
+    that of the trapezoid rule, which removes their delay of half an interval.
 
     """
     after = np.unwrap(2.0 * np.arctan2(quaternions[:, 3], quaternions[:, 0]))
@@ -101,7 +102,7 @@ def vqf(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[st
 
 
 def fusion(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
-    """Return the heading by the bias estimation and the filter of x-io Fusion, both at the gyro's rate."""
+    """Return the heading by bias estimation and filter of x-io Fusion, at the gyro's rate."""
     module: Any = _module('imufusion')
     bias, filtered = module.Bias(), module.Ahrs()
     bias.set_settings(module.BiasSettings(sample_rate=1.0 / drive.gyro.interval, stationary_threshold=settings['threshold'],
@@ -117,9 +118,10 @@ def fusion(drive: Drive, rate: Array, deviation: float | None, settings: Mapping
 
 def bias_average(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
     """
-    Return the heading less an exponential average of rates that differ little from it and from the one before.
+    Return the heading less an exponential average of nearly constant rates.
 
-    So does the complementary filter of imu_tools, as long as the accelerometer shows gravity alone.
+    A rate counts if it differs little from the average and from the one before. So does the
+    complementary filter of imu_tools, as long as the accelerometer shows gravity alone.
 
     """
     threshold, change, gain = settings['threshold'] * DEGREE, settings['change'] * DEGREE, settings['gain']
@@ -133,7 +135,7 @@ def bias_average(drive: Drive, rate: Array, deviation: float | None, settings: M
 
 
 def wheel_bias_average(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
-    """Return the heading less an exponential average over the time in which the wheels stand, as imu_bias_remover of imu_pipeline does."""
+    """Return the heading less an exponential average while the wheels stand (imu_bias_remover)."""
     gain, still = settings['gain'], ~drive.moving
     average = lfilter([gain], [1.0, gain - 1.0], rate[still])
     counted = np.cumsum(still)
@@ -157,7 +159,7 @@ PEERS = {
 
 
 def tuned(peer: Peer, drives: Sequence[tuple[Drive, SelfCalibration]]) -> Mapping[str, float]:
-    """Return the settings with the least mean error over some drives, each improved in turn, twice, from the published ones."""
+    """Return the settings of least mean error, each improved twice in turn from the published."""
     def cost(settings: Mapping[str, float]) -> float:
         return float(np.mean([np.abs(peer.run(drive, known, settings) - drive.heading).mean() for drive, known in drives]))
     best, least = peer.published, cost(peer.published)

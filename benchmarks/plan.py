@@ -1,16 +1,19 @@
 """
-What a planned motion of twenty seconds is worth, predicted and simulated, beside plain ones, and what more seconds buy.
+Compare a planned motion of 20 s with plain ones, predicted and simulated, and with longer ones.
 
     python benchmarks/plan.py [RUNS]
 
-The robot turns at 60 deg/s at most, with 120 deg/s² (60 deg/s² with the short cable) and rests of 1 s. The gyro has the noise of the Epson
-XV-3500 and a scale factor error and a bias drawn for each run, of 3 % and 0.5 deg/s; 100 Hz. After the run it drives on at once, for
-160 s: the motion `robot`, which turns up to 100 deg and comes back each time, or a steady turn of ten rounds. The noise of a run is one
-record, from before the motion to the end of the drive, and the same records serve each row. Standard deviations of the bias are of its
-difference to the mean bias of the drive. Some rows have a gyro that is late against the profile, or a robot that follows with a
-first-order lag, which the fit is not told.
+The robot turns at 60 deg/s at most, with 120 deg/s² (60 deg/s² with the short cable) and rests of
+1 s. The gyro has the noise of the Epson XV-3500 and a random scale factor error and bias for each
+run, of 3 % and 0.5 deg/s; 100 Hz. After the run it drives on at once for 160 s: the motion
+`robot`, which turns up to 100 deg and comes back each time, or a steady turn of ten rounds. The
+noise of a run is one record, from before the motion to the end of the drive; each row uses the
+same records. Standard deviations of the bias are of its difference from the mean bias of the
+drive. Some rows have a gyro that is late against the profile, or a robot with a first-order lag,
+unknown to the fit.
 
-Prints a table in Markdown; n runs tell a standard deviation to 1 / sqrt(2 n), 200 to 5 %, and a mean heading error to about 5 %.
+Prints a table in Markdown; n runs determine a standard deviation to 1 / sqrt(2 n), 200 runs to 5
+%, and a mean heading error to about 5 %.
 
 """
 
@@ -44,14 +47,14 @@ ABILITIES = {
 
 
 def followed(motion: Motion, time: Array, late: float, lag: float) -> Array:
-    """Return the rate, rad/s, of a robot that follows with a first-order lag, s, as a gyro that is late, s, says it."""
+    """Return the rate, rad/s, of a robot with a first-order lag, s, by a gyro with a delay, s."""
     fine = np.arange(round(time[-1] * 1000.0) + 1) / 1000.0
     response = np.exp(-np.arange(2000) / 1000.0 / lag) if lag else np.ones(1)
     return np.convolve(motion.rate_at(fine - late), response / response.sum())[:len(fine):1000 // RATE]
 
 
 def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
-    """Return the error of s, that of b against the mean bias of the drive, and the mean heading error of each drive, shape (4,)."""
+    """Return the errors of s, of b against the drive's mean, and of the headings, shape (4,)."""
     generator = np.random.default_rng([11, seed])
     s, b = 0.03 * generator.standard_normal(), 0.5 * DEGREE * generator.standard_normal()
     before, run, drive = (round(length * RATE) for length in (BEFORE, motion.duration, DRIVE))

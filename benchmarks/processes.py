@@ -18,5 +18,5 @@ def end(process: subprocess.Popen) -> None:
 
 
 def processor_time(process: int) -> float:
-    """Return what a process has used so far, s; by the clock of clock_getcpuclockid(3), which is finer than the ticks in /proc."""
+    """Return the processor time of a process, s, by clock_getcpuclockid(3), finer than /proc."""
     return time.clock_gettime(~process << 3 | 2)

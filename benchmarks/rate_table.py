@@ -3,8 +3,9 @@ How well calibrations predict a measured rate table of an open-loop fibre-optic 
 
     GYRO_CALIBRATION_DATA=FOLDER python benchmarks/rate_table.py
 
-Each is fitted without one sweep and tested on it, for all 24 sweeps; and fitted to dwells slower than 60 deg/s and tested on the others,
-up to 101 deg/s. The default chooses the effects anew from what it may see. Prints a table in Markdown, root mean squares in deg/s.
+Each is fitted without one sweep and tested on it, for all 24 sweeps; and fitted to dwells slower
+than 60 deg/s and tested on the others, up to 101 deg/s. The default selects the effects anew from
+the fitted data. Prints a table in Markdown, root mean squares in deg/s.
 
 """
 
@@ -62,7 +63,7 @@ FITS = {
 
 
 def table(data: Path) -> Dwells:
-    """Return the dwells of the recording, all of them: those that are outlying are not fitted, but tested on."""
+    """Return all dwells of the recording: outliers are not fitted, but tested on."""
     return from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
 
 

@@ -1,16 +1,18 @@
 """
-How far the heading of measured gyros is off over five minutes, calibrated on their first seconds of motion.
+Measure heading errors of recorded gyros over five minutes, calibrated on their first motion.
 
     GYRO_CALIBRATION_DATA=FOLDER python benchmarks/recordings.py [STEP]
 
-An MPU-6050 swings over 180 degrees on a shaft with an encoder. It is calibrated on 20, 30 or 60 s against the encoder, and then its heading
-is followed to five minutes after the beginning: without calibration, with the least squares of Hong and Park (eq. 7), with the likelihood
-of blocks alone, by what is slow in the run where errors repeat with the motion (slow), and as self-calibration is now, which refuses a run
-where they are large. Two tables in Markdown: from the beginning of each recording, and from beginnings every STEP seconds (60) of it.
+An MPU-6050 swings over 180 degrees on a shaft with an encoder. It is calibrated on 20, 30 or 60 s
+against the encoder, and then its heading is followed to five minutes after the beginning: without
+calibration, with the least squares of Hong and Park (eq. 7), with the likelihood of blocks alone,
+by the slow part of the run where errors repeat with the motion (slow), and as self-calibration is
+now, which refuses a run where they are large. Two tables in Markdown: from the beginning of each
+recording, and from beginnings every STEP seconds (60) of it.
 
-The heading is compared with the encoder where the fit says that they belong together, in time and at the start; eq. 7 knows nothing of
-that, and is followed with what the likelihood has found. What is stated is the covariance of the calibration, and the noise of the same
-kind of gyro at rest.
+The heading is compared with the encoder aligned by the fit, in time and at the start; eq. 7 has no
+such alignment, and uses that of the likelihood. The stated uncertainty is the covariance of the
+calibration, and the noise of the same kind of gyro at rest.
 
 """
 
@@ -65,7 +67,7 @@ def fits(time: Array, output: Array, heading: Array, seconds: float) -> tuple[di
 
 
 def follow(fit: Fit, time: Array, output: Array, heading: Array) -> tuple[Array, Array]:
-    """Return the error of the heading and its stated standard deviation, rad, without the last second."""
+    """Return the error of the heading and its stated sigma, rad, without the last second."""
     turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
     turned = np.interp(time + fit.time_offset, time, turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
     known = quadratic_form(fit.covariance, np.array([heading, time])) / (1.0 + fit.scale_factor_error) ** 2
@@ -75,7 +77,7 @@ def follow(fit: Fit, time: Array, output: Array, heading: Array) -> tuple[Array,
 
 
 def row(log: Log, sense: float, begin: float, seconds: float) -> tuple[list[float], list[float], str]:
-    """Return rms errors, deg, of the methods; deviations of bias, deg/s, and heading at the end, deg, and part inside; why refused."""
+    """Return rms errors, sigmas of bias and final heading (deg), share inside, and refusal."""
     time, output, heading = part(log, sense, begin)
     found, reason = fits(time, output, heading, seconds)
     followed = {name: follow(fit, time, output, heading) for name, fit in found.items()}
@@ -107,13 +109,13 @@ def root_mean_square(values: Array) -> float:
 
 
 def summary(stated: Array) -> Array:
-    """Return the medians of what was stated, and the least part inside, of the runs that there are."""
+    """Return the medians of the stated values, and the least share inside, of given runs."""
     known = stated[np.isfinite(stated[:, 0])]
     return np.append(np.median(known[:, :2], axis=0), known[:, 2].min()) if len(known) else np.full(3, math.nan)
 
 
 def tables(folder: Path, step: float) -> tuple[str, str]:
-    """Return the table from the beginning of the recordings, and that from many beginnings: root mean squares, least part inside."""
+    """Return the tables from the beginning and from many: rms errors, least share inside."""
     first, many = header('refused'), header('refused')
     for name, sense in RECORDINGS.items():
         log = read_log(folder / 'mems_encoder_turntable' / f'{name}.csv.gz')

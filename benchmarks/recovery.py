@@ -1,12 +1,14 @@
 """
-How often the 95 % intervals of a calibration from dwells hold the truth, for every effect, on simulated rate tables.
+Measure the coverage of 95 % intervals of calibrations from dwells, for every effect, simulated.
 
     python benchmarks/recovery.py [RUNS]
 
-Each table has eight sweeps of 21 rates up to 100 deg/s both ways, while the temperature goes from 25 to 47 degC; the mean of a dwell
-scatters by 0.03 deg/s. The first table has a gyro for each effect, the second one gyro with several effects for each kind of scatter.
-Prints tables in Markdown: which part of the runs (400, or as given) had the truth of each value inside its interval, the mean over the
-values of a gyro and the lowest and highest of them, and the same for the rates that the model gives back over the whole range.
+Each rate table has eight sweeps of 21 rates up to 100 deg/s both ways, while the temperature goes
+from 25 to 47 degC; the mean of a dwell scatters by 0.03 deg/s. The first table has a gyro for each
+effect, the second one gyro with several effects for each kind of scatter. Prints tables in
+Markdown: the share of the runs (400, or as given) with the truth of each value inside its
+interval, the mean over the values of a gyro and the lowest and highest of them, and the same for
+the compensated rates over the whole range.
 
 """
 
@@ -118,7 +120,7 @@ def gyros() -> dict[str, tuple[Term, ...]]:
 
 
 def expressed(truth: GyroModel, fitted: GyroModel) -> np.ndarray:
-    """Return the true values as the fitted model counts them: from another temperature, or by other centres and scales."""
+    """Return the true values in the fitted model's terms: temperature, centres and scales."""
     rate, temperature = (each.ravel() for each in np.meshgrid(np.linspace(-1.7, 1.7, 11), np.linspace(25.0, 47.0, 7)))
     channels = Channels(rate, truth.output(rate, temperature), temperature)
     shapes = {term.effect.name: term.values[:len(term.effect.shapes)] for term in truth.terms if term.effect is SINE_RESPONSE}
@@ -133,7 +135,7 @@ def expressed(truth: GyroModel, fitted: GyroModel) -> np.ndarray:
 
 
 def run(terms: Sequence[Term], table: Table, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the fitted values, and of the compensated rates over the whole range, in standard deviations."""
+    """Return the normalized errors of the fitted values, and of the compensated rates."""
     truth = GyroModel(tuple(terms))
     model = fit_effects(table.measure(truth, generator), [term.effect for term in terms]).model
     found = np.array([term.values[place] for term in model.terms for place in term.fitted])

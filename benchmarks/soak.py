@@ -1,17 +1,20 @@
 """
-The whole graph for an hour: emulated gyro -> driver_node -> compensation_node -> a subscriber that counts, each a process of its own.
+Run the whole graph for an hour: emulated gyro, driver_node, compensation_node and subscriber.
 
-    python benchmarks/soak.py --minutes 60       one gyro at 1 kHz; Ctrl-C ends it early, with the figures so far
-    python benchmarks/soak.py --protocols        every wire format at its full line rate, a minute each
+    python benchmarks/soak.py --minutes 60      one gyro at 1 kHz; Ctrl-C prints the figures so far
+    python benchmarks/soak.py --protocols       every wire format at full line rate, a minute each
     python benchmarks/soak.py --minutes 1 --json
 
-The emulated KVH 1750 turns at rates that hold the number of the sample, so the subscriber knows of each corrected rate which sample it is:
-none may be missing and none come twice. Latency is counted from when a sample is due on the line until its corrected rate is taken by the
-subscriber, so emulator, driver, compensation and two hops of DDS are in it. Memory is the resident memory of a process: the median of the
-last tenth of the run against that of its second tenth, for the first one is the warm-up.
+Each is a process of its own. The emulated KVH 1750 turns at rates that encode the number of the
+sample, so the subscriber can match each corrected rate to its sample: none may be missing and none
+come twice. Latency is counted from when a sample is due on the line until its corrected rate is
+taken by the subscriber, so it includes emulator, driver, compensation and two hops of DDS. Memory
+is the resident memory of a process: the median of the last tenth of the run against that of its
+second tenth, for the first one is the warm-up.
 
-At the full line rate the baud decides how many samples come. A driver that gets more than 1 kHz publishes means of several samples; the
-heading at the end, beside the angle that the emulated gyro has turned, shows that none of them was lost on the way.
+At the full line rate the baud rate determines the number of samples. A driver that gets more than
+1 kHz publishes means of several samples; the heading at the end, compared with the angle that the
+emulated gyro has turned, shows that none of them was lost on the way.
 
 """
 
@@ -99,7 +102,7 @@ def numbered_rate(number: int) -> float:
 
 
 def number_of(rate: float, last: int) -> int | None:
-    """Return the number that a rate holds, as the one nearest to the last; None of a leading sample."""
+    """Return the number that a rate encodes, as the one nearest to the last; None if leading."""
     if abs(rate) < 0.5 * (SMALLEST + abs(LEADING)):
         return None
     held = round((abs(rate) - SMALLEST) / STEP)
@@ -115,7 +118,7 @@ def arriving(name: str, output: float, rate: float) -> float:
 
 
 def turning(name: str, rate: float) -> Iterator[tuple[float, float]]:
-    """Yield true rate and output of one sample after the other: numbered rates, or to and fro with what the format does not round."""
+    """Yield true rate and output of each sample: numbered, or to and fro without rounding."""
     if name == SOAKED and rate == SOAKED_RATE:
         yield from ((turned, MODEL.output(turned, 25.0)) for turned in map(numbered_rate, itertools.count()))
     outputs = [arriving(name, sign * SMALLEST, rate) for sign in (1.0, -1.0)]
@@ -125,7 +128,7 @@ def turning(name: str, rate: float) -> Iterator[tuple[float, float]]:
 
 
 def samples_of(given: argparse.Namespace, numbers: np.memmap) -> Iterator[Sample]:
-    """Yield leading samples until all is ready, then those that count, then leading ones for a second."""
+    """Yield leading samples until all is ready, counted ones, then leading ones for 1 s."""
     interval, begin, leading, turned = 1.0 / given.rate, time.monotonic(), given.leading, given.leading
     for first in itertools.count():
         if numbers[GO]:
@@ -175,7 +178,7 @@ class Counter:
         self._said: dict[str, str] = {}
 
     def take(self, seconds: float) -> None:
-        """Take what comes, for so long; waiting as `rclpy.wait_for_message` does it, for an executor needs a quarter of a core here."""
+        """Take messages for a time as `rclpy.wait_for_message`; an executor costs 1/4 core."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             self._wait_set.clear_entities()
@@ -384,7 +387,7 @@ def text(found: dict[str, object]) -> Iterator[str]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Give a domain that no other run of this or of the tests uses meanwhile: each holds the lock of its own."""
+    """Return a domain that no other run uses meanwhile: each holds the lock of its own."""
     for number in random.sample(range(1, 102), 101):
         with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock, suppress(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""The verb diagnose as people call it: what it prints and writes, and what it says where the data do not allow an answer."""
+"""The verb diagnose: what it prints and writes, and its messages where data do not suffice."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def log(hidden, tmp_path):
 
 @pytest.fixture
 def diagnose(run, tmp_path):
-    """Return a function that writes a log, diagnoses it into the folder `found`, and gives exit code, output and errors."""
+    """Return a function that diagnoses a log into `found`; it returns code, output, errors."""
     def diagnose(log, *words):
         write_log(tmp_path / 'given.csv', log)
         return run('diagnose', tmp_path / 'given.csv', *words, '--out', tmp_path / 'found')

@@ -1,8 +1,8 @@
 """
-The diagnosis names what is hidden, with its size, and wins what there is to win; and it names nothing where there is nothing.
+The diagnosis names hidden effects with their size, wins what is possible, and adds no others.
 
-The logs are made by `hidden`, which shares nothing with the package. The seeds of the fixed set are places in lists; those of the last test
-vary from run to run, and are printed.
+The logs are made by `hidden`, which shares nothing with the package. The seeds of the fixed set
+are places in lists; those of the last test vary from run to run, and are printed.
 
 """
 
@@ -177,7 +177,7 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
 # several logs of one gyro
 
 def recorded(names, steps, seed, given=None, multiple=8.0):
-    """Record a gyro once for each moment at which the temperature steps up by 10 K, to go down by 15 K later."""
+    """Record a gyro once for each moment of a temperature step of 10 K up, 15 K down later."""
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, SHORT['duration'], 1.0 / SHORT['sample_rate'])
     motion = 1.5 * np.sin(0.7 * time) * (np.sin(0.05 * time) > 0.0)
@@ -243,7 +243,7 @@ def again(hidden, seed):
 
 
 def left_over(model, log):
-    """Return what a model leaves of a log: of its output, simulated, and of its reference rate, compensated."""
+    """Return the residuals of a log: of its simulated output, and of its compensated rate."""
     channels = channels_of(log)
     simulated = respond(model, log.time, channels.moving(log.reference_rate, log.reference_rate))
     known = np.interp(model.true_time(log.time), log.time, log.reference_rate)

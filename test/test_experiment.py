@@ -1,4 +1,4 @@
-"""Experiments: what looks the same in one log is parted by the one that is proposed, once it has been carried out."""
+"""Experiments: the proposed one, once carried out, distinguishes what one log confounds."""
 
 import re
 import zlib
@@ -27,7 +27,7 @@ MULTIPLES = {('time_offset', 'bandwidth'): 30.0, ('bias_temperature_rate', 'ther
 
 
 def seeded(*words):
-    """Return a source of random numbers that differs for different words, and is the same in each run."""
+    """Return a source of random numbers by words, the same in each run."""
     return np.random.default_rng(zlib.crc32(' '.join(words).encode()))
 
 

@@ -1,4 +1,4 @@
-"""The extended model: what it holds of what was found, what it keeps of the model that was given, and what it says of itself."""
+"""The extended model: the findings in it, what it keeps of the given model, and its messages."""
 
 from dataclasses import replace
 
@@ -61,7 +61,7 @@ def value(model, name, place=0):
 # what is found of an effect that the model has already
 
 def on_top(own, found, *shapes, supply=None):
-    """Return a model with an effect, and what a log says that has more of it, counted from elsewhere or later."""
+    """Return a model with an effect, and a finding of more of it from another origin or time."""
     model = replace(MODEL, terms=(*LINEAR, own), covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted)]))
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)

@@ -1,8 +1,9 @@
 """
 What docs/findings.md says of measured recordings is what the program finds in them.
 
-The tables of the document are read, and its commands are run. A size may differ a little, for noise that is drawn to fill
-lost samples differs from one release of numpy to the next; an error by a quarter of the width of the interval of what is won.
+The tables of the document are read, and its commands are run. A size may differ a little, for
+noise that is drawn to fill lost samples differs between releases of numpy; an error by a quarter
+of the width of the interval of the improvement.
 
 """
 
@@ -42,9 +43,10 @@ def numbers(text):
 
 def agree(written, found):
     """
-    Tell whether a quantity is what is written: within half of its interval, or 2 %.
+    Tell whether a quantity is as written: within half of its interval, or 2 %.
 
-    Where the vibration of a stepper is left, the noise that is taken moves a delay by a hundredth, which is more than its interval.
+    Where the vibration of a stepper is left, the assumed noise moves a delay by 1 %, which is more
+    than its interval.
 
     """
     (mine, form), (theirs, other) = numbers(written), numbers(found)

@@ -1,4 +1,4 @@
-"""What a diagnosis says that an extended model wins, on blocks that took no part in it: before as it was given, and how sure."""
+"""The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ WHITE, RATE = 1e-3, 10.0
 
 
 def drive(generator, duration=600.0, bias=0.0, scale=0.0):
-    """Return a drive with a reference rate, of a gyro with nothing but a bias, a scale factor error and white noise."""
+    """Return a drive with a reference rate, of a gyro with bias, scale error and white noise."""
     time = np.arange(round(duration * RATE)) / RATE
     rate = np.sin(0.3 * time) + 0.4 * np.sin(0.071 * time + 1.0)
     output = (1.0 + scale) * rate + bias + WHITE * generator.standard_normal(len(time))

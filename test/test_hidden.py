@@ -1,4 +1,4 @@
-"""The generator of hidden effects is itself right: its noise, its physics, its sizes; and it shares nothing with the package."""
+"""The generator of hidden effects: its noise, physics, sizes, and independence of the package."""
 
 import ast
 import math
@@ -51,7 +51,7 @@ def test_nothing_of_the_package_is_imported(path):
 
 
 def allan_variance(rate, interval, size):
-    """Return the Allan variance of a record at an averaging time of so many samples, over all overlapping means."""
+    """Return the Allan variance of a record over so many samples, over all overlapping means."""
     angle = np.concatenate([[0.0], np.cumsum(rate)]) * interval
     second = angle[2 * size:] - 2.0 * angle[size:-size] + angle[:-2 * size]
     return float(np.mean(second ** 2) / (2.0 * (size * interval) ** 2))
@@ -235,7 +235,7 @@ def test_noise_is_changed_against_what_a_model_expects(generator):
 
 
 def left_over(hidden_name, other, log, sessions, twins):
-    """Return the standard deviations that the other twin leaves of a hidden one, by a search over its size where it bends."""
+    """Return the sigmas of a hidden twin left by the other, by a search over nonlinear sizes."""
     cause, metric = log.truth[hidden_name], Metric(sessions, log.truth.gyro.figures)
     known = ('bias', 'scale') if twins.against_a_model else ()
     hidden = errors(ALL[hidden_name], cause.size, cause.shapes, sessions)

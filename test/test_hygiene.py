@@ -1,4 +1,4 @@
-"""Hygiene: faults of a record are found at stated sizes, a record without any brings nothing, and what allows no diagnosis is refused."""
+"""Hygiene: faults are found at stated sizes, good records pass, and useless ones are refused."""
 
 import math
 import os
@@ -76,7 +76,7 @@ def coarse(log, step):
 
 
 def in_digits(log, digits):
-    """Return what is left of a log that was printed with so many significant digits, as streams do."""
+    """Return a log as printed with so many significant digits, as by streams."""
     return replace(log, output=np.array([float(f'{each:.{digits}g}') for each in (log.output / DEGREE).tolist()]) * DEGREE)
 
 
@@ -194,7 +194,7 @@ def test_a_coarse_gyro_that_sticks_while_it_turns_is_seen(generator):
 
 
 def test_codes_as_wide_as_the_noise_are_stuck_as_seldom_as_said(generator):
-    """At rest in the middle of a code, 200 logs at 2 % each. With the chance of one repeat for each, there would be 26 alarms."""
+    """200 logs at rest in the middle of a code at 2 % each; 26 alarms if each repeat counted."""
     logs = [compare(np.round(generator.standard_normal(2000) / 1.05) * 1.05, None, None) for _ in range(200)]
     assert sum(stuck_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool), 0.02) is not None for log in logs) <= 10
 
@@ -238,7 +238,7 @@ def test_a_dead_band_of_the_driver_is_found_as_a_dead_zone():
 
 
 def test_a_moving_average_of_coarse_codes_is_not_stuck(generator):
-    """As some trackers give it: a new sample that equals the one seven before leaves the mean of seven as it is."""
+    """Mean of seven, as in trackers: a sample equal to the one seven before repeats it."""
     log = swing(generator)
     mean = np.convolve(coarse(log, 0.2 * SIGMA).output, np.full(7, 1.0 / 7.0), 'valid') * (1.0 + 0.02 * np.sin(31.0 * log.time[3:-3]))
     assert not found(Log(printed(mean, 4), time=log.time[3:-3], reference_rate=log.reference_rate[3:-3]))

@@ -17,7 +17,7 @@ LATE = 0.004
 
 @pytest.fixture(scope='module')
 def smoothed():
-    """Return a log at 250 Hz of a hand's motion, late by 4 ms, whose noise, of the gyro and more of the reference, was smoothed."""
+    """Return a hand's motion at 250 Hz, 4 ms late, with smoothed noise of gyro and reference."""
     generator = np.random.default_rng(5)
     time = np.arange(30_000) / 250.0
     turns = [(frequency, generator.normal(), generator.uniform(0.0, 6.0)) for frequency in (0.13, 0.31, 0.7, 1.1, 1.9, 3.1, 5.3)]
@@ -79,7 +79,7 @@ NOISE = 1e-3 * np.random.default_rng(4).standard_normal(len(TIME))
 
 
 def stepped(every):
-    """Return a rate that is commanded in steps: rests and stretches of 10 s, with turns between them, held for so many samples."""
+    """Return a rate commanded in steps, each held: rests and stretches of 10 s, with turns."""
     wanted = np.where(TIME % 20.0 < 10.0, np.where(TIME % 40.0 < 20.0, 0.0, 0.3), 0.3 + 0.5 * np.sin(0.7 * TIME))
     return wanted[np.arange(len(TIME)) // every * every]
 

@@ -1,4 +1,4 @@
-"""The report of a diagnosis: one page that needs nothing else, looked at in a browser as people do, on a phone and on a desk."""
+"""The report of a diagnosis: one self-contained page, opened in a browser, narrow and wide."""
 
 import base64
 import json
@@ -67,7 +67,7 @@ def adequate():
 
 
 def extended():
-    """Return a diagnosis with one cause that the data leave in a set, and everything there is to draw."""
+    """Return a diagnosis with one cause that remains in a set, and everything there is to draw."""
     model = GyroModel((Term(CATALOGUE['bias'], (0.1 * DEGREE,)), Term(CATALOGUE['bias_temperature'], (25.0, 0.021 * DEGREE))),
                       np.diag([1e-9, 1e-12]), (-1.745, 1.745), (18.0, 41.0), noise=Noise(1e-4, 2e-5, 1e-6), gyro={'name': 'yaw gyro'})
     thermal = (TEMPERATURE - 25.0) * 0.021 * DEGREE
@@ -165,7 +165,7 @@ def made(request):
 # the page as text
 
 class Page(HTMLParser):
-    """Reads a page strictly: every element that is opened is closed, in order, and says which elements and attributes there are."""
+    """Read a page strictly: every element closed, in order; lists elements and attributes."""
 
     EMPTY = {'meta', 'br'}
 
@@ -320,7 +320,7 @@ def test_lines_for_a_terminal_are_not_too_long(made):
 # the page in a browser
 
 class Browser:
-    """Chromium without a window, spoken to through a pipe in its own protocol; what it asks the network for and complains of is kept."""
+    """Chromium without a window, driven through a pipe; keeps its requests and complaints."""
 
     def __init__(self, folder):
         there, self._out = os.pipe()

@@ -1,4 +1,4 @@
-"""The search looks everywhere in the logs, pays for all that it could have found, and says how sure it is of each value."""
+"""The search covers all logs, pays for all that it could have found, and bounds each value."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""
-The diagnosis of rate tables: what is hidden is found, what is not there is not, and what cannot be told is said with what would tell it.
-
-"""
+"""The diagnosis of rate tables: hidden effects are found, absent ones not, limits are stated."""
 
 import json
 import re
@@ -46,7 +43,7 @@ def without_gain(monkeypatch):
 
 
 def gyro(name, size):
-    """Return a gyro with bias and scale factor, and an effect of some size on top; those of temperature count from 25 degC."""
+    """Return a gyro with bias, scale factor and one effect; temperature counts from 25 degC."""
     terms = {term.effect.name: term for term in LINEAR}
     known = terms[name].values[-1] if name in terms else 0.0
     values = {'sine_response': (size, 1.0)}.get(name) or (*[25.0] * len(STEADY[name].shapes), known + size)

@@ -1,15 +1,18 @@
 """
-Logs with something hidden in them, made apart from the package: nothing of it is imported here.
+Logs with hidden effects, made independently of the package: nothing of it is imported here.
 
-`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE` those that are not in it; `twin` and `part` make the
-logs on which two causes cannot be told apart, and on which they can; `oracle_gain` says what is won by who knows the truth.
+`hide` makes logs of a random gyro; `FORMS` are the effects of the catalogue, `OUTSIDE` those that
+are not in it; `twin` and `part` make the logs on which two causes are confounded, and on which
+they are distinguishable; `oracle_gain` is the improvement with the truth known.
 
-A size is a multiple of what is just detectable beside a bias of each recording and one scale (`size`), with these exceptions: faults of
-samples are counted, and three are just detectable; steps of codes and encoders have the size whose added variance is just detectable; a
-wrong unit has no size; a figure of the noise changes until its spectrum is as far from the expected one as a just detectable effect is from
-none.
+A size is a multiple of the minimum detectable effect beside a bias of each recording and one scale
+(`size`), with these exceptions: faults of samples are counted, and three are just detectable;
+quantization and encoder steps have the size whose added variance is just detectable; a wrong unit
+has no size; a figure of the noise changes until its spectrum is as far from the expected one as a
+just detectable effect is from none.
 
-Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `likeness`, `log`, `twins`, `oracle`.
+Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `likeness`, `log`,
+`twins`, `oracle`.
 
 """
 

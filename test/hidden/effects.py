@@ -1,9 +1,11 @@
 """
-The physics of what is hidden, as the catalogue of effects says it: w rate, psi heading, t time since power-on, T temperature, y output.
+Physics of the hidden effects, as in the catalogue of effects.
 
-Each effect is a `Form`: how its shapes are drawn, and what it adds when its leading parameter has a size. Forms say where in the chain
-they act: on the signal before all else ('signal'), added to it ('sum'), on the finished output ('output'), on the reference
-('reference'), on single samples ('samples'), on the unit ('unit'), on the noise ('noise').
+Symbols: w rate, psi heading, t time since power-on, T temperature, y output. Each effect is a
+`Form`: how its shapes are drawn, and what it adds for a size of its leading parameter. Forms state
+where in the chain they act: on the signal before all else ('signal'), added to it ('sum'), on the
+finished output ('output'), on the reference ('reference'), on single samples ('samples'), on the
+unit ('unit'), on the noise ('noise').
 
 """
 
@@ -41,7 +43,8 @@ class Form:
 
     Attributes
     ----------
-    error : (session, resulting rate w, size, shapes) -> what it adds to the output less the reference, rad/s, of shape (n,)
+    error : (session, resulting rate w, size, shapes) -> its addition to output less reference,
+        rad/s
     unit : of the leading parameter, which is named like the effect
     shapes : (sessions, generator) -> the other parameters
     stage : where it acts
@@ -101,7 +104,7 @@ def temperature_rate(session: Session) -> np.ndarray:
 
 
 def branch(session: Session, threshold: float = 5e-4) -> np.ndarray:
-    """Return +1 while it heats and -1 while it cools; slower than the threshold, K/s, the last known; 0 before the first."""
+    """Return +1 while heating, -1 while cooling; below the threshold, K/s, the last; 0 before."""
     speed = temperature_rate(session)
     known = np.where(np.abs(speed) > threshold, np.arange(len(speed)), -1)
     last = np.maximum.accumulate(known)
@@ -222,7 +225,7 @@ FORMS: Mapping[str, Form] = {
 
 
 def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
-    """Return what an effect of a size adds in each recording, less the reference, at the true rate, rad/s."""
+    """Return the addition of an effect to output less reference of each recording, rad/s."""
     return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run else np.zeros(len(each.time))
             for run, each in enumerate(sessions)]
 

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 
 def lag(signal: np.ndarray, interval: float, time_constant: float) -> np.ndarray:
-    """Return the answer of a first-order lag, exact for a signal that is straight between samples, starting in its first value."""
+    """Return the output of a first-order lag, exact for piecewise linear signals."""
     decay = np.exp(-interval / time_constant)
     ramp = time_constant / interval * -np.expm1(-interval / time_constant)
     # x' = (u - x) / tau over one interval: x1 = decay x0 + (ramp - decay) u0 + (1 - ramp) u1

@@ -45,7 +45,7 @@ class Likeness:
         self._always = list(range(len(self._metric.nuisances)))
 
     def shares(self, hidden: Columns, without: str = '') -> dict[str, float]:
-        """Return what each effect alone could explain of a column beside bias and scale, as a share of its information."""
+        """Return the share of a column that each effect alone explains beside bias and scale."""
         total, along = self._measure(hidden)
         start = self._explained(along, self._always)
         best: dict[str, float] = {}
@@ -56,7 +56,7 @@ class Likeness:
         return best
 
     def together(self, hidden: Columns, count: int = 3) -> float:
-        """Return what some effects could explain together, each chosen as the best beside those before it."""
+        """Return the share that some effects explain together, chosen greedily one by one."""
         total, along = self._measure(hidden)
         start, chosen = self._explained(along, self._always), self._always
         for _ in range(count):
@@ -92,7 +92,7 @@ def _shapes(name: str, sessions: list[Session]) -> Iterator[Shapes]:
 
 
 def _sizes(name: str, sessions: list[Session]) -> Sequence[float]:
-    """Return sizes at which a column of the effect is taken: one where it is in proportion, some where it is not."""
+    """Return the sizes at which a column of the effect is taken: one if linear, else several."""
     top = top_rate(sessions)
     return {'sine_response': [0.1 / top, 0.5 / top, 1.0 / top], 'dead_zone': list(top * np.geomspace(1e-3, 0.2, 8)),
             'saturation': list(top * np.linspace(0.6, 0.98, 8)), 'time_offset': [1e-4], 'bandwidth': [1e-4, 0.05],

@@ -1,8 +1,9 @@
 """
-Logs with something hidden in them, and the truth about it.
+Logs with hidden effects, and the truth about them.
 
-The chain: the rate as the gyro sees it (time offset, clock, bandwidth); what adds to it; noise; saturation; quantization; faults of
-samples; a wrong unit. Effects on the reference change the reference alone.
+The chain: the rate as the gyro senses it (time offset, clock, bandwidth); additions to it; noise;
+saturation; quantization; faults of samples; a wrong unit. Effects on the reference change the
+reference alone.
 
 """
 
@@ -42,14 +43,15 @@ class Cause:
     Attributes
     ----------
     name : in the catalogue, or outside it
-    size : the leading parameter, in SI: what was added; for a figure of the noise its value
+    size : the leading parameter as added, in SI; for a figure of the noise its value
     shapes : the other parameters
     unit : of the size
-    minimum_detectable : size that is just found, alone; for saturation a limit, for a figure of the noise a change; nan without meaning
-    multiple : of it, that is hidden
-    apart : the multiple that is left when the other hidden effects take from it what they can explain
-    likeness : of an effect outside the catalogue, the share that the best effect in it could explain, and
-    likeness_of_three : that the best three could
+    minimum_detectable : size that is just detected alone; for saturation a limit, for a figure of
+        the noise a change; nan without meaning
+    multiple : of the minimum detectable effect, that is hidden
+    apart : the multiple that remains beside the other hidden effects
+    likeness : of an effect outside the catalogue, the share that the best effect in it explains
+    likeness_of_three : the same for the best three
 
     """
 
@@ -65,12 +67,12 @@ class Cause:
 
     @property
     def left(self) -> float:
-        """The multiple that is left of an effect outside the catalogue when three effects in it take what they can."""
+        """The remaining multiple of an outside effect beside the best three of the catalogue."""
         return self.multiple * math.sqrt(1.0 - self.likeness_of_three)
 
     @property
     def standard_deviation(self) -> float:
-        """What an estimate of the size scatters by at best, where it is in proportion to the size."""
+        """Least standard deviation of an estimate of the size, if the effect is linear in it."""
         return self.minimum_detectable / DETECTABLE
 
     @property
@@ -101,7 +103,7 @@ class Gyro:
     bias_spread: float
 
     def bias_of(self, run: int, generator: np.random.Generator) -> float:
-        """Return the bias of one recording, rad/s; a new one for a recording that was not planned."""
+        """Return the bias of one recording, rad/s; a new one for an unplanned recording."""
         return self.biases[run] if run < len(self.biases) else float(generator.normal(np.mean(self.biases), self.bias_spread))
 
     def value(self, name: str) -> float:
@@ -116,21 +118,22 @@ class Gyro:
 @dataclass(frozen=True)
 class Truth:
     """
-    What is so, of one recording.
+    The truth about one recording.
 
     Attributes
     ----------
     gyro : the hidden gyro
-    names : of what is hidden
+    names : of the hidden effects
     bias, scale_factor_error : of this recording, rad/s and 1
-    expected : what a model says that knows all but what is hidden: bias, scale_factor_error, angle_random_walk, bias_instability,
-        rate_random_walk, in SI; for effects that are findings only against a model
+    expected : figures of a model that knows all but what is hidden: bias, scale_factor_error,
+        angle_random_walk, bias_instability, rate_random_walk, in SI; for effects that are findings
+        only against a model
     rate, heading : true, rad/s and rad, at the rows of the log
-    added : what all effects, bias and scale included, add to the true rate; without noise, rad/s
-    reference : rate that the reference means, rad/s
+    added : by all effects, bias and scale included, to the true rate; without noise, rad/s
+    reference : rate that the reference states, rad/s
     noise : the noise that was added, rad/s
-    prediction : the output that who knows all but the noise predicts, rad/s
-    good : False at rows whose sample is wild or stuck
+    prediction : the output predicted with all but the noise known, rad/s
+    good : False at rows whose sample is an outlier or repeated
 
     """
 
@@ -189,9 +192,9 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     encoder_step : of a reference heading, rad; 0 is a heading without steps
     figures : the noise instead of a random one
     conditions : words for `session`: motion, temperature, supply, force, top_rate
-    given : recordings -> name of an effect -> what of it is not to be random: its shapes, its 'sign', or its 'size' in SI, which then has
-        the multiple that it has
-    against_a_model : a model is known that says bias and scale, so that they hide nothing
+    given : recordings -> name of an effect -> its parts that are not random: its shapes, its
+        'sign', or its 'size' in SI, which determines the multiple
+    against_a_model : a model with bias and scale is known, so that they hide nothing
 
     Returns
     -------
@@ -209,7 +212,7 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
 def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, sessions: list[Session],
               expected: NoiseFigures, encoder_step: float = 0.0, given: Mapping[str, Shapes] | None = None,
               known: tuple[str, ...] = ()) -> Gyro:
-    """Draw a gyro whose hidden effects have these multiples of what is just detectable in these recordings."""
+    """Draw a gyro whose hidden effects have these multiples of the minimum detectable effect."""
     multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
     figures, causes = expected, []
     for name in names:
@@ -230,7 +233,7 @@ def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], gener
 
 @dataclass(frozen=True)
 class _Sizing:
-    """What sizes are measured by: the recordings, the gyro without its effects, the information, and what a model says of the nuisances."""
+    """Basis of sizes: recordings, gyro without effects, information, and known nuisances."""
 
     sessions: list[Session]
     gyro: Gyro
@@ -238,7 +241,7 @@ class _Sizing:
     known: tuple[str, ...]
 
     def errors(self, name: str, size: float, shapes: Shapes) -> list[np.ndarray]:
-        """Return what an effect adds in each recording; one on the output has bias and scale before it."""
+        """Return an effect's addition to each recording, to the output after bias and scale."""
         if ALL[name].stage != 'output':
             return errors(ALL[name], size, shapes, self.sessions)
         outputs = [(1.0 + self.gyro.scale_factor_error) * each.rate + bias for each, bias in zip(self.sessions, self.gyro.biases)]
@@ -275,7 +278,7 @@ def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizi
 
 
 def _draw_outside(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing) -> Cause:
-    """Draw shapes until no effect of the catalogue explains much of it; the least explained of all where that takes long."""
+    """Draw shapes until no catalogued effect explains much of it, or keep the least explained."""
     form, likeness = OUTSIDE[name], Likeness(sizing.sessions, sizing.gyro.figures)
     drawn = []
     for _ in range(DRAWS):
@@ -291,7 +294,7 @@ def _draw_outside(name: str, multiple: float, generator: np.random.Generator, si
 
 
 def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
-    """Solve for how far below the largest output the limit is; the higher, the less there is to see."""
+    """Solve for the distance of the limit below the largest output; a higher limit shows less."""
     top = (1.0 + sizing.gyro.scale_factor_error) * top_rate(sizing.sessions) + max(map(abs, sizing.gyro.biases))
     def norm(below: float) -> float:
         return sizing.norm('saturation', top - below, {})
@@ -331,7 +334,7 @@ def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, s
 
 def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session],
                 expected: NoiseFigures) -> tuple[Cause, NoiseFigures]:
-    """Change a figure of the noise so far that the spectrum tells it; white noise up or down, the others up."""
+    """Change a noise figure until the spectrum shows it; white noise up or down, others up."""
     start, sign = getattr(expected, name), 1.0
     if name == 'angle_random_walk' and multiple * DETECTABLE / math.sqrt(2.0 * len(sessions[0].time)) < 0.5:
         sign = float(generator.choice([-1.0, 1.0]))
@@ -346,7 +349,7 @@ def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sess
 
 def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expected: NoiseFigures | None = None, reference: str = 'rate',
            encoder_step: float = 0.0, run: int = 0) -> HiddenLog:
-    """Record a gyro under the conditions of a session, which need not be those that its effects were sized for."""
+    """Record a gyro under a session's conditions, perhaps not those its effects were sized for."""
     bias = gyro.bias_of(run, generator)
     delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'), 0.0)
     w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'), gyro.value('bandwidth'))
@@ -384,7 +387,7 @@ def _finish(gyro: Gyro, signal: np.ndarray) -> np.ndarray:
 
 
 def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return rate and heading as the reference, true or wrong, means them, without the steps of an encoder."""
+    """Return rate and heading stated by the reference, true or wrong, without encoder steps."""
     rate, heading = each.rate, each.heading
     for cause in gyro.causes:
         if cause.name == 'reference_once_per_rev':
@@ -410,7 +413,7 @@ def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: 
 
 
 def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.ndarray]:
-    """Return what is measured beside the gyro; the thermometer has fine steps, or some noise, or neither."""
+    """Return the other measurements; the thermometer has fine steps, or some noise, or neither."""
     temperature = each.temperature
     kind = generator.integers(4)
     if kind == 0:
@@ -428,7 +431,7 @@ def _conditions(each: Session, generator: np.random.Generator) -> dict[str, np.n
 
 def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Generator,
             each: Session) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Make samples wild or stuck, and drop some; return the columns, which of the true rows are good, and which are kept."""
+    """Make outliers, repeats and gaps; return the columns, good true rows, and kept rows."""
     output = columns['gyro_rad_s'].copy()
     count = len(output)
     good, kept = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
@@ -449,7 +452,7 @@ def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Gen
 
 
 def _turning_rows(each: Session, count: int, generator: np.random.Generator, apart: int = 25) -> list[int]:
-    """Choose rows while it turns, not in the first or last seconds, and not close to one another."""
+    """Choose rows while it turns, not in the first or last seconds, and not close together."""
     margin = round(2.0 / each.interval)
     rows = generator.permutation(margin + np.flatnonzero(np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max()))
     chosen: list[int] = []

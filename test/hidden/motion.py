@@ -1,4 +1,4 @@
-"""What happens to a gyro during a recording: motion, temperature, supply, tilt and vibration, drawn at random."""
+"""Random conditions of a gyro during a recording: motion, temperature, supply, tilt, vibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Motion:
-    """The true rate, rad/s, and its integral from 0 on, rad, as functions of the time since power-on."""
+    """The true rate, rad/s, and its integral from 0 on, rad, over the time since power-on."""
 
     rate: Callable[[np.ndarray], np.ndarray]
     heading: Callable[[np.ndarray], np.ndarray]
@@ -72,10 +72,13 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
     ----------
     generator : source of all that is random
     duration, sample_rate : s and Hz
-    motion : rich, one_speed (never at rest), two_way (one speed both ways, and rest), slow (below 0.3 rad/s), smooth (slow swings only)
-    temperature : rich, ramp, cold_start, triangle (one turn), triangles (one speed both ways), smooth, constant
+    motion : rich, one_speed (never at rest), two_way (one speed both ways, and rest), slow (below
+        0.3 rad/s), smooth (slow swings only)
+    temperature : rich, ramp, cold_start, triangle (one turn), triangles (one speed both ways),
+        smooth, constant
     supply : rich, heating (follows the temperature), constant
-    force : rich, one_pose, turning (its power goes as the speed), off_axis (centripetal)
+    force : rich, one_pose, turning (its power is proportional to the speed), off_axis
+        (centripetal)
     top_rate : rad/s; random between 1 and 5 where it is None
 
     """
@@ -88,7 +91,7 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
 
 def described(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray, temperature: np.ndarray | None = None,
               supply: str = 'rich', force: str = 'rich') -> Session:
-    """Make a recording of a motion and a temperature that somebody else planned, given at evenly spaced times."""
+    """Make a recording of a given motion and temperature at evenly spaced times."""
     knots = np.interp(np.arange(time[0], time[-1] + KNOT, KNOT), time, rate)
     degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0], 5.0)
     return assemble(generator, time - time[0], spline(knots), degc, supply, force)
@@ -104,7 +107,7 @@ def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion, t
 
 
 def spline(knots: np.ndarray) -> Motion:
-    """Return the motion whose rate has these coefficients every `KNOT` s; outside of them it rests."""
+    """Return the motion whose rate has these coefficients every `KNOT` s; outside, it rests."""
     margin = 4
     coefficients = np.concatenate([np.zeros(margin), knots, np.zeros(margin)])
     places = KNOT * (np.arange(len(coefficients) + 4) - margin - 2)
@@ -229,7 +232,7 @@ def _chamber(generator: np.random.Generator, time: np.ndarray, corners: np.ndarr
 
 
 def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """Draw a cold start and, on top, a chamber that goes up and down two to four times, some of the corners with a pause."""
+    """Draw a cold start plus a chamber with two to four cycles, with pauses at some corners."""
     half_cycles = generator.integers(3, 7)
     inner = np.sort(generator.uniform(0.1, 0.95, half_cycles)) * time[-1]
     corners = np.concatenate([[0.0], inner, [1.3 * time[-1]]])
@@ -291,7 +294,7 @@ SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _
 
 
 def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tilt between poses, slowly, and vibrate while a motor runs, which it does at rest and in motion."""
+    """Tilt slowly between poses, and vibrate while a motor runs, at rest and in motion."""
     edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(8, 15)))
     poses = generator.uniform(-0.7 * np.pi, 0.7 * np.pi, len(edges) + 1)
     angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 8.0), time[1] - time[0], 8.0)
@@ -301,7 +304,7 @@ def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarr
 
 
 def _vibration(generator: np.random.Generator, time: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Vibrate at random with this root mean square, m/s², that comes and goes within half a second."""
+    """Vibrate at random with this root mean square, m/s², that comes and goes within 0.5 s."""
     return generator.standard_normal(len(time)) * lag(level, time[1] - time[0], 0.2)
 
 
@@ -310,7 +313,7 @@ def _one_pose(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray
 
 
 def _turning_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shake to and fro in proportion to the speed's square root, so that the power goes as the speed."""
+    """Shake in proportion to the square root of the speed, so that power is as the speed."""
     return np.full(len(time), GRAVITY), generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate))
 
 

@@ -1,9 +1,11 @@
 """
-The noise of a hidden gyro, how it is made, and how well an effect shows through it.
+The noise of a hidden gyro, its generation, and the information on an effect in it.
 
-Everything that is not white is a sum of first-order Markov processes: the rate random walk is one that never decays, and flicker is a
-ladder of stationary ones, whose time constants go up by factors of four. What they look like to an effect is then exact and cheap: the
-precision matrix of all their states over all samples is banded, and so ``x' S^-1 y`` takes one banded Cholesky factor (`Whitening`).
+Everything that is not white is a sum of first-order Markov processes: the rate random walk is one
+that never decays, and flicker is a ladder of stationary ones, whose time constants increase by
+factors of four. The information on an effect is then exact and cheap: the precision matrix of all
+their states over all samples is banded, and so ``x' S^-1 y`` takes one banded Cholesky factor
+(`Whitening`).
 
 """
 
@@ -47,7 +49,7 @@ class NoiseFigures:
 
     @property
     def floor(self) -> float:
-        """The bias instability that a model without a Gauss-Markov process needs for the same worst Allan deviation, rad/s."""
+        """Bias instability without a Gauss-Markov process, at equal worst deviation, rad/s."""
         return math.hypot(self.bias_instability, FLOOR_OF_GAUSS_MARKOV * self.correlated)
 
     def sample_deviation(self, interval: float) -> float:
@@ -59,7 +61,8 @@ def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
     """
     Draw the figures of a gyro between a good fibre gyro and a cheap micromachined one.
 
-    Flicker, random walk and Gauss-Markov process rise out of the white noise at averaging times that are random, too.
+    Flicker, random walk and Gauss-Markov process rise out of the white noise at random averaging
+    times.
 
     """
     if kind not in KINDS:
@@ -77,7 +80,7 @@ def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
 
 @dataclass(frozen=True)
 class Markov:
-    """x[k] = factor x[k-1] + innovations of a standard deviation, from a first x of one of its own."""
+    """x[k] = factor x[k-1] + innovations of a standard deviation, from a first x of its own."""
 
     factor: float
     innovation: float
@@ -120,9 +123,10 @@ class Whitening:
     """
     Inner products x' S^-1 y for the covariance S of the noise of one recording.
 
-    With r = white + H s, where s are the states of the slow processes and P their banded precision matrix, S^-1 = (1 - H C H' / v) / v
-    with C = (P + H' H / v)^-1 and v the variance of the white noise. The steps of an encoder add a state of their own a sample, the error
-    of the reference's heading, whose differences are in the residual.
+    With r = white + H s, where s are the states of the slow processes and P their banded precision
+    matrix, S^-1 = (1 - H C H' / v) / v with C = (P + H' H / v)^-1 and v the variance of the white
+    noise. The steps of an encoder add a state for each sample, the error of the reference's
+    heading, whose differences are in the residual.
 
     """
 
@@ -152,7 +156,7 @@ class Whitening:
         return band.reshape(width + 1, count * width)
 
     def _add_encoder(self, band: np.ndarray, step: float, information: float) -> None:
-        """Add the error e of the reference's heading: uniform over a step, and in the residual by -(e[k] - e[k-1]) / interval."""
+        """Add the heading error e of the reference: residual -(e[k] - e[k-1]) / interval."""
         width, last, rate = self._states, self._states - 1, 1.0 / self._interval
         band[width, :, last] += 12.0 / step ** 2
         band[width, 1:, last] += information * rate ** 2
@@ -179,7 +183,7 @@ class Whitening:
 
 
 def spectrum(figures: NoiseFigures, count: int, interval: float) -> np.ndarray:
-    """Return the variance of the noise's components at the frequencies k / (2 T), k = 1 to n - 1, as those of white noise would have it."""
+    """Return the variances of the noise at k / (2 T), k = 1 to n - 1, scaled as of white noise."""
     angle = math.pi * np.arange(1, count) / count
     total = np.full(count - 1, figures.sample_deviation(interval) ** 2)
     for process in processes(figures, count, interval):
@@ -189,9 +193,10 @@ def spectrum(figures: NoiseFigures, count: int, interval: float) -> np.ndarray:
 
 def divergence(figures: NoiseFigures, expected: NoiseFigures, count: int, interval: float) -> float:
     """
-    Return how far a noise is from another, in standard deviations: the root of twice the information that tells them apart.
+    Return the distance of a noise from another, in standard deviations.
 
-    For a small change of one figure it is the change over its standard deviation.
+    It is the root of twice the information that distinguishes them. For a small change of one
+    figure it is the change over its standard deviation.
 
     """
     ratio = spectrum(figures, count, interval) / spectrum(expected, count, interval)

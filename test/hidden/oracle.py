@@ -11,7 +11,7 @@ from hidden.log import HiddenLog
 
 @dataclass(frozen=True)
 class OracleGain:
-    """Root mean squares of output less prediction, rad/s, and of its integral over windows, rad; before: best bias and scale alone."""
+    """Rms of output less prediction, rad/s, and of its integral over windows, rad."""
 
     rate_before: float
     rate_after: float

@@ -1,4 +1,4 @@
-"""Effects that the catalogue does not have: a diagnosis must say that something is left, and give it no name."""
+"""Effects outside the catalogue: a diagnosis must report a remainder, without a name."""
 
 from __future__ import annotations
 

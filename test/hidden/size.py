@@ -1,9 +1,10 @@
 """
-How large an effect must be so that it is found: the minimum detectable effect, and the size at a multiple of it.
+The minimum detectable effect, and the size at a multiple of it.
 
-``I = x' S^-1 x - x' S^-1 Z (Z' S^-1 Z)^-1 Z' S^-1 x`` for an effect's column x, with the nuisances Z, a bias of each recording and one
-scale; its standard deviation is 1 / sqrt(I), and `DETECTABLE` of them are found. An effect that is no column times a size has the size at
-which all that it adds, as it is, has the norm `DETECTABLE`: sqrt(x' S^-1 x - ...) for x the whole finite error.
+``I = x' S^-1 x - x' S^-1 Z (Z' S^-1 Z)^-1 Z' S^-1 x`` for an effect's column x, with the nuisances
+Z, a bias of each recording and one scale; its standard deviation is 1 / sqrt(I), and `DETECTABLE`
+of them are detected. A nonlinear effect has the size at which its whole finite error x has the
+norm `DETECTABLE`: sqrt(x' S^-1 x - ...).
 
 """
 
@@ -26,17 +27,16 @@ Columns = list[np.ndarray]  # of each recording, shape (n,)
 
 class Metric:
     """
-    The information of several recordings of one gyro about what it adds, beside a bias of each and one scale.
+    Information of recordings of one gyro on an effect, beside a bias of each and one scale.
 
     Parameters
     ----------
     sessions : the recordings
     figures : the noise
     encoder_step : of the reference's heading, rad
-
     thin : average so many samples to one first, which keeps what is slow
 
-    A nuisance whose value a model says ('bias', 'scale') can be left out of a question.
+    A nuisance known from a model ('bias', 'scale') can be left out.
 
     """
 
@@ -54,7 +54,7 @@ class Metric:
         return [whitening.solve(column) for whitening, column in zip(self._whitenings, columns)]
 
     def gram(self, several: list[Columns], without: Sequence[str] = ()) -> np.ndarray:
-        """Return the inner products of several columns, less what the nuisances explain, shape (m, m)."""
+        """Return the inner products of several columns, less the nuisances, shape (m, m)."""
         names = [name for name in self.nuisances if name.split()[0] not in without]
         several = [thinned(columns, self._thin) for columns in several]
         solved = [self.solve(columns) for columns in several]
@@ -83,7 +83,7 @@ def _inner(a: Columns, b: Columns) -> float:
 
 def solve_size(norm: Callable[[float], float], wanted: float, first: float, most: float) -> float:
     """
-    Return the size at which a norm that grows with the size has a wanted value; the largest size where it does not get there.
+    Return the size at which a norm that grows with it has a wanted value, or the largest size.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def solve_size(norm: Callable[[float], float], wanted: float, first: float, most
 
 
 def _by_powers(norm: Callable[[float], float], wanted: float, size: float, most: float) -> float | None:
-    """Go along a power of the size, which is the first for most effects; None where the norm is not as smooth as that."""
+    """Go along a power of the size, the first for most effects; None if the norm is not smooth."""
     value, power = norm(size), 1.0
     for _ in range(6):
         if abs(value / wanted - 1.0) < 3e-3:
@@ -130,7 +130,7 @@ def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float, mo
 
 def solve_noise(changed: Callable[[float], NoiseFigures], expected: NoiseFigures, wanted: float, sessions: list[Session],
                 first: float) -> float:
-    """Return by how much a figure of the noise must change so that all recordings together tell it by so many standard deviations."""
+    """Return the change of a noise figure that all recordings together detect at so many sigma."""
     def norm(change: float) -> float:
         each = [divergence(changed(change), expected, len(session.time), session.interval) for session in sessions]
         return math.sqrt(sum(value ** 2 for value in each))

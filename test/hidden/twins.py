@@ -1,4 +1,4 @@
-"""Twins: conditions under which two causes cannot be told apart, and those under which they can."""
+"""Twins: conditions under which two causes are confounded, and those that distinguish them."""
 
 from __future__ import annotations
 
@@ -107,11 +107,11 @@ def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *, 
 
 def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) -> HiddenLog:
     """
-    Record the same gyro again, under conditions that part the pair; what happens once does not happen again.
+    Record the gyro again, under conditions that distinguish the pair; single events do not recur.
 
     Raises
     ------
-    ValueError : no recording with this reference parts them
+    ValueError : no recording with this reference distinguishes them
 
     """
     twins, first = TWINS[pair], log.session
