@@ -87,7 +87,7 @@ def speed_table(rate: np.ndarray, repeats: int) -> str:
     return '\n'.join(lines)
 
 
-#: (angle random walk, bias instability, rate random walk), quantization, rate ramp: what records are simulated with.
+#: (angle random walk, bias instability, rate random walk), quantization, rate ramp, simulated.
 CASES = ((Noise(1e-3), 0.0, 0.0), (Noise(1e-3, 3e-4), 0.0, 0.0), (Noise(1e-3, 0.0, 1e-4), 0.0, 0.0), (Noise(1e-3, 3e-4, 3e-5), 0.0, 0.0),
          (Noise(1e-3, 3e-4, 2e-4), 0.0, 0.0), (Noise(1e-3), 3e-5, 0.0), (Noise(1e-3), 0.0, 3e-6))
 

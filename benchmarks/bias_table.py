@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
-from bias_history import answers, carried_answers, coverage, cubic, linear  # noqa: E402  the path is set just above
+from bias_history import answers, carried_answers, coverage, cubic, linear  # noqa: E402
 
 from gyro_calibration.log import DEGREE  # noqa: E402
 

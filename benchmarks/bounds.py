@@ -20,7 +20,7 @@ from gyro_calibration.motion import CALIBRATION
 
 #: Longest time that is one step of the filter, s.
 _BLOCK = 0.5
-#: Time constants, s, of the Gauss-Markov processes that sum up to flicker, and the ratio of neighbours.
+#: Time constants, s, of the Gauss-Markov processes whose sum is flicker; ratio of neighbours.
 _RATIO = math.sqrt(10.0)
 _CONSTANTS = 0.3 * _RATIO ** np.arange(10)
 #: Places in the state: correction of the heading, s, b; the flicker comes after them.
@@ -45,7 +45,7 @@ def _true_rate(drive: Drive) -> Array:
 def knows_rests(drive: Drive) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return heading and variance, live and with hindsight, of who knows when the robot rests."""
     mean, covariance = _calibrated(drive)
-    scale, mean[_SCALE] = 1.0 + mean[_SCALE], 0.0  # from here on the part of s that the calibration did not find
+    scale, mean[_SCALE] = 1.0 + mean[_SCALE], 0.0  # from here on the uncalibrated part of s
     rests = (drive.rate[1:] == 0.0) & (drive.rate[:-1] == 0.0)
     corners = _corners(drive.time, rests)
     output = integrate(drive.time, drive.output)

@@ -107,7 +107,7 @@ def side_by_side(count: int = 10 ** 7, repeats: int = 9) -> str:
     log = samples(count, np.random.default_rng(0))
     wanted = floor(*log)
     assert all(np.allclose(side(*log), wanted, rtol=0.0, atol=1e-9) for side in SIDES.values())
-    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()] for _ in range(repeats)])  # noqa: B023, it runs at once
+    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()] for _ in range(repeats)])  # noqa: B023
     medians, ratios = np.median(taken, axis=0), np.median(taken / taken[:, 1:2], axis=0)
     lines = [f'| {count:.0e} samples | million samples/s | time over the floor |', '|:---|---:|---:|']
     lines += [f'| {name} | {count / median / 1e6:.0f} | {ratio:.2f} |' for name, median, ratio in zip(SIDES, medians, ratios)]

@@ -66,7 +66,7 @@ NOISES = ('mixed', 'walk', 'flicker', 'white', 'gauss_markov')
 #: References in turn: a rate, a heading, and the heading of an encoder.
 REFERENCES = ('rate', 'heading', 'rate', 'encoder')
 ENCODER_STEP = 2.0 * math.pi / 65536
-#: What pairs are not made of: findings against a model only, and a wrong unit, in which all else has another size.
+#: Not in pairs: findings against a model only, and a wrong unit, which changes other sizes.
 ALONE = {*AGAINST_A_MODEL, 'unit_error'}
 #: So much of its multiple each of several effects must keep beside the others.
 LEFT = 0.8

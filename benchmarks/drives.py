@@ -44,8 +44,8 @@ def _gyro(name: str, interval: float, scale_factor_error: float, bias: float, wa
 
 GYROS = {
     'XV3500': Gyro('XV3500', XV3500, 0.01),
-    # Table I and the 10 Hz of section 5 of Ojeda, Chung and Borenstein: 5 (deg/h)/√Hz, 0.002 deg/s at constant temperature; of 2 % and
-    # 0.2 deg/s, both from end to end of the range of temperatures, one half
+    # Ojeda, Chung and Borenstein, Table I and 10 Hz of section 5: 5 (deg/h)/√Hz, 0.002 deg/s at
+    # constant temperature; half of 2 % and 0.2 deg/s, both over the range of temperatures
     'RD2100': _gyro('RD2100', 0.1, 0.01, 0.1, 5.0 / 60.0, 7.2),
     # round figures of the better ones that are sold, such as the ADIS16488
     'good MEMS': _gyro('good MEMS', 0.01, 0.01, 0.2, 0.3, 6.0),
@@ -142,7 +142,7 @@ def _rest(shortest: float, longest: float, generator: np.random.Generator) -> Ar
     return np.zeros(_count(generator.uniform(shortest, longest)))
 
 
-#: How often each kind of stretch comes, so that about half of the time the robot rests or goes straight.
+#: Probability of each kind of stretch; about half of the time the robot rests or goes straight.
 STRETCHES: tuple[tuple[float, Callable[[np.random.Generator], Array]], ...] = (
     (0.2, partial(_rest, 3.0, 20.0)), (0.2, partial(_rest, 0.2, 0.5)), (0.2, _straight), (0.3, _turn), (0.1, _slow_turn))
 

@@ -25,7 +25,8 @@ from gyro_calibration.noise import Noise, simulate_noise
 
 SCALE_FACTOR_ERROR, BIAS, STEP, INTERVAL = 0.02, 0.3 * DEGREE, 0.088 * DEGREE, 0.05
 WHITE, FLICKER, WALK = 0.3 * DEGREE / 60, 20 * DEGREE / 3600, 1.0 * DEGREE / 3600
-#: Noise, and how much the bias drifts with the temperature, rad/s, as the gyro warms up with a time constant of a third of the log.
+#: Noise, and drift of the bias with the temperature, rad/s, as the gyro warms up with a time
+#: constant of a third of the log.
 CASES = {'white': (Noise(WHITE), 0.0), 'white, flicker': (Noise(WHITE, FLICKER), 0.0),
          'white, rate random walk': (Noise(WHITE, 0.0, WALK), 0.0),
          'white, flicker, rate random walk': (Noise(WHITE, FLICKER, WALK), 0.0),

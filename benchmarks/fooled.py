@@ -159,7 +159,7 @@ def saturated(run: Run) -> Array:
 
 
 
-#: What the gyro's output was in, and was read as -> the factor that this makes, and what the refusal says of it.
+#: Unit of the gyro's output and unit assumed -> their ratio, and the text of the refusal.
 UNITS = {'deg/s read as rad/s': (1.0 / DEGREE, 'deg/s and read as rad/s'), 'rad/s read as deg/s': (DEGREE, 'rad/s and read as deg/s'),
          'mdeg/s read as deg/s': (1e3, 'thousandths'), 'mdeg/s read as rad/s': (1e3 / DEGREE, 'mdeg/s and read as rad/s'),
          'mrad/s read as rad/s': (1e3, 'thousandths'), 'mrad/s read as deg/s': (1e3 * DEGREE, 'mrad/s and read as deg/s'),

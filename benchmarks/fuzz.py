@@ -219,7 +219,7 @@ def _code_lines(file: str) -> Iterator[int]:
     while codes:
         code = codes.pop()
         codes += [each for each in code.co_consts if hasattr(each, 'co_code')]
-        if code.co_name not in ('<module>',) and code.co_flags & 2:  # optimized: a function, not the body of a class
+        if code.co_name not in ('<module>',) and code.co_flags & 2:  # a function, not a class
             yield from (line for _, _, line in code.co_lines() if line and line != code.co_firstlineno)
 
 

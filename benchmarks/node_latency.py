@@ -178,7 +178,7 @@ class Probe:
         return Block(self._latencies, count, load)
 
     def _serve_until(self, due: float) -> None:
-        # Waiting as `rclpy.wait_for_message` does it: an executor would need as much time here as the relay needs in all.
+        # Wait as `rclpy.wait_for_message` does; an executor takes as much time as the relay.
         while (left := due - time.monotonic()) > 0.0:
             self._wait_set.clear_entities()
             self._wait_set.add_subscription(self._subscription)

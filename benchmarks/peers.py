@@ -27,7 +27,8 @@ from gyro_calibration.model import SelfCalibration
 
 GRAVITY = 9.81
 
-#: From a drive, its rates, rad/s, the standard deviation of their bias, rad/s (None where not calibrated), and settings, to headings.
+#: (drive, rates, rad/s, standard deviation of their bias, rad/s, None where not calibrated,
+#: settings) -> headings
 Heading = Callable[[Drive, Array, 'float | None', Mapping[str, float]], Array]
 
 

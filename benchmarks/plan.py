@@ -58,7 +58,7 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
     generator = np.random.default_rng([11, seed])
     s, b = 0.03 * generator.standard_normal(), 0.5 * DEGREE * generator.standard_normal()
     before, run, drive = (round(length * RATE) for length in (BEFORE, motion.duration, DRIVE))
-    # the drive is at the end of the record, so that its noise is the same for motions of any length
+    # the drive is at the end of the record: same noise for motions of any length
     count = before + round(LENGTHS[-1] * RATE) + drive
     wander = simulate_noise(replace(XV3500.noise, angle_random_walk=0.0), count, 1.0 / RATE, generator)
     noise = wander + simulate_noise(Noise(XV3500.noise.angle_random_walk), count, 1.0 / RATE, generator)

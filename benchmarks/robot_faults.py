@@ -3,12 +3,13 @@ What misleads a robot that is calibrated: faults on the real stack, one row each
 
     python benchmarks/robot_faults.py [--tree DIRECTORY] [--only WORD]
 
-A compensation node in a process of its own drives a small robot (``test/robot.py``: 150 ms latency,
-0.2 s lag, 100 Hz) through `calibrate`. In mid-run, at 40 deg/s or more, the fault happens. A row tells
-how far the robot turned since, when the last command to turn was followed by a zero, what the
-heading was off by and the standard deviation that it claimed, the worst diagnostics since the fault
-and the answer of the service. ``--tree`` takes the node from another version of this project, also
-one with the interface of 0.1.0. All faults take 6 min; nothing leaves the machine.
+A compensation node in a process of its own drives a small robot (``test/robot.py``: 150 ms
+latency, 0.2 s lag, 100 Hz) through `calibrate`. In mid-run, at 40 deg/s or more, the fault
+happens. A row states the turn of the robot since, the time until the last command to turn was
+followed by a zero, the error of the heading and its stated standard deviation, the worst
+diagnostics since the fault and the answer of the service. ``--tree`` takes the node from another
+version of this project, also one with the interface of 0.1.0. All faults take 6 min; nothing
+leaves the machine.
 
 """
 
@@ -48,7 +49,7 @@ LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 @dataclass(frozen=True)
 class Interface:
-    """The names of one version: module of the node, place of its services, parameter that drives."""
+    """Names of one version: module of the node, place of its services, parameter that drives."""
 
     module: str
     services: str
@@ -180,7 +181,7 @@ class Stage:
             time.sleep(0.02)
 
     def row(self, name, others=()):
-        """Return what happened since the fault; `others` are rates that somebody else commanded."""
+        """Return what happened since the fault; `others` are rates commanded by others."""
         row, began = Row(name), self._began
         row.turned = math.degrees(self.robot.turned_since(began))
         row.still = abs(self.robot.robot.rate) > 0.01
@@ -198,7 +199,7 @@ class Stage:
         return row
 
     def _heading(self):
-        """Return what the heading of the node is off by since the start, and what it claims, deg."""
+        """Return the error of the node's heading since the start, and its stated sigma, deg."""
         heard, truth = list(self._heard), dict(self.robot.headings)
         error, claimed, turned, last, begin = math.nan, math.nan, 0.0, None, None
         for _, stamp, yaw, variance in heard:

@@ -57,7 +57,7 @@ SOAKED, SOAKED_RATE = 'kvh_1750', 1000.0  # Hz
 SMALLEST = 0.5  # rad/s; of a numbered sample
 CYCLE = 1 << 18  # samples, after which the number that a rate holds begins anew
 STEP = 2.0 ** -20  # rad/s a number; 16 times what the wire format resolves
-LEADING = -0.25  # rad/s; of samples that have no number yet, until the whole graph has found itself
+LEADING = -0.25  # rad/s; of samples without a number, until the whole graph is connected
 STRETCH = 2.0  # s, after which it turns the other way
 INTERVAL = 1.0  # s between looks at the processes
 LARGEST_RATE = 1000.0  # Hz; above it the driver is told to average
@@ -67,8 +67,8 @@ MODEL = GyroModel((Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), 1e-1
                   noise=Noise(angle_random_walk=2.4e-5, bias_instability=5e-6, rate_random_walk=1e-7))
 FINEST, RATIO = 1e-2, 1.02  # ms, and between the edges of the classes of latencies
 
-# What all processes of a run see: when to begin, and when to end early; when the first numbered sample was due, how many have been sent,
-# and the angle they turned; how many samples there were with those around them, and how many bytes nobody took.
+# Shared by all processes of a run: times of begin and early end; due time of the first numbered
+# sample, number of samples sent and their angle; number with those around them, and lost bytes.
 GO, BEGIN, SENT, ANGLE, ALL, LOST_BYTES = range(6)
 ENOUGH = 2.0  # in the place of GO
 
@@ -153,7 +153,7 @@ def gyro(given: argparse.Namespace) -> None:
     """Be the gyro until the samples end or a signal comes."""
     numbers = shared(given.folder)
     settings = settings_of(given.protocol, given.rate)
-    speed = 1.0 + 1e-9 if given.patient else 1.0  # what is faster than time is a replay, which waits for its reader
+    speed = 1.0 + 1e-9 if given.patient else 1.0  # faster than real time is a replay, which waits
     emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, speed, given.folder / 'port', wait_for_reader=True)
     signal.signal(signal.SIGINT, lambda *_: emulator.stop())
     emulate(emulator)

@@ -59,8 +59,8 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
     ends_blurred = name == 'dead_zone' and 'encoder_step' in reference
     assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(log, found)
     for measure, (mine, oracle) in won(log, found).items():
-        # gains are compared where they are more than what noise and the steps of an encoder make of the mean square of some blocks
-        # the oracle knows how fast the temperature changes; a thermometer of 1/16 K shows it in leaps
+        # gains are compared where they exceed the scatter by noise and encoder steps; the oracle
+        # knows the rate of the temperature, which a thermometer of 1/16 K shows in leaps
         blurred = measure == 'rate' and ('encoder_step' in reference or name == 'bias_temperature_rate')
         if oracle > {'rate': 0.01, 'heading': 1.0}[measure] and not blurred:
             assert mine > 0.8 * oracle, (measure, mine, oracle, told(log, found))
@@ -80,7 +80,7 @@ def test_effects_together_are_all_named(seed, names):
 
 
 def test_a_coarse_output_and_another_effect_are_both_named():
-    # what rounding does at a rate is foreseen by a straight line, which this is not: a companion along the rate may be left
+    # rounding is expected on a straight line, which this is not: one more along the rate may stay
     log, = hidden_in(('quantization', 'scale_factor_temperature'), 5.0, 5)
     found = diagnosis_of([log], np.random.default_rng(5))
     assert {'quantization', 'scale_factor_temperature'} <= set(names_of(found)), told(log, found)
@@ -90,7 +90,7 @@ def test_a_coarse_output_and_another_effect_are_both_named():
 @pytest.mark.parametrize('seed, noise', list(enumerate(KINDS)), ids=KINDS)
 def test_where_nothing_is_hidden_nothing_is_found(seed, noise, reference):
     log, = hidden_in([], 0.0, seed, noise, REFERENCES[reference])
-    # every other log is held against a model that is right, so that bias, scale factor and noise must fit as well
+    # every other log has a right model, so that bias, scale factor and noise must fit as well
     found = diagnosis_of([log], np.random.default_rng(seed), with_model=bool((seed + reference) % 2))
     assert judged_diagnosis(log, found, ENCODER).right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
@@ -113,7 +113,8 @@ def test_random_effects_are_found():
         log, = hide([name], 5.0, generator, noise=str(generator.choice(KINDS)), **SHORT)
         found = diagnosis_of([log], generator)
         wrong += [] if judged_diagnosis(log, found).right else [told(log, found)]
-    # at 5 times the minimum detectable effect it was right in 92 % (docs/benchmarks.md), and then 4 of 8 are wrong once in 500 runs
+    # right in 92 % at 5 times the minimum detectable effect (docs/benchmarks.md), so 4 of 8 are
+    # wrong once in 500 runs
     assert len(wrong) <= 3, '\n'.join(wrong)
 
 

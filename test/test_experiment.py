@@ -22,7 +22,8 @@ from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import from_rates
 from gyro_calibration.simulation import simulate
 
-#: In multiples of the minimum detectable effect: large ones are parted by their second order, slow ones are lost in wander.
+#: In multiples of the minimum detectable effect: large ones are distinguishable by their second
+#: order, slow ones are lost in wander.
 MULTIPLES = {('time_offset', 'bandwidth'): 30.0, ('bias_temperature_rate', 'thermal_hysteresis'): 2.0}
 
 
@@ -68,7 +69,8 @@ def names(named):
 
 # what is proposed for two causes that are given
 
-#: How a cause is put, with the shapes that its twin speaks for; and the experiments that may part the twins, in their order.
+#: Each cause with the shapes suggested by its twin; below, the experiments that may distinguish
+#: the twins, in their order.
 FIRST = {'time_offset': effect('time_offset', 0.03), 'bandwidth': effect('bandwidth', 0.03), 'sine_response': effect('sine_response', 0.19),
          'bias_temperature': effect('bias_temperature', 25.0), 'bias_temperature_rate': effect('bias_temperature_rate', 10.0),
          'thermal_lag': effect('thermal_lag', 18.0), 'thermal_hysteresis': effect('thermal_hysteresis', 3.0, 5e-4),
@@ -93,7 +95,8 @@ def put(name, hidden):
 def test_two_that_are_alike_are_parted_by_what_physics_would_have(pair):
     hidden = twin(pair, pair[0], seeded('proposed', *pair), multiple=MULTIPLES.get(pair), sample_rate=20.0)
     size = hidden.truth[pair[0]].size
-    # Some are found against a model only, and half a wave of temperature is easily taken for wander: there, no fit tells the values.
+    # Some are found against a model only, and half a wave of temperature looks like wander: there
+    # no fit determines the values.
     given = TWINS[pair].against_a_model or pair[1] == 'thermal_lag'
     alike = {'reference_scale': (-size,), 'thermal_lag': (-size / FIRST['thermal_lag'].shapes[0],)}
     known = Named(put(pair[0], hidden), (size,) if given else ())
@@ -141,7 +144,7 @@ def test_an_experiment_can_be_simulated(log):
     plan = next(each for each in menu(reach([whole]), [whole]) if each.name == 'reversals')
     simulated = simulate(GyroModel(()), from_rates(plan.time, plan.rate), 1.0 / (plan.time[1] - plan.time[0]))
     assert simulated.output == pytest.approx(plan.log().reference_rate, abs=1e-5)
-    assert plan.replay(np.random.default_rng(0)).duration == pytest.approx(60.0 * plan.minutes, rel=0.05)  # less what has no fast transform
+    assert plan.replay(np.random.default_rng(0)).duration == pytest.approx(60.0 * plan.minutes, rel=0.05)
 
 
 def test_a_cause_that_none_of_the_experiments_parts_is_said_to_stay():
@@ -156,9 +159,10 @@ def test_a_cause_that_none_of_the_experiments_parts_is_said_to_stay():
 
 #: Each experiment may leave a smaller set, with an experiment of its own.
 ROUNDS = 2
-#: Of two that show beside a model only, or that no experiment with this reference parts, there is nothing to search for.
+#: Without pairs that show against a model only: no experiment can distinguish those.
 SEARCHED = [pair for pair in TWINS if not TWINS[pair].against_a_model]
-#: Where generator and package mean something else by a channel, which shows in quick changes before the twins are parted.
+#: Generator and package define a channel differently, which shows in quick changes before the
+#: twins are distinguished.
 DIFFERENT = {
     ('scale_factor_asymmetry', 'vibration_rectification'):
         'the power of a vibration is a mean over a centred second in the one, and over the time before in the other',

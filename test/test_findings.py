@@ -83,7 +83,8 @@ def test_the_tables_are_of_the_recordings_that_are_diagnosed():
 @pytest.mark.parametrize('recording', RECORDINGS)
 def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     found = diagnosed(recording)
-    causes = sorted(found['findings'], key=lambda each: each['effect'])  # several of a kind stay in their order
+    # several of a kind stay in their order
+    causes = sorted(found['findings'], key=lambda each: each['effect'])
     written = sorted(((cause.strip('`'), *cells) for cause, *cells in CAUSES.get(recording, [])), key=lambda each: each[0])
     assert [each['effect'] for each in causes] == [name for name, *_ in written]
     for (name, size, instead), cause in zip(written, causes):

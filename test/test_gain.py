@@ -89,5 +89,5 @@ def test_intervals_of_what_is_won_hold_the_truth_for_few_parts(parts, shared):
         change = change_over(np.column_stack([before, after]) ** 2, np.ones(parts))
         low, high = change.interval
         inside += low <= np.hypot(1.0, 0.2) - np.hypot(shared, 0.2) <= high
-    # Few squares of one number each are skew, which takes some in a hundred; blocks drawn anew would hold it in 62 to 86 of 100.
+    # Few squares are skew, which costs some per cent; resampled blocks cover 62 to 86 of 100.
     assert inside > 0.86 * runs, inside / runs

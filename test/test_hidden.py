@@ -107,7 +107,7 @@ def test_a_detectable_effect_is_found_with_the_promised_scatter_and_power(genera
     estimates = gram[0, 1:] / gram[0, 0]
     assert np.std(estimates) / scale == pytest.approx(cause.standard_deviation / scale, rel=0.25)
     assert np.mean(estimates) / scale == pytest.approx(cause.size / scale, abs=0.1)
-    # one-sided beyond 3.5 standard deviations: the power at 4.8 is 0.90, and 150 trials scatter by 0.025
+    # one-sided beyond 3.5 sigma: the power at 4.8 is 0.90, and 150 trials scatter by 0.025
     assert np.mean(np.abs(estimates) > 3.5 * cause.standard_deviation) > 0.8
 
 

@@ -284,7 +284,7 @@ def test_sizes_are_in_the_units_of_people():
     (0.0201, (0.0198, 0.0204), 's', '20.10 (19.80 to 20.40) ms'),
     (-0.0123, (-0.0130, -0.0116), '1', '−1.230 (−1.300 to −1.160) %'),
     (1.5e-5, (1e-5, 2e-5), '1', '15.0 (10.0 to 20.0) ppm'),
-    (-2.1e-3, (-2.4e-3, -1.8e-3), 's²/rad²', '−6.40 (−7.31 to −5.48) × 10⁻⁷ s²/deg²'),  # (pi / 180)² of it
+    (-2.1e-3, (-2.4e-3, -1.8e-3), 's²/rad²', '−6.40 (−7.31 to −5.48) × 10⁻⁷ s²/deg²'),
     (np.pi / 180.0, (0.0, np.pi / 90.0), '(rad/s)/(m/s²)', '1.0 (0.0 to 2.0) (deg/s)/(m/s²)'),
     (1.0, (0.9, 1.1), 's/rad', '0.0175 (0.0157 to 0.0192) s/deg'),
     (0.1, (0.1, 0.1), 'V', '0.1 V'), (0.5, (-np.inf, np.inf), 'Hz', '0.5 (−∞ to ∞) Hz')])
@@ -420,7 +420,7 @@ def path(made, tmp_path_factory):
     return path
 
 
-#: Elements that reach beyond the right edge of the screen, other than within a box that scrolls by itself.
+#: Elements that reach beyond the right edge of the screen, except inside scrolling boxes.
 BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest(".scroll, svg") && '
           'each.getBoundingClientRect().right > innerWidth + 0.5).map(each => each.outerHTML.slice(0, 80))')
 
@@ -469,7 +469,7 @@ def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
     temperatures = []
     browser.tell('[...document.querySelectorAll("figure")].find(each => '
                  'each.textContent.startsWith("Residual along temperature")).id = "thermal"')
-    for part in (46.0 / 360.0, 195.0 / 360.0, 344.0 / 360.0):  # left end, middle and right end of the axis
+    for part in (46.0 / 360.0, 195.0 / 360.0, 344.0 / 360.0):  # left end, middle, right end
         browser.point('#thermal > svg', part)
         temperatures.append(float(browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
     assert temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51 and temperatures[2] == 41.0
@@ -506,7 +506,7 @@ def test_arrow_keys_read_values_too(browser, whole_path):
     assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith(f'time {first} s')
 
 
-#: The least contrast of any text, and of any stroke, with what lies behind it (WCAG 2, 1.4.3 and 1.4.11).
+#: Least contrast of any text and any stroke with its background (WCAG 2, 1.4.3 and 1.4.11).
 CONTRAST = """(() => {
   const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number).map(each => each / 255)
     .map(each => each > 0.04045 ? ((each + 0.055) / 1.055) ** 2.4 : each / 12.92); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };

@@ -276,7 +276,7 @@ def test_of_the_recorded_table_the_sine_and_the_warm_scale_factor_are_named(data
     assert [members(finding) for finding in found.findings] == [{'sine_response', 'cubic_nonlinearity'}, {'scale_factor_temperature'}]
     assert found.gain.rate.before == pytest.approx(0.67 * DEGREE, rel=0.03) and found.gain.rate.after < 0.051 * DEGREE
     assert '186 deg/s' in found.findings[0].separate_by
-    # Single rates have errors of their own, a fifth of what is left, which neither effect nor polynomial explains.
+    # Errors of single rates, a fifth of the residual, fit neither an effect nor a polynomial.
     assert [each.along for each in found.unexplained] == ['single_rates'] and 0.15 < found.unexplained[0].share_of_variance < 0.25
 
 

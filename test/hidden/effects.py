@@ -28,7 +28,7 @@ Shapes = dict[str, float]
 
 #: What is a finding only beside a model that says otherwise.
 AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk', 'bias_instability', 'rate_random_walk')
-#: What is counted, and how many of them are just detectable: enough that chance does not make them.
+#: Counted effects, and the number that is just detectable: more than occur by chance.
 COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
 #: Steps that are sized by the variance that they add, which a test of the variance would just see.
 STEPPED = ('quantization', 'reference_quantization')

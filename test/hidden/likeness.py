@@ -12,7 +12,7 @@ from hidden.motion import Session
 from hidden.noise import NoiseFigures
 from hidden.size import Columns, Metric, thinned
 
-#: A reference may slip at any moment, and a tone has any frequency: enough of them explain anything.
+#: A slip has any time, and a tone any frequency: enough of them explain anything.
 ANYTHING = {'reference_slip', 'interference_tone'}
 #: Samples that are averaged to one: what looks alike in fifths of a second looks alike.
 THIN = 10

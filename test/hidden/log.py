@@ -28,10 +28,10 @@ from hidden.size import DETECTABLE, Metric, solve_noise, solve_size
 #: Recordings -> name of an effect -> what of it is not to be random.
 Given = Callable[[list[Session]], Mapping[str, Shapes]]
 ALL: Mapping[str, Form] = {**FORMS, **OUTSIDE}
-#: Share of an effect outside the catalogue that no effect in it may explain, and how often its shapes are drawn for that.
+#: Largest share of an outside effect that one in the catalogue may explain, and draws for that.
 MOST_ALIKE = 0.25
 DRAWS = 30
-#: Bias of a gyro and its scatter from one power-on to the next, rad/s, and the largest scale factor error.
+#: Bias of a gyro and its power-on to power-on scatter, rad/s, and the largest scale factor error.
 BIAS, BIAS_SPREAD, SCALE = 3e-3, 3e-4, 0.02
 
 
@@ -182,10 +182,11 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
 
     Parameters
     ----------
-    names : of effects in `FORMS` or `OUTSIDE`; none is a gyro with bias, scale factor error and noise alone
+    names : of effects in `FORMS` or `OUTSIDE`; without any, bias, scale error and noise alone
     multiple : of the minimum detectable effect, one for all or by name
     generator : source of all that is random
-    noise : white, walk, flicker, gauss_markov or mixed (random walk, Gauss-Markov process, and flicker in every other)
+    noise : white, walk, flicker, gauss_markov or mixed (random walk, Gauss-Markov process, and
+        flicker in every other)
     reference : rate, heading or both
     duration, sample_rate : of each recording, s and Hz
     runs : recordings of the one gyro, each after a power-on of its own
@@ -327,7 +328,7 @@ def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, s
         return Cause(name, UNIT_FACTORS.get(kind, 1.0), shapes, form.unit, math.nan, math.nan)
     count = sum(len(each.time) for each in sizing.sessions)
     extra = DETECTABLE * math.sqrt(2.0 / count) * sizing.gyro.figures.sample_deviation(interval) ** 2
-    # a step q adds q² / 12 to the variance; a heading's, differenced, twice that over the interval squared
+    # a step q adds q² / 12 to the variance; differences of headings twice that / interval²
     least = math.sqrt(12.0 * extra) if name == 'quantization' else math.sqrt(6.0 * extra) * interval
     return Cause(name, multiple * least, {}, form.unit, least, multiple)
 

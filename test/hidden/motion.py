@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from hidden.filters import lag
 
-#: Knots of the rate, s. A cubic B-spline through them is exactly zero at rest, and its integral is exact.
+#: Knots of the rate, s. A cubic B-spline through them is zero at rest, and its integral is exact.
 KNOT = 0.05
 GRAVITY = 9.81
 

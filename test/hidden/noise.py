@@ -21,7 +21,8 @@ from hidden.filters import autoregression
 
 #: Between the time constants of the ladder that makes flicker.
 STEP_OF_LADDER = 4.0
-#: Bias instability B whose Allan floor is the peak of a Gauss-Markov process of standard deviation 1: 0.437 sqrt(2) / 0.664.
+#: Bias instability B whose Allan floor equals the peak of a Gauss-Markov process of standard
+#: deviation 1: 0.437 sqrt(2) / 0.664.
 FLOOR_OF_GAUSS_MARKOV = 0.437 * math.sqrt(2.0) / math.sqrt(2.0 * math.log(2.0) / math.pi)
 KINDS = ('white', 'walk', 'flicker', 'gauss_markov', 'mixed')
 
@@ -96,7 +97,7 @@ def processes(figures: NoiseFigures, count: int, interval: float) -> list[Markov
     if figures.correlated:
         found.append(_stationary(figures.correlated, figures.correlation_time, interval))
     if figures.bias_instability:
-        # integrated over ln(time constant), processes of variance v a factor e have the spectrum v / (2 f)
+        # processes of variance v per factor e of the time constant have the spectrum v / (2 f)
         each = figures.bias_instability * math.sqrt(math.log(STEP_OF_LADDER) / math.pi)
         rungs = math.ceil(math.log(16.0 * count) / math.log(STEP_OF_LADDER))
         found += [_stationary(each, 0.5 * interval * STEP_OF_LADDER ** rung, interval) for rung in range(rungs)]
@@ -141,7 +142,8 @@ class Whitening:
     def _precision(self, slow: list[Markov], encoder_step: float) -> np.ndarray:
         """Return P + H' H / v, upper banded, the states of one sample side by side."""
         width, count, information = self._states, self._count, 1.0 / self._variance
-        band = np.zeros((width + 1, count, width))  # band[width - d, k, j]: with the state d places before state j of sample k
+        # band[width - d, k, j]: with the state d places before state j of sample k
+        band = np.zeros((width + 1, count, width))
         for place, process in enumerate(slow):
             inner = 1.0 / process.innovation ** 2
             band[width, :, place] = inner * (1.0 + process.factor ** 2)
@@ -164,7 +166,7 @@ class Whitening:
         band[0, 1:, last] -= information * rate ** 2
         for place in range(self._slow):
             band[width - last + place, 1:, last] -= information * rate  # with e of the same sample
-            band[width - 1 - place, 1:, place] += information * rate    # with e of the sample before
+            band[width - 1 - place, 1:, place] += information * rate  # of the sample before
 
     def solve(self, signal: np.ndarray) -> np.ndarray:
         """Return S^-1 times a signal of shape (n,)."""
