@@ -1,4 +1,4 @@
-"""From dwells to a gyro's model: the values of given effects, how well they are known, and how well they predict sweeps left out."""
+"""From dwells to a gyro's model: values of effects, covariance and errors of left-out sweeps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gyro_calibration.scatter import (
     summed,
 )
 
-#: Beyond this condition number of the columns, each of length one, the data do not part the effects.
+#: Beyond this condition number of the columns, each of length one, the effects are not separable.
 LARGEST_CONDITION = 1e3
 
 
@@ -55,11 +55,12 @@ class Calibration:
     dwells : all of them
     scatter : of the dwells, and which were fitted
     residual : error of each dwell that the effects do not explain, rad/s, shape (n,)
-    left_out : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying dwells, infinite where nothing predicts it
+    left_out : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying
+        dwells, infinite where the other sweeps do not determine it
     deviation : standard deviation of each dwell, rad/s, shape (n,)
     condition : number of the columns, each of length one
     freedom : dwells less fitted values
-    misfit : sum of the whitened squared residuals; about `freedom` where the effects are all there is
+    misfit : sum of the whitened squared residuals; about `freedom` where no effect is missing
 
     """
 
@@ -80,31 +81,40 @@ class Calibration:
 
     @cached_property
     def model(self) -> GyroModel:
-        """Return effects with values, covariance and valid range; 1.96 standard deviations hold 95 %."""
+        """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
         used = take(self.dwells, self.scatter.kept)
         columns, residual = _forward(used, self.terms)
         covariance = self._uncertainty(columns, residual).covariance() if self.freedom else None
         return _model(used, self.terms, covariance)
 
     def chance_of(self, effect: Effect) -> float:
-        """Return how likely the dwells would show as much of an effect, either way, where there is nothing of it."""
+        """Return the two-sided probability of as much of an effect where there is none."""
         used = take(self.dwells, self.scatter.kept)
         term = next(each for each in self.terms if each.effect is effect)
         if not self.freedom or not np.any(term.error(channels_of(used))):
             return 1.0
         others = [each for each in self.terms if each is not term]
-        # What it adds as a whole, not its derivative by a shape: near nothing, that of a sine's is nothing too.
-        columns = [*columns_of(used, others).T, term.error(channels_of(used))] if others else [term.error(channels_of(used))]
-        below = float(self._uncertainty(np.column_stack(columns), self.residual[self.scatter.kept]).below(-1.0)[-1])
+        # The whole effect, not its derivative by a shape: near zero, that of a sine vanishes too.
+        columns = ([*columns_of(used, others).T, term.error(channels_of(used))] if others
+                   else [term.error(channels_of(used))])
+        below = float(self._uncertainty(np.column_stack(columns),
+                                        self.residual[self.scatter.kept]).below(-1.0)[-1])
         return 2.0 * min(below, 1.0 - below)
 
     def _uncertainty(self, columns: Array, residual: Array) -> Uncertainty:
-        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns, residual)
+        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns,
+                              residual)
 
     @property
     def folded_beyond(self) -> float | None:
-        """Return the slowest rate of a dwell, rad/s, beyond which the output does not grow with the rate; None where it always does."""
-        folded = self.model.steepness(channels_of(self.dwells)) + np.zeros(len(self.dwells)) <= 0.1
+        """
+        Return the slowest rate of a dwell, rad/s, at which the output no longer grows with it.
+
+        None where the output always grows with the rate.
+
+        """
+        folded = (self.model.steepness(channels_of(self.dwells)) + np.zeros(len(self.dwells))
+                  <= 0.1)
         return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
 
     @property
@@ -123,7 +133,7 @@ class Calibration:
         return rms(self.left_out[self.scatter.kept])
 
     def predicted_misfit(self) -> float:
-        """Return the mean over the sweeps of the mean squared error when the sweep is left out, in variances of a dwell."""
+        """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
         parts = parts_of(take(self.dwells, self.scatter.kept))
         squares = (self.left_out / self.deviation)[self.scatter.kept] ** 2
         return float(np.mean(summed(squares, parts) / np.bincount(parts)))
@@ -131,18 +141,21 @@ class Calibration:
 
 def channels_of(dwells: Dwells) -> Channels:
     """Return what the effects look at."""
-    temperature = np.full(len(dwells), np.nan) if dwells.temperature is None else dwells.temperature
+    temperature = (np.full(len(dwells), np.nan) if dwells.temperature is None
+                   else dwells.temperature)
     return Channels(dwells.rate, dwells.output, temperature)
 
 
 # the fit
 
-def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | None = None) -> Calibration:
+def fit_effects(dwells: Dwells, effects: Sequence[Effect],
+                scatter: Scatter | None = None) -> Calibration:
     """
     Fit effects to dwells by generalised least squares, solved by QR.
 
-    Effects of the rate look at the reference rate. The polynomial of Ojeda et al. (eq. 9 to 12) looks at the output, which does no harm
-    where the output is an average. A shape is found by Gauss-Newton steps from the best of a grid over its bounds.
+    Effects of the rate look at the reference rate. The polynomial of Ojeda et al. (eq. 9 to 12)
+    looks at the output, which does no harm where the output is an average. A shape is found by
+    Gauss-Newton steps from the best of a grid over its bounds.
 
     Parameters
     ----------
@@ -157,7 +170,8 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
 
     """
     _refuse_unseen(dwells, effects)
-    terms = tuple(Term(effect, tuple(_start(parameter, dwells) for parameter in effect.parameters)) for effect in effects)
+    terms = tuple(Term(effect, tuple(_start(parameter, dwells) for parameter in effect.parameters))
+                  for effect in effects)
     _refuse_few(dwells, terms)
     scatter = scatter or find_scatter(dwells)
     used = take(dwells, scatter.kept)
@@ -167,7 +181,7 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter | No
 
 
 def _start(parameter: Parameter, dwells: Dwells) -> float:
-    """Return a value to begin with; those of conventions, such as the temperature to count from, stay."""
+    """Return a start value; conventions, such as the reference temperature, are final."""
     temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
     conventions = {
         'reference_temperature': round(float(temperature.mean()), 1),
@@ -193,45 +207,50 @@ def columns_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
 
 def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
     """
-    Return what the output at the reference rate changes by for each fitted value, shape (n, m), and output less that of the model.
+    Return the columns, shape (n, m), and residual of the output at the reference rate.
 
-    The polynomial looks at the output. With the measured one among the columns, a scale factor error of -1 would make every residual
-    nothing, whatever sweeps share, and the likelihood of a large scatter of their scale would win: the Jacobian of output against error
-    is missing there. Here columns and residual are those of the output, at what the model expects of it: ``Δoutput = Δerror / (1 - g)``
-    with ``g`` the slope of the error over the output.
+    The columns are the change of the output for each fitted value; the residual is the output less
+    that of the model. The polynomial looks at the output. With the measured one among the columns,
+    a scale factor error of -1 would make every residual zero, whatever sweeps share, and the
+    likelihood would prefer a large scatter of their scale: the Jacobian of output against error is
+    missing there. Columns and residual are therefore those at the expected output:
+    ``Δoutput = Δerror / (1 - g)`` with ``g`` the slope of the error over the output.
 
     """
     model, channels = GyroModel(tuple(terms)), channels_of(dwells)
     if not model.looks_at('output'):
         return columns_of(dwells, terms), error_of(dwells, terms)
     expected, step = model.output_in(channels), 1e-5
-    below, here, above = (channels.moving(channels.rate, expected + change) for change in (-step, 0.0, step))
+    below, here, above = (channels.moving(channels.rate, expected + change)
+                          for change in (-step, 0.0, step))
     slope = (model.error(above) - model.error(below)) / (2.0 * step)
     columns = np.column_stack([row for term in terms for row in term.sensitivity(here)])
     return columns / np.maximum(1.0 - slope, 0.1)[:, None], dwells.output - expected
 
 
 def _search(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
-    """Set every fitted shape to the best of a grid over its bounds, the others being as they are."""
+    """Set each fitted shape in turn to the best of a grid over its bounds."""
     for number, term in enumerate(terms):
         for place in term.fitted:
             if place < len(term.effect.shapes):
                 grid = np.geomspace(*term.effect.shapes[place].bounds, 60).tolist()
-                tried = [(*terms[:number], _with(term, place, value), *terms[number + 1:]) for value in grid]
+                tried = [(*terms[:number], _with(term, place, value), *terms[number + 1:])
+                         for value in grid]
                 terms = min(tried, key=lambda each: _linear_misfit(dwells, each))
     return terms
 
 
 def _with(term: Term, place: int, value: float) -> Term:
     low, high = term.effect.parameters[place].bounds
-    return replace(term, values=(*term.values[:place], min(max(value, low), high), *term.values[place + 1:]))
+    return replace(term, values=(*term.values[:place], min(max(value, low), high),
+                                 *term.values[place + 1:]))
 
 
 def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
     """Return the sum of squares that is left when the coefficients, not the shapes, are fitted."""
     channels = channels_of(dwells)
-    columns = [term.columns(channels)[place - len(term.effect.shapes)] for term in terms for place in term.fitted
-               if place >= len(term.effect.shapes)]
+    columns = [term.columns(channels)[place - len(term.effect.shapes)]
+               for term in terms for place in term.fitted if place >= len(term.effect.shapes)]
     error = error_of(dwells, terms)
     matrix = np.column_stack([*columns, np.zeros(len(dwells))])
     return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
@@ -241,7 +260,8 @@ def _solve(dwells: Dwells, terms: tuple[Term, ...], whitener: Whitener) -> tuple
     """Take Gauss-Newton steps; where only coefficients are fitted the first is the solution."""
     for _ in range(20):
         orthogonal, triangle, lengths = _factor(dwells, terms, whitener)
-        step = solve_triangular(triangle, orthogonal.T @ whitener.whiten(error_of(dwells, terms))) / lengths
+        step = solve_triangular(
+            triangle, orthogonal.T @ whitener.whiten(error_of(dwells, terms))) / lengths
         terms = _moved(terms, step)
         if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
             break
@@ -257,7 +277,8 @@ def _moved(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
     return tuple(moved)
 
 
-def _factor(dwells: Dwells, terms: Sequence[Term], whitener: Whitener) -> tuple[Array, Array, Array]:
+def _factor(dwells: Dwells, terms: Sequence[Term],
+            whitener: Whitener) -> tuple[Array, Array, Array]:
     """Return Q and R of the whitened columns, each of length one, and their lengths before."""
     columns = whitener.whiten(columns_of(dwells, terms))
     lengths = np.linalg.norm(columns, axis=0)
@@ -269,23 +290,28 @@ def _factor(dwells: Dwells, terms: Sequence[Term], whitener: Whitener) -> tuple[
 
 # what a fit shows
 
-def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter, whitener: Whitener) -> Calibration:
+def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
+                 whitener: Whitener) -> Calibration:
     used = take(dwells, scatter.kept)
     orthogonal, triangle, lengths = _factor(used, terms, whitener)
     whitened = whitener.whiten(error_of(used, terms))
     left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
-    left_out[scatter.kept], deviation[scatter.kept] = _left_out(orthogonal, whitened, whitener), whitener.deviation
-    return Calibration(terms, dwells, scatter, error_of(dwells, terms), left_out, deviation, float(np.linalg.cond(triangle)),
-                       len(used) - len(lengths), float(whitened @ whitened))
+    left_out[scatter.kept], deviation[scatter.kept] = (_left_out(orthogonal, whitened, whitener),
+                                                       whitener.deviation)
+    return Calibration(terms, dwells, scatter, error_of(dwells, terms), left_out, deviation,
+                       float(np.linalg.cond(triangle)), len(used) - len(lengths),
+                       float(whitened @ whitened))
 
 
 def _left_out(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
-    """Return what a fit without its sweep leaves of each dwell's error: the deleted residuals, block by block."""
+    """Return each dwell's residual of a fit without its sweep: the deleted residuals."""
     parts = whitener.parts
-    rest = np.eye(orthogonal.shape[1]) - summed(orthogonal[:, :, None] * orthogonal[:, None, :], parts)
+    rest = np.eye(orthogonal.shape[1]) - summed(orthogonal[:, :, None] * orthogonal[:, None, :],
+                                                parts)
     alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9  # only this sweep shows some value
     rest[alone] = np.eye(len(rest[0]))
-    changes = np.linalg.solve(rest, summed(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
+    changes = np.linalg.solve(
+        rest, summed(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
     left_out = whitened + np.einsum('nm,nm->n', orthogonal, changes[parts])
     return np.where(alone[parts], math.inf, whitener.restore(left_out))
 
@@ -293,8 +319,10 @@ def _left_out(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
 def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
     outputs, temperatures = dwells.output, dwells.temperature
     middle = 25.0 if temperatures is None else round(float(temperatures.mean()), 1)
-    temperature_range = (-math.inf, math.inf) if temperatures is None else (float(temperatures.min()), float(temperatures.max()))
-    return GyroModel(terms, covariance, (float(outputs.min()), float(outputs.max())), temperature_range, middle)
+    temperature_range = ((-math.inf, math.inf) if temperatures is None
+                         else (float(temperatures.min()), float(temperatures.max())))
+    return GyroModel(terms, covariance, (float(outputs.min()), float(outputs.max())),
+                     temperature_range, middle)
 
 
 # refusals
@@ -302,7 +330,8 @@ def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) ->
 def _refuse_few(dwells: Dwells, terms: Sequence[Term]) -> None:
     values = sum(len(term.fitted) for term in terms)
     if len(dwells) < values:
-        raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; add dwells, or fit fewer effects')
+        raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; '
+                          'add dwells, or fit fewer effects')
 
 
 def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
@@ -311,24 +340,30 @@ def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
         return
     unseen = f'{", ".join(thermal)} cannot be seen'
     if dwells.temperature is None:
-        raise EffectsNotParted(f'{unseen}: the log holds no temperature; record temperature_degc too', thermal)
+        raise EffectsNotParted(f'{unseen}: the log holds no temperature; '
+                               'record temperature_degc too', thermal)
     spread = float(np.ptp(dwells.temperature))
     if spread < SMALLEST_TEMPERATURE_SPREAD:
-        raise EffectsNotParted(f'{unseen}: the temperature varies by {spread:.2g} K, wanted at least {SMALLEST_TEMPERATURE_SPREAD:g} K; '
+        raise EffectsNotParted(f'{unseen}: the temperature varies by {spread:.2g} K, wanted at '
+                               f'least {SMALLEST_TEMPERATURE_SPREAD:g} K; '
                                'repeat the rates at another temperature', thermal)
 
 
 def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
-    """Return the refusal that names the effects whose columns add up to nearly nothing, and what would part them."""
+    """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
     direction = np.abs(np.linalg.svd(triangle)[2][-1])
     owners = [term.effect for term in terms for _ in term.fitted]
     alike = [effect for effect in dict.fromkeys(owners)
-             if max(size for size, owner in zip(direction, owners) if owner is effect) > 0.1 * direction.max()]
+             if max(size for size, owner in zip(direction, owners) if owner is effect)
+             > 0.1 * direction.max()]
     names = [effect.name for effect in alike]
     if len(names) == 1:
-        return EffectsNotParted(f'{names[0]} cannot be determined from these dwells; {alike[0].shown_by}', names)
-    advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1] if effect.shown_by))
-    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be parted; {advice}, or leave one out', names)
+        return EffectsNotParted(f'{names[0]} cannot be determined from these dwells; '
+                                f'{alike[0].shown_by}', names)
+    advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1]
+                                     if effect.shown_by))
+    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be parted; '
+                            f'{advice}, or leave one out', names)
 
 
 # looking at it
@@ -358,17 +393,20 @@ class Bin:
 
 
 def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
-    """Return the errors over one quantity, shape (n,), in bins of equal width that hold something."""
+    """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
     edges = np.linspace(values.min(), values.max(), min(most, len(np.unique(values))) + 1)
     place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
     chosen = [(place == number) & fit.scatter.kept for number in range(len(edges) - 1)]
-    return [_bin(fit, float(low), float(high), part) for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
+    return [_bin(fit, float(low), float(high), part)
+            for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
 
 
 def _bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
     part, residual = take(fit.dwells, chosen), fit.residual[chosen]
     # What a sweep shares does not average out within it.
     sweeps = np.unique(part.sweep, return_inverse=True)[1]
-    variance = np.sum(fit.deviation[chosen] ** 2) + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2)
+    variance = (np.sum(fit.deviation[chosen] ** 2)
+                + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2))
     before = float((part.output - part.rate).mean())
-    return Bin(low, high, len(part), before, float(residual.mean()), math.sqrt(float(variance)) / len(part), rms(residual))
+    return Bin(low, high, len(part), before, float(residual.mean()),
+               math.sqrt(float(variance)) / len(part), rms(residual))

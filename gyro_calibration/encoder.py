@@ -1,7 +1,8 @@
 """
-Calibrate against an encoder: a log in time with a reference heading -> scale factor error and bias, and what heading is left wrong.
+Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
 
-Two ways: the likelihood of the headings themselves, and the regression of the encoder's rate on the gyro, sample by sample.
+The input is a log in time with a reference heading. There are two methods: the likelihood of the
+headings, and the regression of the encoder's rate on the gyro, sample by sample.
 
 """
 
@@ -39,7 +40,7 @@ class Residual:
 
     Attributes
     ----------
-    heading : rad, shape (n,); its mean is 0, as nobody knows where the gyro began
+    heading : rad, shape (n,); its mean is 0, as the gyro's first heading is not known
 
     """
 
@@ -63,10 +64,11 @@ class Drift:
 
     Attributes
     ----------
-    time, rate : middles of the intervals between pieces of the log, s, and how the heading drifts there, rad/s, shape (m,)
+    time, rate : middles of the intervals between pieces of the log, s, and the drift of the
+        heading there, rad/s, shape (m,)
     angle_random_walk : rad/√s, over times longer than a piece
     mean : standard deviation of the mean bias over the log, rad/s
-    wander : standard deviation of what the mean bias differs by from the bias at the beginning, rad/s
+    wander : standard deviation of the mean bias less the bias at the beginning, rad/s
 
     """
 
@@ -80,17 +82,17 @@ class Drift:
 @dataclass(frozen=True)
 class EncoderCalibration:
     """
-    What a log with a reference heading says of a gyro.
+    The calibration of a gyro by a log with a reference heading.
 
     Attributes
     ----------
-    model : scale factor error and bias with their covariance, the ranges and the temperature that they were found at
+    model : scale factor error and bias with their covariance, valid ranges and temperature
     method : one of `METHODS`
     fit : the same with noise and time offset, as found
-    drift : what is left of the bias, and of its standard deviation what its wander is
+    drift : of the bias after the fit; the wander is part of the bias's standard deviation
     time : of the reference's samples, s, shape (n,)
     before, after : the residual heading without calibration and with it
-    lost_samples : so many are missing between the stamps, as far as these are regular enough to tell
+    lost_samples : number missing between the stamps, where these are regular enough to tell
     remarks : what to know, one sentence each
 
     """
@@ -107,18 +109,20 @@ class EncoderCalibration:
 
 
 def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None = None,
-                      limits: Limits | None = None, technology: str = 'mems') -> EncoderCalibration:
+                      limits: Limits | None = None,
+                      technology: str = 'mems') -> EncoderCalibration:
     """
     Find scale factor error and bias from a log with a reference heading.
 
     Parameters
     ----------
     log : with time, output and reference heading; samples without a number count as lost
-    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the encoder's rate on the gyro; None for
-        'course' where the reference is one, else 'likelihood'
+    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
+        encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
     noise : of the gyro, if it is known; goes into the model
     limits : what is believed
-    technology : of the gyro, one of `course_over_ground.PRIORS`; decides with 'course' what a drive leaves open
+    technology : of the gyro, one of `course_over_ground.PRIORS`; with 'course' its prior decides
+        what a drive leaves open
 
     Raises
     ------
@@ -138,49 +142,60 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     _refuse_useless(fit.bias, drift.mean, limits.heading)
     fit = _drawn(replace(fit, covariance=_covariance(fit, drift)), drift.mean, technology)
     _refuse_uncertain(fit, limits)
-    before, after = _residual(time - np.nan_to_num(fit.time_offset), output, motion), _after(time, output, motion, fit)
+    before, after = (_residual(time - np.nan_to_num(fit.time_offset), output, motion),
+                     _after(time, output, motion, fit))
     model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
-    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time), _remarks(fit, method))
+    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time),
+                              _remarks(fit, method))
 
 
-def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Noise | None, technology: str) -> EncoderCalibration:
+def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Noise | None,
+               technology: str) -> EncoderCalibration:
     """Calibrate against a course over ground."""
     _refuse_length(motion)
     refuse_dead(output)
     fit = fit_course(time, output, motion, technology)
-    before, after = _residual(time - fit.time_offset, output, motion), _after(time, output, motion, fit)
+    before, after = (_residual(time - fit.time_offset, output, motion),
+                     _after(time, output, motion, fit))
     drift = _drift(motion.time, after.heading, noise or Noise())
     model = _model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
-    remark = (f'what the drive leaves open of scale factor error and bias is drawn towards zero, as of a gyro of the technology '
-              f'{technology} (--technology); the intervals hold that')
-    return EncoderCalibration(model, 'course', fit, drift, motion.time, before, after, _lost(time), (remark,))
+    remark = ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
+              f'as of a gyro of the technology {technology} (--technology); '
+              'the intervals hold that')
+    return EncoderCalibration(model, 'course', fit, drift, motion.time, before, after, _lost(time),
+                              (remark,))
 
 
-#: Gyro and encoder on one host are no further apart, s; a swing may look alike half a period later.
+#: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
 LARGEST_TIME_OFFSET = 0.25
 #: Standard deviation of what is assumed of the gyro's lag, s²: that of a filter of 20 ms.
 LAG = 2e-4
 
 
 def _pair(log: Log) -> tuple[Array, Array, Motion]:
-    """Return time and output of the gyro, and the motion by the reference, each without what was lost."""
+    """Return time and output of the gyro, and the reference motion, without lost samples."""
     if log.time is None or log.output is None or log.reference_heading is None:
-        raise DataRefused('the log holds no reference heading over time: it needs the columns time_s, gyro_dps and reference_heading_deg')
+        raise DataRefused('the log holds no reference heading over time: '
+                          'it needs the columns time_s, gyro_dps and reference_heading_deg')
     refuse_wrapped(log)
     heard, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
     for known, name in ((heard, 'gyro'), (seen, 'reference')):
         if known.sum() < max(100, 0.1 * len(log)):
-            raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; at least a tenth and 100 are needed: '
+            raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
+                              'at least a tenth and 100 are needed: '
                               'mend its line and record again')
     start = log.time[seen][0]
-    return log.time[heard] - start, log.output[heard], from_headings(log.time[seen], log.reference_heading[seen])
+    return (log.time[heard] - start, log.output[heard],
+            from_headings(log.time[seen], log.reference_heading[seen]))
 
 
 def _refuse_length(motion: Motion) -> None:
     if motion.duration < 10.0:
-        raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: record longer')
+        raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
+                          'record longer')
     if motion.duration > LONGEST:
-        raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; see whether time_s is in s, or give --rate')
+        raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
+                          'see whether time_s is in s, or give --rate')
 
 
 def _refuse_motion(motion: Motion, limits: Limits) -> None:
@@ -189,21 +204,30 @@ def _refuse_motion(motion: Motion, limits: Limits) -> None:
     spread = float(np.std(np.diff(motion.heading_at(points)) / 0.5))
     if spread < limits.rate_spread:
         mean = motion.heading[-1] / motion.duration
-        raise DataRefused(f'the reference turns at one speed, {mean / DEGREE:.1f} deg/s (it varies by {spread / DEGREE:.2f} deg/s), so '
-                          'scale and bias cannot be parted: turn in both senses, or at another speed too, or with a rest')
+        raise DataRefused(f'the reference turns at one speed, {mean / DEGREE:.1f} deg/s '
+                          f'(it varies by {spread / DEGREE:.2f} deg/s), so scale and bias cannot '
+                          'be parted: turn in both senses, or at another speed too, '
+                          'or with a rest')
 
 
 def _refuse_uncertain(fit: Fit, limits: Limits) -> None:
     deviation = math.sqrt(fit.covariance[0, 0])
     if deviation > limits.scale_standard_deviation:
-        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, wanted '
-                          f'{100 * limits.scale_standard_deviation:g} %: turn further, faster, or more often')
+        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
+                          f'wanted {100 * limits.scale_standard_deviation:g} %: '
+                          'turn further, faster, or more often')
 
 
 def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
-    """Refuse a log that shows no bias beyond chance, and could only make a heading worse, by more than a limit, rad, in `DRIVE` s."""
+    """
+    Refuse a log whose bias is within chance and could make a heading worse.
+
+    It is refused where its standard deviation, rad/s, in `DRIVE` s exceeds the limit, rad.
+
+    """
     if deviation * DRIVE > limit and bias ** 2 < 2.0 * deviation ** 2:
-        raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- {deviation / DEGREE:.3f} deg/s, which says nothing: without it '
+        raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
+                          f'{deviation / DEGREE:.3f} deg/s, which says nothing: without it '
                           'a heading is as good. Turn more slowly, with rests, or for longer')
 
 
@@ -212,11 +236,12 @@ def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -
 
 
 def _by_rate(time: Array, output: Array, motion: Motion, _: Limits) -> Fit:
-    """Fit by the rate of the encoder, as it stands: the stamps are believed."""
+    """Fit by the rate of the encoder; the stamps are taken as exact."""
     inside = (time >= 0.0) & (time <= motion.duration)
     time, output = time[inside], output[inside]
     fit = fit_rate(time, output, motion)
-    scale, offset = 1.0 / (1.0 + fit.scale_factor_error), -fit.bias / (1.0 + fit.scale_factor_error)
+    scale, offset = (1.0 / (1.0 + fit.scale_factor_error),
+                     -fit.bias / (1.0 + fit.scale_factor_error))
     columns = np.column_stack([output, np.ones(len(output))])
     scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
     jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
@@ -228,7 +253,7 @@ METHODS = {'likelihood': _by_likelihood, 'rate': _by_rate}
 
 
 def _pieces(time: Array) -> NDArray[np.intp]:
-    """Return which piece of a log each time is in: pieces of at least 5 s, but 8 of them, and up to 64."""
+    """Return the piece of the log of each time: 8 to 64 pieces, of 5 s or more if above 8."""
     since = (time - time[0]) / (time[-1] - time[0])
     count = int(np.clip((time[-1] - time[0]) / 5.0, 8, 64))
     return np.minimum(since * count, count - 1).astype(np.intp)
@@ -236,31 +261,35 @@ def _pieces(time: Array) -> NDArray[np.intp]:
 
 def _drift(time: Array, error: Array, noise: Noise) -> Drift:
     """
-    Find how the bias wanders, by restricted likelihood of the mean drifts between pieces of the log.
+    Find how the bias wanders, by restricted likelihood of the mean drifts between pieces of a log.
 
-    What repeats itself with a motion within a piece does not show. The sizes of the noises being unknown, all of a grid count by how
-    likely they are.
+    What repeats itself with a motion within a piece does not show. The sizes of the noises are not
+    known, so all of a grid count, weighted by their likelihood.
 
     """
     piece = _pieces(time)
     known = np.flatnonzero(np.bincount(piece))
     if len(known) < 6:
-        raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of the log; at least 6 are needed: '
-                          'mend its line and record again')
-    middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known] for values in (time, error))
+        raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of '
+                          'the log; at least 6 are needed: mend its line and record again')
+    middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known]
+                       for values in (time, error))
     rate = np.diff(heading) / np.diff(middle)
     duration = float(time[-1] - time[0])
     walk, mean, wander = _likely_noise(rate, duration / len(rate))
-    figured = 2.0 / math.pi * noise.bias_instability ** 2 + noise.rate_random_walk ** 2 * duration / 3.0
-    return Drift(0.5 * (middle[1:] + middle[:-1]), rate, math.sqrt(walk), math.sqrt(mean), math.sqrt(max(wander, figured)))
+    figured = (2.0 / math.pi * noise.bias_instability ** 2
+               + noise.rate_random_walk ** 2 * duration / 3.0)
+    return Drift(0.5 * (middle[1:] + middle[:-1]), rate, math.sqrt(walk), math.sqrt(mean),
+                 math.sqrt(max(wander, figured)))
 
 
 def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
     """
-    Return N², rad²/s, of mean rates between pieces of some length, s, and the variances of their mean by noise and by wander, (rad/s)².
+    Return N², rad²/s, and the variances of the mean by noise and by wander, (rad/s)².
 
-    The cosine transform makes independent values of them, each with a variance that is known but for one factor, as soon as three ratios
-    are: those of rate noise, of noise of the headings, and of flicker or rate random walk.
+    The input are mean rates between pieces of some length, s. Their cosine transform has
+    independent values, each with a variance that is known but for one factor, given three ratios:
+    those of rate noise, of noise of the headings, and of flicker or rate random walk.
 
     """
     power = dct(rate, norm='ortho')[1:] ** 2
@@ -270,27 +299,32 @@ def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
     weights = odds * np.exp(likelihoods - likelihoods.max())
     variances = variances * weights / weights.sum()
     student = len(power) / (len(power) - 2.0)
-    return float(variances.sum() * length), float(student * variances @ means), float(student * variances @ wanders)
+    return (float(variances.sum() * length), float(student * variances @ means),
+            float(student * variances @ wanders))
 
 
-#: Odds of a random walk against flicker, where the drifts themselves do not tell: with 1, intervals are too narrow for a random walk.
+#: Odds of a random walk against flicker, where the drifts do not determine it: with 1, intervals
+#: are too narrow for a random walk.
 _ODDS = 3.0
 
 
 def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
     """
-    Return what the cosine transform of rates between `count` pieces, and their mean, may have as variances, in units of N² / length.
+    Return possible variances of the transformed rates and of their mean, in units of N² / length.
 
-    Flicker B² and rate random walk K² are given by the averaging time at which the Allan deviation shows them above N. They begin with
-    the log: the mean over it has the variance 2 / pi B² or K² duration / 3.
+    The rates are those between `count` pieces, after the cosine transform. Flicker B² and rate
+    random walk K² are given by the averaging time at which the Allan deviation shows them above N.
+    They begin with the log: the mean over it has the variance 2 / pi B² or K² duration / 3.
 
     Returns
     -------
-    of the values but the first, shape (n, count - 1); of the mean by noise, and by wander, shape (n,) each; and odds, shape (n,)
+    of the values but the first, shape (n, count - 1); of the mean by noise, and by wander, shape
+    (n,) each; and odds, shape (n,)
 
     """
     frequency, duration = math.pi * np.arange(1, count) / count, count * length
-    cosine, crossing = np.cos(frequency), np.geomspace(0.01 * length, 1000.0 * duration, 30)[:, None]
+    cosine, crossing = (np.cos(frequency),
+                        np.geomspace(0.01 * length, 1000.0 * duration, 30)[:, None])
     flicker, walk = length / (ALLAN_FLOOR ** 2 * crossing), 3.0 * length / crossing ** 2
     wander = np.vstack([flicker / frequency, walk * length / frequency ** 2])
     wander_of_mean = np.vstack([2.0 / math.pi * flicker, walk * duration / 3.0])
@@ -298,16 +332,18 @@ def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
     shapes = (2.0 + cosine) / 3.0 + ratio * 2.0 * (1.0 - cosine) + wander
     means = 1.0 / count + 2.0 * ratio / count ** 2 + 0.0 * wander_of_mean
     odds = np.tile(np.repeat([1.0, _ODDS], len(crossing)), len(ratio))
-    return shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(), odds
+    return (shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(),
+            odds)
 
 
 def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
     """
     Return the fit with a bias that is drawn towards zero as far as the log leaves it open.
 
-    The prior is normal about zero with a standard deviation that is not known, of any size up to that of the technology. A bias of many
-    standard deviations stays; one that the log hardly shows would only harm a heading. What the bias wanders by is not what the log
-    leaves open of its mean: it draws nothing, and stays in the covariance.
+    The prior is normal about zero; its standard deviation is not known, of any size up to that of
+    the technology. A bias of many standard deviations stays; one that the log hardly shows would
+    only harm a heading. The wander of the bias is not an uncertainty of its mean: it does not draw
+    the bias, and stays in the covariance.
 
     Parameters
     ----------
@@ -318,7 +354,8 @@ def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
     """
     variance, largest = deviation ** 2, max(PRIORS[technology][1], 3.0 * abs(fit.bias))
     sizes = (np.geomspace(0.01, 1.0, 40) * largest) ** 2
-    logarithms = 0.5 * np.log(sizes) - 0.5 * (np.log(sizes + variance) + fit.bias ** 2 / (sizes + variance))
+    logarithms = 0.5 * np.log(sizes) - 0.5 * (np.log(sizes + variance)
+                                              + fit.bias ** 2 / (sizes + variance))
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     kept = sizes / (sizes + variance)
@@ -326,19 +363,22 @@ def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
     left = share * variance + fit.bias ** 2 * float(weights @ (kept - share) ** 2)
     gain = fit.covariance[:, 1] / fit.covariance[1, 1]
     s, b = (fit.scale_factor_error, fit.bias) + gain * (share - 1.0) * fit.bias
-    return replace(fit, scale_factor_error=float(s), bias=float(b), covariance=fit.covariance + (left - variance) * np.outer(gain, gain))
+    return replace(fit, scale_factor_error=float(s), bias=float(b),
+                   covariance=fit.covariance + (left - variance) * np.outer(gain, gain))
 
 
 def _covariance(fit: Fit, drift: Drift) -> Array:
     """
-    Return the covariance of (s, b) by the scatter between pieces of the log, with the drift's variance of the bias.
+    Return the covariance of (s, b) by the scatter between pieces, with the drift's bias variance.
 
-    What repeats itself with the motion is no noise of the fit, and what is slower than a piece is not all of it.
+    What repeats itself with the motion is not noise of the fit, and what is slower than a piece
+    shows in part only.
 
     """
     piece = _pieces(fit.influence[:, 2])
     sums = np.array([np.bincount(piece, values) for values in fit.influence[:, :2].T])
-    student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1) / stats.norm.ppf(0.975)) ** 2
+    student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1)
+               / stats.norm.ppf(0.975)) ** 2
     scatter = student * sums @ sums.T
     deviations = np.sqrt(np.diag(scatter))
     known = np.array([deviations[0], math.hypot(drift.mean, drift.wander)])
@@ -346,8 +386,9 @@ def _covariance(fit: Fit, drift: Drift) -> Array:
 
 
 def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> GyroModel:
-    model = GyroModel((Term(BIAS, (fit.bias,)), Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))), fit.covariance[::-1, ::-1],
-                      (float(output.min()), float(output.max())),
+    model = GyroModel((Term(BIAS, (fit.bias,)),
+                       Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
+                      fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
                       noise=noise)
     if temperature is None:
         return model
@@ -356,8 +397,9 @@ def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> 
 
 
 def _after(time: Array, output: Array, motion: Motion, fit: Fit) -> Residual:
-    """Return the residual of what a fit makes of the output."""
-    return _residual(time - np.nan_to_num(fit.time_offset), (output - fit.bias) / (1.0 + fit.scale_factor_error), motion)
+    """Return the residual of the output corrected by a fit."""
+    return _residual(time - np.nan_to_num(fit.time_offset),
+                     (output - fit.bias) / (1.0 + fit.scale_factor_error), motion)
 
 
 def _residual(time: Array, rate: Array, motion: Motion) -> Residual:
@@ -366,7 +408,7 @@ def _residual(time: Array, rate: Array, motion: Motion) -> Residual:
 
 
 def _lost(time: Array) -> int:
-    """Return how many samples are missing between the stamps; none where they are too irregular to tell."""
+    """Return the number of samples missing between the stamps; 0 where these are irregular."""
     lost = lost_samples(time)
     return 0 if lost is None else int(lost.sum())
 
@@ -374,9 +416,12 @@ def _lost(time: Array) -> int:
 def _remarks(fit: Fit, method: str) -> tuple[str, ...]:
     s = fit.scale_factor_error
     wrong = -s / (1.0 + s)
-    scale = (f'a reference that shows {abs(100 * wrong):.2f} % too {"much" if wrong > 0.0 else "little"}, {360.0 * (1.0 + wrong):.2f} for '
-             f'360 deg, would look just like this scale factor error of {100 * s:+.2f} %: check it over whole turns closed on a mark')
+    scale = (f'a reference that shows {abs(100 * wrong):.2f} % too '
+             f'{"much" if wrong > 0.0 else "little"}, {360.0 * (1.0 + wrong):.2f} for 360 deg, '
+             f'would look just like this scale factor error of {100 * s:+.2f} %: '
+             'check it over whole turns closed on a mark')
     if method == 'likelihood':
         return (scale,)
-    return scale, ('the regression of rates knows no time offset, and takes noise of the gyro for scale: its scale factor error is too '
-                   'large by more than is stated; compare it with the method likelihood')
+    return scale, ('the regression of rates knows no time offset, and takes noise of the gyro for '
+                   'scale: its scale factor error is too large by more than is stated; '
+                   'compare it with the method likelihood')

@@ -1,9 +1,10 @@
 """
-How dwells scatter about what a gyro's effects explain, and what that leaves open of the effects' values.
+The scatter of dwells about a gyro's effects, and the uncertainty of the effects' values.
 
-The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own, that of its sweep's bias, and that of its
-sweep's scale factor (a bias that wanders, a temperature that the sensor does not show). How large they are is found by restricted
-likelihood, so that thirty dwells of one sweep do not count as thirty independent ones.
+The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
+that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
+that the sensor does not show). Their sizes are found by restricted likelihood, so that thirty
+dwells of one sweep do not count as thirty independent ones.
 
 """
 
@@ -25,25 +26,26 @@ from gyro_calibration.log import Array, DataRefused, Mask
 OUTLYING = 6.0
 #: With a smaller spread, K, a sensor's own error looks like a change of temperature.
 SMALLEST_TEMPERATURE_SPREAD = 1.0
-#: With fewer, what the dwells of a sweep have in common cannot be told from chance.
+#: With fewer, what the dwells of a sweep have in common is not distinguishable from chance.
 FEWEST_SWEEPS = 4
-#: So many blocks stand for sweeps where there are fewer.
+#: Number of blocks of dwells that replace sweeps where there are fewer sweeps.
 _MOST_BLOCKS = 60
-#: With fewer, an outlying dwell cannot be told from a gyro that is not linear.
+#: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _FEWEST_DWELLS = 12
 
 
 @dataclass(frozen=True)
 class Scatter:
     """
-    How dwells scatter about a surface over rate and temperature that is as smooth as their number allows, as standard deviations.
+    Standard deviations of dwells about a smooth surface over rate and temperature.
 
-    It does not depend on the effects that are fitted: a scatter found beside too few of them would take in what they leave.
+    The surface is as smooth as the number of dwells allows. The scatter does not depend on the
+    effects that are fitted: one found with too few of them would include what they leave.
 
     Attributes
     ----------
     dwell : of a dwell, beyond its own deviation, rad/s
-    dwell_scale : of the scale factor from dwell to dwell, 1; a table's speed is no better than that
+    dwell_scale : of the scale factor from dwell to dwell, 1; a limit of the table's speed
     sweep_bias : of the bias from sweep to sweep, rad/s
     sweep_scale : of the scale factor from sweep to sweep, 1
     kept : which dwells are not outlying, shape (n,)
@@ -57,16 +59,18 @@ class Scatter:
     kept: Mask
 
     def deviation(self, dwells: Dwells) -> Array:
-        """Return the standard deviation of each dwell, without what its sweep shares, rad/s, shape (n,)."""
-        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell ** 2 + (self.dwell_scale * dwells.rate) ** 2)
+        """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
+        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell ** 2
+                       + (self.dwell_scale * dwells.rate) ** 2)
 
     def shared(self, dwells: Dwells) -> Array:
-        """Return what one standard deviation of its sweep's bias and scale factor adds to each dwell, rad/s, shape (n, 2)."""
-        return np.column_stack([np.full(len(dwells), self.sweep_bias), self.sweep_scale * dwells.rate])
+        """Return the effect of one deviation of sweep bias and scale, rad/s, shape (n, 2)."""
+        return np.column_stack([np.full(len(dwells), self.sweep_bias),
+                                self.sweep_scale * dwells.rate])
 
 
 def _own_deviation(dwells: Dwells) -> Array:
-    """Return the deviations that the dwells came with, rad/s; one that is not known is like the others."""
+    """Return the deviations of the dwells, rad/s; one that is not known is their rms."""
     known = np.isfinite(dwells.deviation)
     typical = rms(dwells.deviation[known]) if known.any() else 0.0
     return np.where(known, dwells.deviation, typical)
@@ -81,12 +85,14 @@ def parts_of(dwells: Dwells) -> Numbers:
     """
     Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
 
-    It is the sweep, as what its dwells have in common does not predict other sweeps. Fewer than four sweeps show too little of the gyro
-    without one of them, two temperatures nothing of the slope between them: then parts are blocks of time, or the dwells.
+    It is the sweep, as what its dwells have in common does not predict other sweeps. Fewer than
+    four sweeps show too little of the gyro without one of them, two temperatures nothing of the
+    slope between them: then parts are blocks of time, or the dwells.
 
     """
     parts = np.unique(dwells.sweep, return_inverse=True)[1]
-    return parts if parts.max() + 1 >= FEWEST_SWEEPS else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells)
+    return (parts if parts.max() + 1 >= FEWEST_SWEEPS
+            else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells))
 
 
 def summed(values: Array, parts: Numbers) -> Array:
@@ -96,14 +102,15 @@ def summed(values: Array, parts: Numbers) -> Array:
 
 
 class Whitener:
-    """The covariance of the errors of dwells; sweeps are independent of each other, and what one shares has two directions."""
+    """The covariance of the errors of dwells: independent sweeps, two shared directions each."""
 
     def __init__(self, dwells: Dwells, scatter: Scatter):
-        """Find the directions of each sweep, and how much the dwells of a sweep vary along them."""
+        """Find the directions of each sweep, and the scatter of its dwells along them."""
         self.parts = parts_of(dwells)
         self.deviation = scatter.deviation(dwells)
         self._shared = scatter.shared(dwells) / self.deviation[:, None]
-        self._sizes, self._directions = np.linalg.eigh(summed(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
+        self._sizes, self._directions = np.linalg.eigh(
+            summed(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
 
     def whiten(self, values: Array) -> Array:
         """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
@@ -114,12 +121,15 @@ class Whitener:
         return self._stretched(whitened, 0.5) * self.deviation
 
     def _stretched(self, values: Array, power: float) -> Array:
-        """Multiply by a power of the covariance in units of the dwells' own: the identity, and the products of two columns a sweep."""
+        """Multiply by a power of the covariance in units of the dwells' own."""
         sizes = np.maximum(self._sizes, 1e-12)
-        inner = self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :] @ self._directions.swapaxes(1, 2)
+        # the covariance is the identity plus the products of two columns a sweep
+        inner = (self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
+                 @ self._directions.swapaxes(1, 2))
         columns = values.reshape(len(values), -1)
         along = inner @ summed(self._shared[:, :, None] * columns[:, None, :], self.parts)
-        return values + np.einsum('ni,nim->nm', self._shared, along[self.parts]).reshape(values.shape)
+        return values + np.einsum('ni,nim->nm', self._shared,
+                                  along[self.parts]).reshape(values.shape)
 
 
 # how large it is
@@ -129,71 +139,87 @@ def find_scatter(dwells: Dwells) -> Scatter:
     kept = not_outlying(dwells)
     used = take(dwells, kept)
     error, surface = used.output - used.rate, _surface(used)
-    # The likelihood does not look at what the surface explains; beside it, errors that are next to nothing would be lost in rounding.
+    # The likelihood does not depend on what the surface explains; with it, errors near zero would
+    # be lost in rounding.
     error = error - surface @ (surface.T @ error)
     size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)
     units = np.array([size, relative, size, relative])[:_sought(used)]
 
     def scatter(logarithms: Array) -> Scatter:
-        return Scatter(*np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)  # type: ignore[misc]
+        return Scatter(  # type: ignore[misc]
+            *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)
 
-    best = minimize(lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
-                    np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B', bounds=[(-7.0, 2.0)] * len(units),
-                    options={'eps': 1e-4, 'ftol': 1e-7})  # a simplex falls flat on a bound, and stays there
+    # a simplex collapses onto a bound, and stays there
+    best = minimize(
+        lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
+        np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
+        bounds=[(-7.0, 2.0)] * len(units), options={'eps': 1e-4, 'ftol': 1e-7})
     return scatter(best.x)
 
 
 def _sought(dwells: Dwells) -> int:
-    """Return how many of the four scatters so many dwells and sweeps can show."""
+    """Return how many of the four scatters the dwells and sweeps determine."""
     if len(dwells) < _FEWEST_DWELLS:
         return 1
     return 4 if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 2
 
 
 def not_outlying(dwells: Dwells) -> Mask:
-    """Return which dwells lie as the others do, by a fit in which a large residual counts by its size, not its square."""
+    """Return which dwells are not outlying, by a fit that counts residuals by their size."""
     surface = _surface(dwells)
     residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
-    # Such a fit passes through as many dwells as it has columns, which say nothing of the scatter.
+    # Such a fit passes through as many dwells as it has columns; these do not show the scatter.
     spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
     return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
 
 
 def _surface(dwells: Dwells) -> Array:
-    """Return orthonormal columns that span a smooth surface over rate and temperature, one for three dwells at most, shape (n, m)."""
+    """
+    Return orthonormal columns of a smooth surface over rate and temperature, shape (n, m).
+
+    There is at most one column for three dwells.
+
+    """
     if len(dwells) < 2:
-        raise DataRefused('a single dwell shows no effect: turn at more rates, and rest between them')
+        raise DataRefused('a single dwell shows no effect: '
+                          'turn at more rates, and rest between them')
     rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
-    temperature = np.zeros(len(rate)) if dwells.temperature is None else dwells.temperature - dwells.temperature.mean()
-    temperature = temperature / max(float(np.abs(temperature).max()), 0.5 * SMALLEST_TEMPERATURE_SPREAD)
-    powers = sorted(((i, j) for i in range(6) for j in range(3)), key=lambda power: (power[0] + 2 * power[1], power[1]))
+    temperature = (np.zeros(len(rate)) if dwells.temperature is None
+                   else dwells.temperature - dwells.temperature.mean())
+    temperature = temperature / max(float(np.abs(temperature).max()),
+                                    0.5 * SMALLEST_TEMPERATURE_SPREAD)
+    powers = sorted(((i, j) for i in range(6) for j in range(3)),
+                    key=lambda power: (power[0] + 2 * power[1], power[1]))
     products = [rate ** i * temperature ** j for i, j in powers]
-    columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[:, :max(len(rate) // 3, min(len(rate) - 1, 2))]
+    columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[
+        :, :max(len(rate) // 3, min(len(rate) - 1, 2))]
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, sizes > 1e-4 * sizes[0]]
 
 
 def freedom_beside_surface(dwells: Dwells) -> int:
-    """Return how many dwells there are beyond the columns of the surface that their scatter was found about."""
+    """Return the number of dwells less that of the columns of the surface of their scatter."""
     return len(dwells) - _surface(dwells).shape[1]
 
 
-def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array, columns: Array) -> float:
-    """Return the logarithm of the likelihood of the scatter, whatever the values are, up to a constant."""
+def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
+                           columns: Array) -> float:
+    """Return the log-likelihood of the scatter, whatever the values are, up to a constant."""
     deviation = scatter.deviation(dwells)
     sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
     (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
     factor = np.linalg.cholesky(gram[:-1, :-1])
     explained = solve_triangular(factor, gram[:-1, -1], lower=True)
-    log_determinant = float(of_sweeps) + 2.0 * float(np.log(deviation).sum()) + 2.0 * float(np.log(np.diag(factor)).sum())
+    log_determinant = (float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
+                       + 2.0 * float(np.log(np.diag(factor)).sum()))
     return -0.5 * (log_determinant + float(gram[-1, -1] - explained @ explained))
 
 
 @dataclass(frozen=True)
 class _Sums:
     """
-    All that a likelihood needs of columns, whatever the scatter of sweeps is.
+    The sums of columns that a likelihood needs, whatever the scatter of sweeps is.
 
     Attributes
     ----------
@@ -212,12 +238,13 @@ class _Sums:
         """Sum over each sweep."""
         columns = columns / deviation[:, None]
         shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
-        inner, outer = (summed(shared[:, :, None] * each[:, None, :], parts_of(dwells)) for each in (shared, columns))
+        inner, outer = (summed(shared[:, :, None] * each[:, None, :], parts_of(dwells))
+                        for each in (shared, columns))
         return cls(columns.T @ columns, inner, outer)
 
     def reduced(self, sizes: Array) -> tuple[Array, Array]:
         """
-        Return the products of the whitened columns, and the logarithm of the determinant of what sweeps add (Woodbury).
+        Return products of the whitened columns, and log-determinant of the sweeps (Woodbury).
 
         Parameters
         ----------
@@ -239,19 +266,20 @@ class _Sums:
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    What dwells leave open of values that were fitted.
+    The uncertainty of values fitted to dwells.
 
-    How large the scatter is, few dwells and few sweeps do not tell. So the distribution of the values is averaged over what it may be,
-    each weighted by its restricted likelihood: that of the dwells gives Student's distribution, that of the sweeps is summed over a grid.
-    Before looking, chances are even that sweeps share nothing; if they do share something, it is about as large as the scatter of a
-    dwell (half Cauchy, Gelman 2006). The largest likelihood alone would say "nothing" about every other time, and its intervals be too
-    narrow.
+    Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
+    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
+    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior
+    probability that sweeps share nothing is one half; if they do share something, it is about as
+    large as the scatter of a dwell (half Cauchy, Gelman 2006). The maximum of the likelihood alone
+    would be at zero about every other time, and its intervals too narrow.
 
     Attributes
     ----------
     weights : of possible scatters, shape (k,)
     offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
-    covariances : scale of the distribution, shape (k, m, m)
+    covariances : scale matrices of the distribution, shape (k, m, m)
     freedom : of Student's distribution
 
     """
@@ -270,8 +298,8 @@ class Uncertainty:
         ----------
         dwells : that were fitted, more than there are values
         scatter : of them
-        columns : what the error changes by for each value, shape (n, m)
-        error : that the fitted values leave, rad/s, shape (n,)
+        columns : change of the error for each value, shape (n, m)
+        error : residual of the fitted values, rad/s, shape (n,)
 
         """
         lengths = np.linalg.norm(columns, axis=0)
@@ -287,13 +315,15 @@ class Uncertainty:
         return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
 
     def below(self, change: Array | float) -> Array:
-        """Return how likely each value is below what was fitted plus a change, shape (m,)."""
-        return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations, self.freedom))
+        """Return the probability that each value is below the fitted plus a change, shape (m,)."""
+        return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations,
+                                                     self.freedom))
 
     def covariance(self) -> Array:
-        """Return the covariance of the values, wide enough for 1.96 standard deviations to hold 95 %, shape (m, m)."""
+        """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
         low = np.zeros(self.offsets.shape[1])
-        high = 2.0 * student.ppf(0.975, self.freedom) * (self.deviations + np.abs(self.offsets)).max(axis=0)
+        high = (2.0 * student.ppf(0.975, self.freedom)
+                * (self.deviations + np.abs(self.offsets)).max(axis=0))
         for _ in range(25):
             half = 0.5 * (low + high)
             narrow = self.below(half) - self.below(-half) < 0.95
@@ -304,44 +334,56 @@ class Uncertainty:
 
 
 def _units(dwells: Dwells, deviation: Array) -> Array:
-    """Return the scatter of sweeps' bias and scale that is as large as that of a dwell, or zeros where sweeps are too few to show it."""
-    return np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)]) * (_sought(dwells) == 4)
+    """Return scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps."""
+    return (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
+            * (_sought(dwells) == 4))
 
 
 def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array]:
-    """Return the weights of possible scatters of sweeps, shape (k,), what each moves the values by, (k, m), and their covariances."""
+    """
+    Return weights of possible scatters of sweeps, offsets of the values and their covariances.
+
+    The shapes are (k,), (k, m) and (k, m, m).
+
+    """
     shown = bool(units.any())
     axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if shown else np.zeros(1)] * 2
     for _ in range(2 if shown else 1):
-        found = [_given(sums, freedom, units * np.column_stack([np.full(len(axes[1]), bias), axes[1]])) for bias in axes[0]]
+        found = [_given(sums, freedom,
+                        units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
+                 for bias in axes[0]]
         logarithm = np.array([each[0] for each in found])
-        weights = np.exp(logarithm - logarithm.max()) * np.outer(*(_prior(axis) for axis in axes))
+        weights = (np.exp(logarithm - logarithm.max())
+                   * np.outer(*(_prior(axis) for axis in axes)))
         weights /= weights.sum()
         axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
     likely = weights.ravel() > 1e-4
-    values, covariances = (np.concatenate([each[place] for each in found])[likely] for place in (1, 2))
+    values, covariances = (np.concatenate([each[place] for each in found])[likely]
+                           for place in (1, 2))
     return weights.ravel()[likely] / weights.ravel()[likely].sum(), values, covariances
 
 
 def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array]:
-    """Return the logarithm of the likelihood of scatters of sweeps, shape (k, 2), the values with each, and their covariances."""
+    """Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances."""
     gram, log_determinant = sums.reduced(sizes)
     inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
     values = np.einsum('kij,kj->ki', inverse, right)
-    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right), 1e-12 * sums.gram[-1, -1]) + 1e-200
+    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
+                        1e-12 * sums.gram[-1, -1]) + 1e-200
     logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
     return logarithm, values, inverse * (misfit / freedom)[:, None, None]
 
 
 def _prior(sizes: Array) -> Array:
-    """Return the chance of each size before looking: a half for 0, the rest spread over the others, which are evenly spaced in size."""
+    """Return the prior of each size: one half for 0, a half Cauchy for the others."""
     if len(sizes) == 1:
         return np.ones(1)
-    return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2) * math.log(sizes[2] / sizes[1])])
+    return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2)
+                           * math.log(sizes[2] / sizes[1])])
 
 
 def _nearer(sizes: Array, weights: Array) -> Array:
-    """Return 0 and sizes about as finely spaced as those above 0 that are likely."""
+    """Return 0 and sizes spaced about as finely as the likely ones above 0."""
     if len(sizes) == 1:
         return sizes
     logarithms, share = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
