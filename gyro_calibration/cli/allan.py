@@ -47,12 +47,17 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'find the noise figures of a gyro in a record at rest, by its Allan deviation',
                   'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
     add_log(parser)
-    parser.add_argument('--picture', type=picture_file, metavar='FILE', help='draw the chart, .png or .svg')
-    parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S', help='leave out what comes before, s since the first '
-                        'sample: the warm-up, or hands on the gyro')
-    parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S', help='leave out what comes after')
-    parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model that the figures are put in; default: a new one')
-    parser.add_argument('--out', metavar='MODEL.yaml', help='write the model with these noise figures')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE',
+                        help='draw the chart, .png or .svg')
+    parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
+                        help='leave out what comes before, s since the first sample: the warm-up, '
+                        'or hands on the gyro')
+    parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
+                        help='leave out what comes after')
+    parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model that the '
+                        'figures are put in; default: a new one')
+    parser.add_argument('--out', metavar='MODEL.yaml',
+                        help='write the model with these noise figures')
     return parser
 
 
@@ -63,9 +68,12 @@ def _allan(given: argparse.Namespace) -> Answer:
         time = time_of(given, log)
         inside = (time - time[0] >= given.begin) & (time - time[0] <= given.end)
         if not inside.any():
-            raise DataRefused(f'--from {given.begin:g} --to {given.end:g} leaves no sample of {time[-1] - time[0]:.5g} s')
-        record = even_record(time[inside], output_of(given, log)[inside], None if log.moving is None else log.moving[inside])
-        chart = allan_deviation(record.rate, record.interval, progress=partial(bar, what='Allan deviation'))
+            raise DataRefused(f'--from {given.begin:g} --to {given.end:g} leaves no sample of '
+                              f'{time[-1] - time[0]:.5g} s')
+        record = even_record(time[inside], output_of(given, log)[inside],
+                             None if log.moving is None else log.moving[inside])
+        chart = allan_deviation(record.rate, record.interval,
+                                progress=partial(bar, what='Allan deviation'))
         fit = fit_noise(record.rate, record.interval)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None

@@ -56,17 +56,22 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'table.csv --out model.yaml')
     add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
-    parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; likelihood: the reference heading itself; '
+    parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; '
+                        'likelihood: the reference heading itself; '
                         'course: a course over ground, as of satellites; '
-                        'rate: the rate of the reference heading, sample by sample. Default: what the log holds')
+                        'rate: the rate of the reference heading, sample by sample. '
+                        'Default: what the log holds')
     what = parser.add_mutually_exclusive_group()
     what.add_argument('--effects', type=_effects, metavar='NAME,...', help='fit these of '
                       f'{", ".join(STEADY)}; default: those that the data support')
     what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
-                      help='fit the polynomial over output and temperature of these orders instead; default: 3,2')
-    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; decides where effects look alike, and what is '
-                        'likely where a course over ground leaves it open (default there: mems)')
-    parser.add_argument('--name', dest='gyro_name', metavar='TEXT', help='of the gyro, kept in the model')
+                      help='fit the polynomial over output and temperature of these orders '
+                      'instead; default: 3,2')
+    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; '
+                        'decides where effects look alike, and what is likely where a course over '
+                        'ground leaves it open (default there: mems)')
+    parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
+                        help='of the gyro, kept in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='of the gyro, kept in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
                         'matrix C of Ojeda et al., in deg/s and degC')
@@ -110,11 +115,13 @@ def _read(given: argparse.Namespace) -> tuple[str, Log]:
 
 
 def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
-    """Return the method that was asked for, or the one for what the logs hold; '' lets the reference heading decide."""
+    """Return the method, given or by the logs; '' lets the reference heading decide."""
     if given.method:
         return str(given.method)
-    chosen = {effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'} or given.polynomial
-    heading_alone = all(log.time is not None and log.reference_rate is None and log.reference_heading is not None for log in logs.values())
+    chosen = ({effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'}
+              or given.polynomial)
+    heading_alone = all(log.time is not None and log.reference_rate is None
+                        and log.reference_heading is not None for log in logs.values())
     return '' if heading_alone and not chosen else 'dwells'
 
 
