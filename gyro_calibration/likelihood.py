@@ -325,7 +325,7 @@ def _stands(motion: Motion, step: float, block: float) -> _Points:
     Return the readings that last longer than a block, single ones, and the first and last.
 
     All samples of one that lasts count as one reading. At the first and the last the gyro rests if
-    they last much longer than the readings beside them; then all their samples have the same error.
+    they last much longer than the readings beside them; then their samples share one error.
 
     """
     run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)

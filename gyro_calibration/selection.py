@@ -1,8 +1,9 @@
 """
-Which effects a gyro has: chosen by what predicts sweeps that were left out, each choice with its reason.
+Selection of a gyro's effects: by the prediction of left-out sweeps, each choice with its reason.
 
-An effect is taken where the error of left-out sweeps falls with it and its evidence is beyond chance, with regard to how many effects
-were tried. Where two effects explain the data alike, the one that the physics of the instrument gives decides, if the instrument is known.
+An effect is taken where the error of left-out sweeps falls with it and its evidence is beyond
+chance, given the number of effects tried. Where two effects explain the data alike, the one that
+the physics of the instrument gives decides, if the instrument is known.
 
 """
 
@@ -30,12 +31,14 @@ from gyro_calibration.effects import (
 from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.scatter import Scatter, find_scatter
 
-#: How often an effect is taken that is not there, in one calibration.
+#: Probability of taking an effect that is not there, in one calibration.
 FALSE_ALARM_RATE = 0.01
-#: Two causes count as parted from so many standard deviations on: then the wrong one is taken in one of thirty thousand calibrations.
+#: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
+#: one of thirty thousand calibrations.
 PARTED = 4.0
 #: Of effects that look alike, the one that the physics of an instrument gives.
-TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY, 'mems': CUBIC_NONLINEARITY}
+TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
+                'mems': CUBIC_NONLINEARITY}
 _TWINS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
 #: An effect that is of no use without another one.
 _NEEDS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
@@ -51,7 +54,7 @@ class Choice:
     effect : its name
     taken : whether it is in the model
     without, with_it : error of left-out sweeps, rad/s; nan where a fit was not possible
-    chance : how likely so much evidence is by chance alone; nan as before
+    chance : probability of so much evidence by chance alone; nan as before
     reason : one sentence
 
     """
@@ -72,8 +75,10 @@ class Twins:
     Attributes
     ----------
     taken, other : their names
-    sigmas : by how many standard deviations the data prefer the one that was taken; negative where they prefer the other
-    rate : two dwells each way at this rate would part them, rad/s; None where no rate below three times the fastest would
+    sigmas : standard deviations by which the data prefer the one that was taken; negative where
+        they prefer the other
+    rate : slowest rate, rad/s, at which two dwells each way would distinguish them; None if it is
+        above three times the fastest
     reason : why it was taken, one sentence
 
     """
@@ -92,21 +97,22 @@ class Twins:
 
 @dataclass(frozen=True)
 class Selection:
-    """A calibration with the effects that the data support, why each was taken or not, and what looks alike."""
+    """A calibration with the effects that the data support, the reasons, and what looks alike."""
 
     calibration: Calibration
     choices: tuple[Choice, ...]
     twins: tuple[Twins, ...]
 
 
-def select_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter) -> Selection:
+def select_effects(dwells: Dwells, technology: str | None = None,
+                   progress: Progress = iter) -> Selection:
     """
     Fit the effects that the dwells support, each with its reason.
 
     Parameters
     ----------
     dwells : of a rate table or a log
-    technology : one of `TECHNOLOGIES`, what the instrument is; it decides where causes tie
+    technology : one of `TECHNOLOGIES`, of the instrument; it decides where causes tie
     progress : is given the effects to go through, such as a progress bar
 
     Raises
@@ -116,13 +122,14 @@ def select_effects(dwells: Dwells, technology: str | None = None, progress: Prog
     """
     best, twins = supported_effects(dwells, technology, progress)
     tried = _tried(best.effects)
-    choices = tuple(_choice(best, effect, tried, twins) for effect in progress(list(STEADY.values())))
+    choices = tuple(_choice(best, effect, tried, twins)
+                    for effect in progress(list(STEADY.values())))
     return Selection(best, choices, twins)
 
 
 def supported_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter,
                       rate: float = FALSE_ALARM_RATE) -> tuple[Calibration, tuple[Twins, ...]]:
-    """Fit the effects that the dwells support, without reasons; `rate` is how often one is taken that is not there."""
+    """Fit the supported effects, without reasons, at a false alarm rate."""
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
     candidates = [effect for effect in STEADY.values() if effect not in base.effects]
@@ -143,7 +150,8 @@ def _base(dwells: Dwells, scatter: Scatter) -> Calibration:
         fit = _try(dwells, effects, scatter)
         if fit is not None:
             return fit
-    raise DataRefused(f'{len(dwells)} dwells show neither a bias nor a scale factor; rest, and turn both ways at several speeds')
+    raise DataRefused(f'{len(dwells)} dwells show neither a bias nor a scale factor; '
+                      'rest, and turn both ways at several speeds')
 
 
 def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibration | None:
@@ -154,17 +162,19 @@ def _try(dwells: Dwells, effects: Sequence[Effect], scatter: Scatter) -> Calibra
 
 
 def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
-    """Tell whether left-out sweeps are predicted better with more effects, and the evidence of each is beyond chance."""
+    """Return whether more effects predict left-out sweeps better, each beyond chance."""
     added = [effect for effect in larger.effects if effect not in smaller.effects]
     predicts = larger.predicted_misfit() < smaller.predicted_misfit()
     return predicts and all(larger.chance_of(effect) < limit for effect in added)
 
 
-def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float, progress: Progress) -> Calibration:
-    """Add the effect that predicts left-out sweeps best, again and again."""
+def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float,
+          progress: Progress) -> Calibration:
+    """Add the effect that predicts left-out sweeps best, until none is supported."""
     while True:
         new = [effect for effect in candidates if _may_join(effect, fit.effects)]
-        tried = [_try(fit.dwells, _joined(fit.effects, effect), fit.scatter) for effect in progress(new)]
+        tried = [_try(fit.dwells, _joined(fit.effects, effect), fit.scatter)
+                 for effect in progress(new)]
         better = [each for each in tried if each is not None and _supported(fit, each, limit)]
         if not better:
             return fit
@@ -172,17 +182,19 @@ def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float, progress
 
 
 def _may_join(effect: Effect, effects: Sequence[Effect]) -> bool:
-    return effect not in effects and not any(effect in pair and any(each in effects for each in pair) for pair in _TWINS)
+    return effect not in effects and not any(
+        effect in pair and any(each in effects for each in pair) for pair in _TWINS)
 
 
 def _joined(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
-    """Return the effects with one more, and with what that one needs: of a curve, the slope may be nothing at first sight."""
+    """Return the effects with one more, and one it needs: a curve needs a slope, even if small."""
     needed = _NEEDS.get(effect)
-    return (*effects, effect) if needed is None or needed in effects else (*effects, needed, effect)
+    return ((*effects, effect) if needed is None or needed in effects
+            else (*effects, needed, effect))
 
 
 def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibration:
-    """Take away what is of no use any more beside effects that came later."""
+    """Remove effects that later ones made superfluous."""
     for effect in fit.effects:
         rest = tuple(each for each in fit.effects if each is not effect)
         if effect in base or effect in map(_NEEDS.get, rest):
@@ -202,7 +214,8 @@ def part_twins(fit: Calibration, technology: str | None) -> tuple[Calibration, t
         for taken, other in (pair, pair[::-1]):
             swapped = None
             if taken in fit.effects:
-                swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other), fit.scatter)
+                swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
+                               fit.scatter)
             if swapped is not None:
                 fit, twins = _decide((fit, taken), (swapped, other), technology)
                 found.append(twins)
@@ -210,7 +223,8 @@ def part_twins(fit: Calibration, technology: str | None) -> tuple[Calibration, t
     return fit, tuple(found)
 
 
-def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect], technology: str | None) -> tuple[Calibration, Twins]:
+def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect],
+            technology: str | None) -> tuple[Calibration, Twins]:
     (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
     sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
     reason = f'{taken.name} fits better by {sigmas:.1f} standard deviations'
@@ -218,22 +232,25 @@ def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect
         physical = TECHNOLOGIES[technology]
         if physical is other:
             (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
-        reason = f'{taken.name} is what the physics of {technology} gives, and fits {"better" if sigmas > 0.0 else "worse"} by ' \
-                 f'{abs(sigmas):.1f} standard deviations'
+        reason = (f'{taken.name} is what the physics of {technology} gives, and fits '
+                  f'{"better" if sigmas > 0.0 else "worse"} by {abs(sigmas):.1f} '
+                  'standard deviations')
     return fit, Twins(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
 
 
 def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
-    """Return the slowest rate, beyond those that were measured, at which two dwells each way would part two fits, rad/s."""
+    """Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits."""
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):
-        if separation(fit, swapped, np.array([rate, rate, -rate, -rate]), fit.model.reference_temperature) >= PARTED + 1.0:
+        if separation(fit, swapped, np.array([rate, rate, -rate, -rate]),
+                      fit.model.reference_temperature) >= PARTED + 1.0:
             return float(rate)
     return None
 
 
-def separation(fit: Calibration, swapped: Calibration, rates: Array, temperature: float) -> float:
-    """Return by how many standard deviations two fits differ in one more sweep, of dwells at these rates, shape (n,), and a temperature."""
+def separation(fit: Calibration, swapped: Calibration, rates: Array,
+               temperature: float) -> float:
+    """Return the difference of two fits in one more sweep at rates (n,), standard deviations."""
     count, known = len(rates), fit.dwells.deviation[np.isfinite(fit.dwells.deviation)]
     deviation = np.full(count, np.median(known) if len(known) else np.nan)
     sweep = Dwells(rates, rates, None, deviation, np.zeros(count, dtype=int), ('',) * count)
@@ -249,24 +266,29 @@ def separation(fit: Calibration, swapped: Calibration, rates: Array, temperature
 # reasons
 
 def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]) -> Choice:
-    """Return what a fit with the effect has over one without it, or with its twin, everything else being as it was chosen."""
+    """Return the gain of a fit with the effect over one without it, or with its twin."""
     for pair in twins:
         if effect.name == pair.other:
-            swapped = fit_effects(fit.dwells, swapped_effects(fit.effects, STEADY[pair.taken], effect), fit.scatter)
+            swapped = fit_effects(
+                fit.dwells, swapped_effects(fit.effects, STEADY[pair.taken], effect), fit.scatter)
             reason = f'explains the same as {pair.taken}, in place of which it is tried here'
-            return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan, reason)
+            return Choice(effect.name, False, fit.left_out_rms, swapped.left_out_rms, math.nan,
+                          reason)
     taken = effect in fit.effects
     rest = tuple(each for each in fit.effects if each is not effect)
     if taken and not rest:
-        return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan, 'nothing else can be seen')
+        return Choice(effect.name, True, math.nan, fit.left_out_rms, math.nan,
+                      'nothing else can be seen')
     try:
         other = fit_effects(fit.dwells, rest if taken else _joined(rest, effect), fit.scatter)
     except DataRefused as error:
         return Choice(effect.name, taken, math.nan, math.nan, math.nan, str(error))
     smaller, larger = (other, fit) if taken else (fit, other)
     limit = FALSE_ALARM_RATE / tried
-    reason = _reason(taken, _supported(smaller, larger, limit)) if larger.freedom else 'as many values as dwells tell nothing from chance'
-    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms, larger.chance_of(effect), reason)
+    reason = (_reason(taken, _supported(smaller, larger, limit)) if larger.freedom
+              else 'as many values as dwells tell nothing from chance')
+    return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
+                  larger.chance_of(effect), reason)
 
 
 def swapped_effects(effects: Sequence[Effect], taken: Effect, other: Effect) -> tuple[Effect, ...]:
