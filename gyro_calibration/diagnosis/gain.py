@@ -1,4 +1,4 @@
-"""What the extended model wins, on parts of the logs that took no part in the choice of causes or in the fit."""
+"""Gain of the extended model, on parts of the logs left out of the choice and the fit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WINDOW = 60.0
 EVERY = 3
 #: A log with fewer samples than this beside what is held out is not fitted.
 _FEWEST = 20
-#: Chance at which a cause is chosen again without what is held out; that it is there was shown by the whole logs.
+#: Chance at which a cause is chosen again without what is held out; the whole logs have shown it.
 _RATE = 0.01
 #: One part alone says nothing of how much the gain differs from part to part.
 _FEWEST_PARTS = 2
@@ -29,7 +29,7 @@ _FEWEST_PARTS = 2
 
 @dataclass(frozen=True)
 class _Block:
-    """What is left of one block: sums of squares of the rate's residual, how many, and the heading's; before and after."""
+    """Squares and count of the rate residual in one block, and its heading: before and after."""
 
     squares: tuple[float, float]
     count: int
@@ -38,13 +38,14 @@ class _Block:
 
 def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     """
-    Hold out every third block, choose again among the causes and fit them without it, and predict what was held out.
+    Hold out every third block, fit causes chosen anew without it, and predict it.
 
     Parameters
     ----------
     search : in the whole logs
     causes : those that were named, and their rivals
-    given : tells whether there is a model; before is then what it leaves as it is, otherwise what the best bias and scale leave
+    given : tells whether there is a model; before is then what it leaves as it is, otherwise what
+        the best bias and scale leave
 
     Returns
     -------
@@ -54,23 +55,30 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     replays = search.field.replays
     length = min(WINDOW, max(each.duration for each in replays) / 6.0)
     held = [held_out(each, length) for each in replays]
-    if not any(out.any() for out in held) or any(np.count_nonzero(each.kept & ~out) < _FEWEST for each, out in zip(replays, held)):
+    if (not any(out.any() for out in held)
+            or any(np.count_nonzero(each.kept & ~out) < _FEWEST
+                   for each, out in zip(replays, held))):
         return None
     rest = relaid(search, [_without(each, out) for each, out in zip(replays, held)], causes, _RATE)
     before = None if given else Outcome(work(rest.field, ()), rest.field.replays)
     after = Outcome(work(rest.field, searched(rest)), rest.field.replays)
     blocks = [block for run, (each, out) in enumerate(zip(replays, held))
-              for block in _blocks(each, out, length, [_left(each, run, found) for found in (before, after)])]
-    words = (f'every third {length:.3g} s of the log' if len(replays) == 1 else f'every third {length:.3g} s of each log')
-    heading = change_over(np.array([block.heading for block in blocks]) ** 2, np.ones(len(blocks))) if length >= WINDOW else None
-    rate = change_over(np.array([block.squares for block in blocks]), np.array([block.count for block in blocks], float))
+              for block in _blocks(each, out, length,
+                                   [_left(each, run, found) for found in (before, after)])]
+    words = (f'every third {length:.3g} s of the log' if len(replays) == 1
+             else f'every third {length:.3g} s of each log')
+    heading = (change_over(np.array([block.heading for block in blocks]) ** 2,
+                           np.ones(len(blocks))) if length >= WINDOW else None)
+    rate = change_over(np.array([block.squares for block in blocks]),
+                       np.array([block.count for block in blocks], float))
     return Gain(f'{words}, {len(blocks)} parts', rate, heading, WINDOW)
 
 
 def held_out(each: Replay, length: float) -> Mask:
     """Mark the samples that are held out, shape (n,)."""
     number = _numbers(each, length)
-    return each.kept & (number % EVERY == 1) & (number < int((each.channels.time[-1] - each.channels.time[0]) / length + 1e-9))
+    return (each.kept & (number % EVERY == 1)
+            & (number < int((each.channels.time[-1] - each.channels.time[0]) / length + 1e-9)))
 
 
 def _numbers(each: Replay, length: float) -> Array:
@@ -80,16 +88,19 @@ def _numbers(each: Replay, length: float) -> Array:
 def _without(each: Replay, out: Mask) -> Replay:
     left = (each.kept & ~out)[each.kept]
     place = each.place[left]
-    return replace(each, kept=each.kept & ~out, place=place - place[0], filling=each.filling[place[0]:])
+    return replace(each, kept=each.kept & ~out, place=place - place[0],
+                   filling=each.filling[place[0]:])
 
 
 def _left(each: Replay, run: int, found: Outcome | None) -> tuple[Array, Array]:
-    """Return what is left of rate and of increments of the heading in a whole log; of a model that was given, all."""
+    """Return the residuals of rate and of heading increments in a whole log; all without a fit."""
     added = 0.0 if found is None else found.explains(each, run) + found.biases[run]
-    return each.channels.output - each.channels.rate - added, each.channels.output - each.reference - added
+    return (each.channels.output - each.channels.rate - added,
+            each.channels.output - each.reference - added)
 
 
-def _blocks(each: Replay, out: Mask, length: float, left: Sequence[tuple[Array, Array]]) -> Iterator[_Block]:
+def _blocks(each: Replay, out: Mask, length: float,
+            left: Sequence[tuple[Array, Array]]) -> Iterator[_Block]:
     number = _numbers(each, length)
     for place in np.unique(number[out]):
         yield _block(each, left, out & (number == place))
@@ -97,7 +108,8 @@ def _blocks(each: Replay, out: Mask, length: float, left: Sequence[tuple[Array, 
 
 def _block(each: Replay, left: Sequence[tuple[Array, Array]], part: Mask) -> _Block:
     squares = tuple(float(np.sum(rate[part] ** 2)) for rate, _ in left)
-    heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part])) for _, increments in left)
+    heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
+                    for _, increments in left)
     return _Block((squares[0], squares[1]), int(np.count_nonzero(part)), (heading[0], heading[1]))
 
 
@@ -105,8 +117,8 @@ def change_over(squares: Array, count: Array) -> Change:
     """
     Return root mean squares before and after, and the interval of their difference.
 
-    Parts drawn anew give too narrow an interval where there are few. So it is that of the jackknife (Tukey 1958): each part is left out in
-    turn, and what that changes is spread as Student has it.
+    Bootstrap intervals are too narrow where there are few parts. So it is that of the jackknife
+    (Tukey 1958): each part is left out in turn, and the change has Student's distribution.
 
     Parameters
     ----------
@@ -118,7 +130,8 @@ def change_over(squares: Array, count: Array) -> Change:
     parts = len(count)
     if parts < _FEWEST_PARTS:
         return Change(float(before), float(after), None)
-    others = np.sqrt(np.maximum(squares.sum(axis=0) - squares, 0.0) / (count.sum() - count)[:, None])
+    others = np.sqrt(np.maximum(squares.sum(axis=0) - squares, 0.0)
+                     / (count.sum() - count)[:, None])
     deviation = (parts - 1) / np.sqrt(parts) * np.std(others[:, 0] - others[:, 1], ddof=1)
     half = float(student.ppf(0.975, parts - 1) * deviation)
     won = float(before - after)

@@ -27,8 +27,7 @@ _SPANS, _LAGS = 1000, 25
 #: Spans that are put together, for the noise of a reference fades over longer ones.
 _TOGETHER = (1, 4, 16)
 #: The least spans; how far a reference must turn in all, and how far gyro and reference must be
-#: apart over the longest spans, rad, for
-#: a gyro that does not follow to be told so.
+#: apart over the longest spans, rad, for a gyro that does not follow to be told so.
 _FEWEST, _TURNED, _APART = 12, 30.0 * DEGREE, 10.0 * DEGREE
 #: Shares of the variance in common: above the first the factor between both is known; below the
 #: second they are different motions.
@@ -178,8 +177,8 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
         yield Gate(
             'time_unit',
             False,
-            f'{said}: the stamps run {10.0**power:g} times too fast, {interval:.4g} s between samples '
-            f'where {interval / 10.0**power:.4g} s would agree',
+            f'{said}: the stamps run {10.0**power:g} times too fast, {interval:.4g} s between '
+            f'samples where {interval / 10.0**power:.4g} s would agree',
             f'divide time_s by {10.0**power:g}, or give --rate '
             f'{10.0**power / interval:.6g}' + (' (the stamps are in ms)' if power == 3 else ''),
             size,

@@ -236,7 +236,7 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
 
 
 def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
-    """Return a model with scale factor error, bias, and the causes of the gyro that are in a fit."""
+    """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
     own = 1.0 + sum(term.values[0] for term in given.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in done.values[:2])
     terms = [Term(BIAS, (bias,)), Term(SCALE_FACTOR_ERROR, (scale,))]
@@ -418,8 +418,9 @@ def _cannot_show(plain: Fitted) -> dict[str, str]:
 def _remarks(reference: Reference, plain: Fitted) -> Iterator[str]:
     yield (
         f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); say so with '
-        f'--reference-kind if it is another. It errs by {plain.size("reference") / DEGREE:.2g} deg '
-        f'from point to point, and by {1000.0 * plain.size("motion"):.2g} ms of the motion.'
+        '--reference-kind if it is another. It errs by '
+        f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and by '
+        f'{1000.0 * plain.size("motion"):.2g} ms of the motion.'
     )
     if plain.prior[0] < PLAIN['scale_factor_error']:
         yield (

@@ -1,8 +1,11 @@
 """
-Hygiene: what is wrong with a record before any gyro is blamed. It is reported, and what it touches is not used; nothing of it is fitted.
+Hygiene: what is wrong with a record before any gyro is blamed.
 
-A log without any of it brings a finding here in at most one case of a thousand: each of the five that chance could make (lost, stuck and
-wild samples, a limit on two sides) has a level of 2e-4. Steps of codes and units need no chance, but a size that matters.
+It is reported, and what it touches is not used; nothing of it is fitted.
+
+A log without any of it brings a finding here in at most one case of a thousand: each of the five
+that chance could make (lost, stuck and wild samples, a limit on two sides) has a level of 2e-4.
+Steps of codes and units need no chance, but a size that matters.
 
 """
 
@@ -16,7 +19,8 @@ from scipy import stats
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.codes import Codes, Limit, codes_of, dead_band, limit_of
-from gyro_calibration.diagnosis.compared import Compared, Line, compare, line_between, reference_rate, scale_of
+from gyro_calibration.diagnosis.compared import (Compared, Line, compare, line_between,
+                                                 reference_rate, scale_of)
 from gyro_calibration.diagnosis.door import evened, prepared
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding
@@ -29,11 +33,14 @@ from gyro_calibration.stamps import Stamps, number_stamps
 
 #: Chance of a false alarm of each check.
 LEVEL = 2e-4
-#: A step of codes matters from this part of the white noise on; a step of the reference from this part of its variance on.
+#: A step of codes matters from this part of the white noise on; a step of the reference from this
+#: part of its variance on.
 STEP, REFERENCE_STEP = 0.2, 0.02
-#: Near a limit the noise decides whether a sample is cut; within so many standard deviations of it none is used.
+#: Near a limit the noise decides whether a sample is cut; within so many standard deviations of it
+#: none is used.
 _NEAR_LIMIT = 4.0
-#: Steps of a heading come without order, those of a calculated motion in stretches alike: share of changes that differ from the last.
+#: Share of the changes of a heading that differ from the last, above which its steps are those of
+#: an encoder; in a calculated motion, stretches of changes are alike.
 _DISORDER = 0.1
 
 
@@ -51,7 +58,7 @@ class Hygiene:
     limit : beyond which the output does not go, rad/s after the factor; None where it shows none
     step : between codes of the output, rad/s after the factor; 0 where it does not matter
     heading_step : between codes of the reference heading, rad; 0 where it has none
-    update_interval : of a reference that is held in between, s; None where it is renewed with each sample
+    update_interval : of a reference that is held in between, s; None where each sample renews it
 
     """
 
@@ -79,26 +86,31 @@ def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
     output, rate = output_of(log), reference_rate(evened(log))
     known = np.isfinite(output)
     line = None if rate is None else line_between(log.time, rate, output)
-    unit = [] if rate is None or line is None else list(_unit(line, 1.0 if model is None else scale_of(model, rate)))
+    unit = ([] if rate is None or line is None
+            else list(_unit(line, 1.0 if model is None else scale_of(model, rate))))
     factor = 1.0 / FACTORS[unit[0][0]] if unit else 1.0
     found = Hygiene(tuple(finding for _, finding in unit), said, known, factor)
     if log.time is None:
         return found
     found = _of_stamps(found, log, known)
     found = _of_reference(found, log)
-    return _of_samples(found, output * factor, rate, None if line is None else _mended(line, factor), model, known, log)
+    return _of_samples(found, output * factor, rate,
+                       None if line is None else _mended(line, factor), model, known, log)
 
 
 def decided(clean: Hygiene) -> Hygiene:
-    """Say what is done about the unit of a record: a factor that may be of the gyro is left to the scale factor."""
+    """Say what is done about the unit; a factor that may be of the gyro is a scale error."""
     if clean.factor == 1.0:
         return clean
     if is_far(clean.factor):
-        said = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for an output so mended: mend the unit or the '
-                'sign of the log (its column, --sensitivity, --invert) before it is compensated.')
+        said = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for '
+                'an output so mended: mend the unit or the sign of the log (its column, '
+                '--sensitivity, --invert) before it is compensated.')
         return replace(clean, remarks=(*clean.remarks, said))
-    said = f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: a new model has it as a scale factor error.'
-    return replace(clean, factor=1.0, step=clean.step / clean.factor, limit=None if clean.limit is None else clean.limit / clean.factor,
+    said = (f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: '
+            'a new model has it as a scale factor error.')
+    return replace(clean, factor=1.0, step=clean.step / clean.factor,
+                   limit=None if clean.limit is None else clean.limit / clean.factor,
                    remarks=(*clean.remarks, said))
 
 
@@ -106,12 +118,14 @@ def _mended(line: Line, factor: float) -> Line:
     return Line(line.factor * factor, line.offset * factor, line.deviation * abs(factor))
 
 
-def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str, twins: tuple[str, ...] = ()) -> Finding:
+def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str,
+            twins: tuple[str, ...] = ()) -> Finding:
     """Return a finding of a cause with one parameter."""
     cause = CAUSES[name]
     unit = next(iter(cause.units.values()))
-    return Finding(name, cause.sentence, {name: Estimate(value, interval, unit)}, p_value, ambiguous_with=twins,
-                   separate_by=cause.separate_by if twins else '', evidence=evidence, along=cause.along)
+    return Finding(name, cause.sentence, {name: Estimate(value, interval, unit)}, p_value,
+                   ambiguous_with=twins, separate_by=cause.separate_by if twins else '',
+                   evidence=evidence, along=cause.along)
 
 
 def _counted(name: str, count: int, p_value: float, evidence: str) -> Finding:
@@ -119,26 +133,30 @@ def _counted(name: str, count: int, p_value: float, evidence: str) -> Finding:
 
 
 def _unit(line: Line, own: float) -> Iterator[tuple[str, Finding]]:
-    """Give the confusion of units, if the factor between output and reference is one, beside the scale that a model has of its own."""
+    """Give the confusion of units, if the factor is one beside the scale that a model has."""
     factor, deviation = line.factor / own, line.deviation / abs(own)
     name = unit_of_scale(factor, deviation)
     if name is None:
         return
     twins = () if is_far(factor) else ('scale_factor_error',)
     chance = float(2.0 * stats.norm.sf(abs(factor - 1.0) / max(deviation, 1e-300)))
-    said = f'the output is {factor:.5g} +- {deviation:.2g} times what the reference says, and {name} is {FACTORS[name]:.5g}'
-    yield name, finding('unit_error', factor, (factor - 1.96 * deviation, factor + 1.96 * deviation), chance, said, twins)
+    said = (f'the output is {factor:.5g} +- {deviation:.2g} times what the reference says, and '
+            f'{name} is {FACTORS[name]:.5g}')
+    yield name, finding('unit_error', factor,
+                        (factor - 1.96 * deviation, factor + 1.96 * deviation),
+                        chance, said, twins)
 
 
 def _of_stamps(found: Hygiene, log: Log, known: Mask) -> Hygiene:
-    """Look at the clock: lost samples are a finding, jitter, bursts and another pace are remarks."""
+    """Look at the clock: lost samples are a finding; jitter, bursts and pace are remarks."""
     assert log.time is not None
     without = np.count_nonzero(~known)
     remarks = [f'{without} samples have no output, and are left out.'] if without else []
     try:
         stamps = number_stamps(log.time)
     except DataRefused as refused:
-        return replace(found, remarks=(*found.remarks, *remarks, f'Lost samples cannot be counted: {refused}.'))
+        return replace(found, remarks=(*found.remarks, *remarks,
+                                       f'Lost samples cannot be counted: {refused}.'))
     said = (*found.remarks, *remarks, *stamps.said_of_bursts, *_said_of_pace(stamps))
     return replace(found, findings=(*found.findings, *_dropped(stamps)), remarks=said)
 
@@ -151,7 +169,8 @@ def _dropped(stamps: Stamps) -> Iterator[Finding]:
     late = (lost.max() - 0.5) * stamps.interval / jitter
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
     if chance < LEVEL:
-        yield _counted('dropped_samples', int(lost.sum()), chance, stamps.said_of_lost[0].rstrip('.'))
+        yield _counted('dropped_samples', int(lost.sum()), chance,
+                       stamps.said_of_lost[0].rstrip('.'))
 
 
 def _said_of_pace(stamps: Stamps) -> Iterator[str]:
@@ -168,7 +187,8 @@ def _said_of_pace(stamps: Stamps) -> Iterator[str]:
         doubts.append(off / np.ptp(number[part]))
     change = paces[1] / paces[0] - 1.0
     if abs(change) > max(1e-5, 6.0 * np.hypot(*doubts) / stamps.interval):
-        yield f'The interval of the samples changes by {1e6 * change:+.0f} ppm from the first to the last third of the log.'
+        yield (f'The interval of the samples changes by {1e6 * change:+.0f} ppm from the first to '
+               'the last third of the log.')
 
 
 def _of_reference(found: Hygiene, log: Log) -> Hygiene:
@@ -180,23 +200,27 @@ def _of_reference(found: Hygiene, log: Log) -> Hygiene:
         return found
     step = encoder_step(values) if heading else 0.0
     update = update_interval(log.time, values, step)
-    said = [f'The reference is renewed every {1000.0 * update:.4g} ms only, and held in between; it is interpolated.'] if update else []
-    return replace(found, heading_step=step, update_interval=update, remarks=(*found.remarks, *said))
+    said = [f'The reference is renewed every {1000.0 * update:.4g} ms only, and held in between; '
+            'it is interpolated.'] if update else []
+    return replace(found, heading_step=step, update_interval=update,
+                   remarks=(*found.remarks, *said))
 
 
 def encoder_step(heading: Array) -> float:
-    """Return the step of a reference heading, rad; 0 where it has none, or where the lattice is that of a calculated motion."""
+    """Return the step of a reference heading, rad; 0 without one or with a calculated motion."""
     known = heading[np.isfinite(heading)]
     step = codes_of(known).step
     change = np.diff(known)
-    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step) for each in (change, np.diff(change)))
+    changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
+                          for each in (change, np.diff(change)))
     return step if step and differing > _DISORDER * changes else 0.0
 
 
 def update_interval(time: Array, values: Array, step: float) -> float | None:
-    """Return the interval at which a reference is renewed, s, where that is not with each sample; small changes may hide in a step."""
+    """Return the interval at which a held reference is renewed, s; None if by each sample."""
     change = np.diff(values)
     renewed = np.flatnonzero(np.isfinite(change) & (change != 0.0))
+    # Small changes may hide in a step.
     fast = np.abs(change[renewed[1:]]) > 2.5 * step
     gaps = np.diff(renewed)[fast]
     if len(gaps) < 20 or np.quantile(gaps, 0.1) < 2.0:
@@ -206,8 +230,8 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
     return float(gaps[regular].mean() * np.median(np.diff(time))) if regular.mean() > 0.8 else None
 
 
-def _of_samples(found: Hygiene, output: Array, rate: Array | None, line: Line | None, model: GyroModel | None, known: Mask,
-                log: Log) -> Hygiene:
+def _of_samples(found: Hygiene, output: Array, rate: Array | None, line: Line | None,
+                model: GyroModel | None, known: Mask, log: Log) -> Hygiene:
     """Look at the samples of the gyro: their codes, their limit, stuck and wild ones."""
     codes, seen = codes_of(output[known]), compare(output, rate, line)
     limit = limit_of(codes, seen, LEVEL)
@@ -219,17 +243,20 @@ def _of_samples(found: Hygiene, output: Array, rate: Array | None, line: Line | 
         stuck = stuck_samples(seen, codes, band, good, LEVEL)
     good = good if stuck is None else good & ~stuck.repeats
     # Single samples that get out of a dead band are not wild.
-    wild = wild_samples(seen, good if band is None else good & ~band.holds(seen.output), 0.5 * codes.step, LEVEL)
+    wild = wild_samples(seen, good if band is None else good & ~band.holds(seen.output),
+                        0.5 * codes.step, LEVEL)
     good = good if wild is None else good & ~wild.samples
-    findings = [*found.findings, *_quantized(codes, seen.white, model), *_limited(limit, at_limit, model), *_stuck(stuck, log),
-                *_wild(wild, log), *_rounded(found.heading_step, log, seen.white)]
+    findings = [*found.findings, *_quantized(codes, seen.white, model),
+                *_limited(limit, at_limit, model), *_stuck(stuck, log), *_wild(wild, log),
+                *_rounded(found.heading_step, log, seen.white)]
     matters = codes.step >= STEP * seen.white
-    return replace(found, findings=tuple(findings), trusted=good & _free(limit, seen), limit=None if limit is None else limit.size,
+    return replace(found, findings=tuple(findings), trusted=good & _free(limit, seen),
+                   limit=None if limit is None else limit.size,
                    step=codes.step if matters else 0.0)
 
 
 def _free(limit: Limit | None, seen: Compared) -> Mask:
-    """Mark the samples that no limit cuts, whatever their noise: by what is expected, as a choice by the noise would bias the rest."""
+    """Mark the samples that no limit cuts, by what is expected, for their noise would bias it."""
     if limit is None or seen.expected is None:
         return np.ones(len(seen.output), dtype=bool)
     near = _NEAR_LIMIT * max(seen.white, seen.scatter)
@@ -239,7 +266,8 @@ def _free(limit: Limit | None, seen: Compared) -> Mask:
 def _knows(model: GyroModel | None, name: str, value: float) -> bool:
     """Tell whether a model has an effect on the signal with this value, to 2 %."""
     terms = () if model is None else model.terms
-    return any(term.effect.name == name and abs(term.values[0] / value - 1.0) < 0.02 for term in terms)
+    return any(term.effect.name == name and abs(term.values[0] / value - 1.0) < 0.02
+               for term in terms)
 
 
 def _quantized(codes: Codes, white: float, model: GyroModel | None) -> Iterator[Finding]:
@@ -248,16 +276,18 @@ def _quantized(codes: Codes, white: float, model: GyroModel | None) -> Iterator[
     chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
     within = 1.96 * codes.deviation
     yield finding('quantization', codes.step, (codes.step - within, codes.step + within), chance,
-                  f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s apart, '
-                  f'where its white noise is {white / DEGREE:.3g} deg/s')
+                  f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s '
+                  f'apart, where its white noise is {white / DEGREE:.3g} deg/s')
 
 
 def _limited(limit: Limit | None, at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
     if limit is None or _knows(model, 'saturation', limit.size):
         return
-    sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high) if np.isfinite(value)]
+    sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
+             if np.isfinite(value)]
     yield finding('saturation', limit.size, (limit.size, limit.size), limit.p_value,
-                  f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) have the extreme code {" or ".join(sides)}')
+                  f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) have '
+                  f'the extreme code {" or ".join(sides)}')
 
 
 def _count_and_first(samples: Mask, log: Log) -> tuple[int, float]:
@@ -270,24 +300,29 @@ def _stuck(stuck: Stuck | None, log: Log) -> Iterator[Finding]:
     if stuck is None:
         return
     count, first = _count_and_first(stuck.repeats, log)
-    yield _counted('stuck_samples', count, stuck.p_value, f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
-                   f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the whole log')
+    yield _counted('stuck_samples', count, stuck.p_value,
+                   f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
+                   f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the '
+                   'whole log')
 
 
 def _wild(wild: Wild | None, log: Log) -> Iterator[Finding]:
     if wild is None:
         return
     count, first = _count_and_first(wild.samples, log)
-    yield _counted('outliers', count, wild.p_value, f'{count} single samples are up to {wild.largest:.0f} standard deviations off their '
-                   f'neighbours, the first at {first:.3f} s')
+    yield _counted('outliers', count, wild.p_value,
+                   f'{count} single samples are up to {wild.largest:.0f} standard deviations off '
+                   f'their neighbours, the first at {first:.3f} s')
 
 
 def _rounded(step: float, log: Log, white: float) -> Iterator[Finding]:
-    """Give the step of the reference heading as a finding, if its differences add to the variance of the residual."""
+    """Give the step of the reference heading as a finding, if it adds to the variance left."""
     assert log.time is not None
     interval = float(np.median(np.diff(log.time)))
     share = step ** 2 / 6.0 / (interval * white) ** 2 if white else np.inf * step
     if step and share > REFERENCE_STEP:
         yield finding('reference_quantization', step, (step, step), 0.0,
-                      f'the reference heading comes in steps of {step / DEGREE:.4g} deg: its rate over one sample is uncertain by '
-                      f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has {white / DEGREE:.3g} deg/s of noise')
+                      f'the reference heading comes in steps of {step / DEGREE:.4g} deg: its rate '
+                      'over one sample is uncertain by '
+                      f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
+                      f'{white / DEGREE:.3g} deg/s of noise')

@@ -1,4 +1,4 @@
-"""Elements of HTML and SVG: whatever is not an element itself is escaped, so that no text can become one."""
+"""Elements of HTML and SVG: all else is escaped, so that no text can become an element."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ def element(name: str, *children: str | None, **attributes: str | float | None) 
     ----------
     name : of its tag
     children : elements, or texts, which are escaped; None is left out
-    attributes : with _ for -, and one at the end to avoid a word of Python; those that are None are left out
+    attributes : with _ for -, and one at the end to avoid a word of Python; None is left out
 
     """
-    given = {key.rstrip('_').replace('_', '-'): _text(value) for key, value in attributes.items() if value is not None}
+    given = {key.rstrip('_').replace('_', '-'): _text(value) for key, value in attributes.items()
+             if value is not None}
     named = ''.join(f' {key}="{_escaped(value)}"' for key, value in given.items())
-    inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children if child is not None)
+    inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children
+                     if child is not None)
     return Markup(f'<{name}{named}/>' if name in _EMPTY else f'<{name}{named}>{inside}</{name}>')
 
 
