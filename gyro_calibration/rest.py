@@ -71,6 +71,7 @@ class Energy:
     The energy of the last `WINDOW` s.
 
     Attributes
+    ----------
     factor : noise of the samples over that of the model, by the quietest windows; 1 until enough
         were seen
 

@@ -104,7 +104,7 @@ class Emulator:
         self.sent_bytes = 0
         self.lost_bytes = 0
 
-    def open(self) -> None:
+    def open(self) -> None:  # noqa: A003
         """Make the pseudo-terminal and the link to it; `path` is then its name."""
         self._master, slave = os.openpty()
         tty.setraw(slave)  # else it echoes samples, and its line discipline takes characters out

@@ -55,7 +55,7 @@ class SerialPort:
         """Whether the port is open, as far as is known."""
         return self._port is not None
 
-    def open(self) -> None:
+    def open(self) -> None:  # noqa: A003
         """
         Open the port for this program alone, and drop what came before.
 

@@ -16,7 +16,7 @@ _BLOCKS = 9
 
 
 def numbered(names: Sequence[str]) -> Numbers:
-    """Number the sweeps that have names, in the order in which they come."""
+    """Give sweeps that have names their numbers, in the order in which they come."""
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return np.array([numbers[name] for name in names])
 
@@ -44,7 +44,7 @@ def sweeps(rate: Array) -> Numbers:
 
 
 def _passes(value: Array) -> Numbers:
-    """Number the passes through values: a new one begins where the direction turns back."""
+    """Give passes through values their numbers; one begins where the direction turns back."""
     change = np.diff(value)
     # Rates that were found differ slightly in size if their sign is opposite.
     steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)

@@ -40,7 +40,7 @@ class Parameter:
     default: bool | int | float | str | Sequence[str]
     description: str
     unit: str = ''
-    range: tuple[float, float] | None = None
+    range: tuple[float, float] | None = None  # noqa: A003
     dynamic: bool = False
     choices: tuple[str, ...] = ()
 

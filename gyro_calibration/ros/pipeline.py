@@ -429,7 +429,7 @@ class Pipeline:
 
     # Now and then
 
-    def set(self, values: SimpleNamespace) -> None:
+    def set(self, values: SimpleNamespace) -> None:  # noqa: A003
         """Go on with other values of the parameters."""
         self.values = values
         tracking = tracker_settings(values, self.store.model.noise)

@@ -173,7 +173,8 @@ def run(node_class: Callable[[], Node]) -> int:
     Returns
     -------
     int
-        0 after a signal; 2 when an argument or a parameter was refused, with one sentence on standard error.
+        0 after a signal; 2 when an argument or a parameter was refused, with a sentence on
+        standard error.
 
     """
     stop = _stop_on_signals()
@@ -185,7 +186,7 @@ def run(node_class: Callable[[], Node]) -> int:
         return 0
     finally:
         rclpy.try_shutdown()
-        # Ctrl-C under a launch file comes twice, and the second would kill the interpreter while it ends.
+        # Ctrl-C under a launch file comes twice; the second would kill the interpreter at its end.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
@@ -194,7 +195,8 @@ def _start(node_class: Callable[[], Node]) -> Node | None:
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         return node_class()
-    # rclpy says with a RuntimeError that an argument cannot be parsed, and with a ParameterException that one of its own is none
+    # rclpy raises RuntimeError where an argument cannot be parsed, and ParameterException where a
+    # parameter of its own is not possible
     except (ValueError, OSError, RuntimeError, ParameterException) as error:
         print(f'{node_class.__name__}: {error}', file=sys.stderr)
         return None
@@ -204,7 +206,8 @@ def _stop_on_signals() -> threading.Event:
     """
     Return an event that SIGINT and SIGTERM set.
 
-    rclpy's own handlers invalidate the context while a callback still publishes, which ends some runs in a traceback.
+    rclpy's own handlers invalidate the context while a callback still publishes, which ends some
+    runs in a traceback.
 
     """
     stop = threading.Event()

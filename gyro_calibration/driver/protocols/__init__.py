@@ -1,4 +1,4 @@
-"""
+r"""
 Wire formats of serial gyros: bytes to samples and back, and recognizing a format (`listening`).
 
 No port, no ROS, no clock.

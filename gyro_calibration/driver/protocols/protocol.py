@@ -413,7 +413,7 @@ class Decoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes that belonged to no frame."""
+        """Return how many bytes belonged to no frame."""
         return self._splitter.discarded_bytes + self._refused_bytes
 
     def feed(self, data: bytes) -> list[Sample]:
