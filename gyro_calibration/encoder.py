@@ -287,7 +287,7 @@ def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
     """
     Return N², rad²/s, and the variances of the mean by noise and by wander, (rad/s)².
 
-    The input are mean rates between pieces of some length, s. Their cosine transform has
+    The input is the mean rates between pieces of some length, s. Their cosine transform has
     independent values, each with a variance that is known but for one factor, given three ratios:
     those of rate noise, of noise of the headings, and of flicker or rate random walk.
 

@@ -28,7 +28,7 @@ OUTLYING = 6.0
 SMALLEST_TEMPERATURE_SPREAD = 1.0
 #: With fewer, what the dwells of a sweep have in common is not distinguishable from chance.
 FEWEST_SWEEPS = 4
-#: Number of blocks of dwells that replace sweeps where there are fewer sweeps.
+#: Largest number of blocks of dwells that replace sweeps where there are fewer sweeps.
 _MOST_BLOCKS = 60
 #: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
 _FEWEST_DWELLS = 12
@@ -45,7 +45,7 @@ class Scatter:
     Attributes
     ----------
     dwell : of a dwell, beyond its own deviation, rad/s
-    dwell_scale : of the scale factor from dwell to dwell, 1; a limit of the table's speed
+    dwell_scale : of the scale factor from dwell to dwell, 1, such as that of a table's speed
     sweep_bias : of the bias from sweep to sweep, rad/s
     sweep_scale : of the scale factor from sweep to sweep, 1
     kept : which dwells are not outlying, shape (n,)
@@ -70,7 +70,7 @@ class Scatter:
 
 
 def _own_deviation(dwells: Dwells) -> Array:
-    """Return the deviations of the dwells, rad/s; one that is not known is their rms."""
+    """Return the deviations of the dwells, rad/s; an unknown one is the rms of the others."""
     known = np.isfinite(dwells.deviation)
     typical = rms(dwells.deviation[known]) if known.any() else 0.0
     return np.where(known, dwells.deviation, typical)
@@ -139,8 +139,8 @@ def find_scatter(dwells: Dwells) -> Scatter:
     kept = not_outlying(dwells)
     used = take(dwells, kept)
     error, surface = used.output - used.rate, _surface(used)
-    # The likelihood does not depend on what the surface explains; with it, errors near zero would
-    # be lost in rounding.
+    # The likelihood does not depend on what the surface explains; errors near zero would be lost
+    # in rounding beside it.
     error = error - surface @ (surface.T @ error)
     size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)
@@ -150,7 +150,7 @@ def find_scatter(dwells: Dwells) -> Scatter:
         return Scatter(  # type: ignore[misc]
             *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)
 
-    # a simplex collapses onto a bound, and stays there
+    # not by a simplex, which collapses onto a bound and stays there
     best = minimize(
         lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
         np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
