@@ -25,15 +25,19 @@ SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000
 SENT = 0.5  # rad/s
 FULL_SCALE = 1.5  # rad/s
-CHECKS = {'kvh_1750': 'CRC-32', 'fizoptika': 'sum, 16 bits', 'kvh_ecore': 'sum, 7 bits', 'witmotion': 'sum, 8 bits'}
+CHECKS = {'kvh_1750': 'CRC-32', 'fizoptika': 'sum, 16 bits', 'kvh_ecore': 'sum, 7 bits',
+          'witmotion': 'sum, 8 bits'}
 
 
 def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
     """Return the rates that arrive, rad/s, and as the first one that which a good line gives."""
     protocol, generator = find(name), np.random.default_rng(1)
-    settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None), full_scale=full_scale)
-    encode, decoder, line = protocol.encoder(settings), protocol.decoder(settings), SerialFaults(0.0, 0.0, *(3 * [share / 3.0]))
-    good = protocol.preamble + b''.join(encode(Sample(SENT, 25.0, 1.0, number)) for number in range(4))
+    settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None),
+                       full_scale=full_scale)
+    encode, decoder, line = (protocol.encoder(settings), protocol.decoder(settings),
+                             SerialFaults(0.0, 0.0, *(3 * [share / 3.0])))
+    good = protocol.preamble + b''.join(encode(Sample(SENT, 25.0, 1.0, number))
+                                        for number in range(4))
     rates = [protocol.decoder(settings).feed(good)[-1].output]
     for number in range(FRAMES):
         data = damaged(line, encode(Sample(SENT, 25.0, number / protocol.rate, number)), generator)
@@ -48,13 +52,14 @@ def row(name: str, share: float) -> str:
     _, *limited = arrived(name, share, FULL_SCALE)
     left = [rate for rate in limited if abs(rate - exact) > 1e-9]
     worst = max(map(abs, wrong), default=math.nan) / DEGREE
-    return (f'| `{name}` | {CHECKS.get(name, "none")} | {100.0 * share:g} % | {100.0 * len(rates) / FRAMES:.1f} % | {len(wrong)} '
-            f'| {worst:.3g} | {len(left)} |')
+    return (f'| `{name}` | {CHECKS.get(name, "none")} | {100.0 * share:g} % '
+            f'| {100.0 * len(rates) / FRAMES:.1f} % | {len(wrong)} | {worst:.3g} | {len(left)} |')
 
 
 def table() -> Iterator[str]:
     """Yield the lines of the table in Markdown."""
-    yield f'| format | check | bytes struck | of {FRAMES} samples arrive | wrong ones | the largest, deg/s | wrong ones within full scale |'
+    yield (f'| format | check | bytes struck | of {FRAMES} samples arrive | wrong ones '
+           '| the largest, deg/s | wrong ones within full scale |')
     yield '|:---|:---|---:|---:|---:|---:|---:|'
     for name in sorted(PROTOCOLS):
         yield from (row(name, share) for share in SHARES)

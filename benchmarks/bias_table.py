@@ -28,14 +28,13 @@ from bias_history import answers, carried_answers, coverage, cubic, linear  # no
 from gyro_calibration.log import DEGREE  # noqa: E402
 
 #: Name, curve, size of the coefficient, and what else is simulated.
-CASES = [
-    ('linear', linear, 1.0, {}), ('cubic', cubic, 1.0, {}), ('linear, 0.003 deg/s/K', linear, 0.1, {}),
-    ('cubic, 0.003 deg/s/K', cubic, 0.1, {}),
-    ('cubic, turns on within 0.01 deg/s', cubic, 1.0, {'turn_on': 0.01 * DEGREE}),
-    ('cubic, turns on within 0.2 deg/s', cubic, 1.0, {'turn_on': 0.2 * DEGREE}),
-    ('linear, a jump by 0.5 deg/s', linear, 1.0, {'jump': 0.5 * DEGREE}),
-    ('cubic, a jump by 0.5 deg/s', cubic, 1.0, {'jump': 0.5 * DEGREE}),
-    ('cubic, no outliers', cubic, 1.0, {'outliers': 0.0})]
+CASES = [('linear', linear, 1.0, {}), ('cubic', cubic, 1.0, {}),
+         ('linear, 0.003 deg/s/K', linear, 0.1, {}), ('cubic, 0.003 deg/s/K', cubic, 0.1, {}),
+         ('cubic, turns on within 0.01 deg/s', cubic, 1.0, {'turn_on': 0.01 * DEGREE}),
+         ('cubic, turns on within 0.2 deg/s', cubic, 1.0, {'turn_on': 0.2 * DEGREE}),
+         ('linear, a jump by 0.5 deg/s', linear, 1.0, {'jump': 0.5 * DEGREE}),
+         ('cubic, a jump by 0.5 deg/s', cubic, 1.0, {'jump': 0.5 * DEGREE}),
+         ('cubic, no outliers', cubic, 1.0, {'outliers': 0.0})]
 
 
 def row(number: int, gyros: int) -> str:
@@ -46,28 +45,33 @@ def row(number: int, gyros: int) -> str:
     off, change = np.abs(asked[:, 2:, 4]) / DEGREE, np.abs(asked[:, 2:, 6]) / DEGREE
     outliers, held, wrong = asked[..., 7:].sum(axis=(0, 1))
     shown = ' | '.join(f'{100 * share:.1f}' for share in shares)
-    return (f'| {name} | {shown} | {np.median(off):.4f} | {np.median(change):.4f} | {np.sqrt(np.mean(off ** 2)):.4f} | '
-            f'{np.sqrt(np.mean(change ** 2)):.4f} | {held:.0f} of {outliers:.0f} | {wrong / gyros:.2f} |')
+    return (f'| {name} | {shown} | {np.median(off):.4f} | {np.median(change):.4f} '
+            f'| {np.sqrt(np.mean(off ** 2)):.4f} | {np.sqrt(np.mean(change ** 2)):.4f} '
+            f'| {held:.0f} of {outliers:.0f} | {wrong / gyros:.2f} |')
 
 
 def carried_row(number: int, gyros: int) -> str:
     """Return how calibrations did in a later run."""
     (name, curve, size, given), generator = CASES[number], np.random.default_rng(100 + number)
-    carried = np.array([carried_answers(generator, curve(generator, size), **given) for _ in range(gyros)])
-    shown = ' | '.join(f'{100 * coverage(*carried[:, place].T):.1f} | {np.sqrt(np.mean(carried[:, place, 0] ** 2)) / DEGREE:.4f}'
+    carried = np.array([carried_answers(generator, curve(generator, size), **given)
+                        for _ in range(gyros)])
+    shown = ' | '.join(f'{100 * coverage(*carried[:, place].T):.1f} '
+                       f'| {np.sqrt(np.mean(carried[:, place, 0] ** 2)) / DEGREE:.4f}'
                        for place in range(2))
     return f'| {name} | {shown} |'
 
 
 def main(gyros: int) -> None:
     """Print both tables."""
-    print('| gyro | inside, begin of a run | inside, bias | inside, difference | median error of the difference | of none | rms | of none |'
-          ' outliers held back | good ones held back, a gyro |\n|' + '---|' * 10)
+    print('| gyro | inside, begin of a run | inside, bias | inside, difference '
+          '| median error of the difference | of none | rms | of none | outliers held back '
+          '| good ones held back, a gyro |\n|' + '---|' * 10)
     numbers = range(len(CASES))
     with ProcessPoolExecutor() as pool:
         for line in pool.map(row, numbers, [gyros] * len(CASES)):
             print(line, flush=True)
-        print('\n| gyro | inside, carried without a table | rms error | inside, with a table | rms error |\n|' + '---|' * 5)
+        print('\n| gyro | inside, carried without a table | rms error | inside, with a table '
+              '| rms error |\n|' + '---|' * 5)
         for line in pool.map(carried_row, numbers, [4 * gyros] * len(CASES)):
             print(line, flush=True)
 

@@ -50,18 +50,21 @@ def knows_rests(drive: Drive) -> tuple[tuple[Array, Array], tuple[Array, Array]]
     corners = _corners(drive.time, rests)
     output = integrate(drive.time, drive.output)
     turned, noisy = (np.concatenate([[0.0], np.cumsum(step * ~rests)]) for step in (
-        np.diff(output) / scale, np.diff(drive.time) * (drive.gyro.model.noise.angle_random_walk / scale) ** 2))
+        np.diff(output) / scale,
+        np.diff(drive.time) * (drive.gyro.model.noise.angle_random_walk / scale) ** 2))
     filtered, predicted, transitions = [(mean, covariance)], [], []
     for begin, end in zip(corners[:-1], corners[1:]):
         duration = drive.time[end] - drive.time[begin]
         transition, grown = _transition(drive, duration)
         if rests[begin]:
-            mean, covariance = _measured(mean, covariance, _seen(0.0), (output[end] - output[begin]) / duration,
+            mean, covariance = _measured(mean, covariance, _seen(0.0),
+                                         (output[end] - output[begin]) / duration,
                                          drive.gyro.model.noise.angle_random_walk ** 2 / duration)
             filtered[-1] = mean, covariance
         else:
             transition = transition.copy()
-            transition[_CORRECTION] = _seen((turned[end] - turned[begin]) / duration) * duration / scale
+            transition[_CORRECTION] = (
+                _seen((turned[end] - turned[begin]) / duration) * duration / scale)
             transition[_CORRECTION, _CORRECTION] = 1.0
         mean, covariance = transition @ mean, transition @ covariance @ transition.T + grown
         predicted.append((mean, covariance))
@@ -69,18 +72,21 @@ def knows_rests(drive: Drive) -> tuple[tuple[Array, Array], tuple[Array, Array]]
         filtered.append((mean, covariance))
     live = [filtered[0], *predicted]
     return (_headings(drive.time, corners, turned, noisy, live),
-            _headings(drive.time, corners, turned, noisy, _smoothed(filtered, predicted, transitions)))
+            _headings(drive.time, corners, turned, noisy,
+                      _smoothed(filtered, predicted, transitions)))
 
 
 def _calibrated(drive: Drive) -> tuple[Array, Array]:
     """Return mean and covariance of the state after the calibration."""
     (time, output), noise = drive.run, drive.gyro.model.noise
     flicker = noise.bias_instability ** 2 * math.log(_RATIO) / math.pi
-    mean, covariance = np.zeros(_SIZE), np.diag([0.0, 0.1 ** 2, DEGREE ** 2, *np.full(len(_CONSTANTS), flicker)])
+    mean, covariance = np.zeros(_SIZE), np.diag([0.0, 0.1 ** 2, DEGREE ** 2,
+                                                 *np.full(len(_CONSTANTS), flicker)])
     corners = np.searchsorted(time, np.arange(0.0, time[-1] + 1e-9, 0.1) - 1e-9)
     said, true = integrate(time, output)[corners], CALIBRATION.heading_at(time[corners])
     for duration, gyro, turned in zip(np.diff(time[corners]), np.diff(said), np.diff(true)):
-        mean, covariance = _measured(mean, covariance, _seen(turned / duration), (gyro - turned) / duration,
+        mean, covariance = _measured(mean, covariance, _seen(turned / duration),
+                                     (gyro - turned) / duration,
                                      noise.angle_random_walk ** 2 / duration)
         transition, grown = _transition(drive, duration)
         mean, covariance = transition @ mean, transition @ covariance @ transition.T + grown
@@ -91,14 +97,16 @@ def _corners(time: Array, rests: Array) -> Array:
     """Return the samples between which the filter steps: ends of rests, at most a block apart."""
     changes = np.flatnonzero(np.diff(rests)) + 1
     count = round(_BLOCK / (time[1] - time[0]))
-    return np.unique(np.concatenate([[0], changes, np.arange(0, len(time), count), [len(time) - 1]]))
+    return np.unique(np.concatenate([[0], changes, np.arange(0, len(time), count),
+                                     [len(time) - 1]]))
 
 
 def _transition(drive: Drive, duration: float) -> tuple[Array, Array]:
     """Return what of the state stays for a time, and what comes new, shape (n, n) each."""
     stays = np.exp(-duration / _CONSTANTS)
     flicker = drive.gyro.model.noise.bias_instability ** 2 * math.log(_RATIO) / math.pi
-    return np.diag([1.0, 1.0, 1.0, *stays]), np.diag([0.0, 0.0, 0.0, *flicker * (1.0 - stays ** 2)])
+    return np.diag([1.0, 1.0, 1.0, *stays]), np.diag([0.0, 0.0, 0.0,
+                                                      *flicker * (1.0 - stays ** 2)])
 
 
 def _seen(rate: float) -> Array:
@@ -106,7 +114,8 @@ def _seen(rate: float) -> Array:
     return np.concatenate([[0.0, rate, 1.0], np.ones(len(_CONSTANTS))])
 
 
-def _measured(mean: Array, covariance: Array, seen: Array, value: float, variance: float) -> tuple[Array, Array]:
+def _measured(mean: Array, covariance: Array, seen: Array, value: float,
+              variance: float) -> tuple[Array, Array]:
     along = covariance @ seen
     gain = along / (seen @ along + variance)
     return mean + gain * (value - seen @ mean), covariance - np.outer(gain, along)
@@ -115,14 +124,19 @@ def _measured(mean: Array, covariance: Array, seen: Array, value: float, varianc
 def _smoothed(filtered: list, predicted: list, transitions: list) -> list:
     """Go back over the filter's steps (Rauch, Tung and Striebel)."""
     states = [filtered[-1]]
-    for (mean, covariance), (next_mean, next_covariance), transition in zip(filtered[-2::-1], predicted[::-1], transitions[::-1]):
+    for (mean, covariance), (next_mean, next_covariance), transition in zip(
+            filtered[-2::-1], predicted[::-1], transitions[::-1]):
         gain = np.linalg.lstsq(next_covariance, transition @ covariance, rcond=1e-12)[0].T
         later_mean, later_covariance = states[-1]
-        states.append((mean + gain @ (later_mean - next_mean), covariance + gain @ (later_covariance - next_covariance) @ gain.T))
+        states.append((mean + gain @ (later_mean - next_mean),
+                       covariance + gain @ (later_covariance - next_covariance) @ gain.T))
     return states[::-1]
 
 
-def _headings(time: Array, corners: Array, turned: Array, noisy: Array, states: list) -> tuple[Array, Array]:
+def _headings(time: Array, corners: Array, turned: Array, noisy: Array,
+              states: list) -> tuple[Array, Array]:
     """Return heading and variance of every sample."""
-    correction, variance = np.array([(mean[_CORRECTION], covariance[_CORRECTION, _CORRECTION]) for mean, covariance in states]).T
-    return turned - np.interp(time, time[corners], correction), noisy + np.interp(time, time[corners], variance)
+    correction, variance = np.array([(mean[_CORRECTION], covariance[_CORRECTION, _CORRECTION])
+                                     for mean, covariance in states]).T
+    return (turned - np.interp(time, time[corners], correction),
+            noisy + np.interp(time, time[corners], variance))

@@ -26,9 +26,11 @@ from gyro_calibration.heading import integrate
 from gyro_calibration.model import GyroModel, Term
 
 #: Errors of some 0.01 rad/s, as a fit to a fibre-optic gyro on a rate table gives them.
-C = np.array([[4e-3, 2.1e-2, -6e-4, -1.3e-2], [-8e-4, 3e-3, 2e-4, -5e-4], [5e-5, -2e-4, 3e-5, 1e-4]])
+C = np.array([[4e-3, 2.1e-2, -6e-4, -1.3e-2], [-8e-4, 3e-3, 2e-4, -5e-4],
+              [5e-5, -2e-4, 3e-5, 1e-4]])
 CENTRE, SCALE, MIDDLE, SPAN = 0.01, 1.1, 43.0, 4.0
-MODEL = GyroModel((Term(rate_temperature_polynomial(3, 2), (CENTRE, SCALE, MIDDLE, SPAN, *C.ravel().tolist())),),
+MODEL = GyroModel((Term(rate_temperature_polynomial(3, 2),
+                        (CENTRE, SCALE, MIDDLE, SPAN, *C.ravel().tolist())),),
                   rate_range=(-1.8, 1.8), temperature_range=(37.0, 49.0))
 BLOCK = 1 << 15  # the fastest of 2**11 to 2**16 for the floor
 
@@ -37,7 +39,8 @@ Samples = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def samples(count: int, generator: np.random.Generator, first: int = 0) -> Samples:
     """Return time, output and temperature of a log."""
-    return np.arange(first, first + count) * 0.01, generator.uniform(-1.75, 1.75, count), generator.uniform(38.0, 48.0, count)
+    return (np.arange(first, first + count) * 0.01, generator.uniform(-1.75, 1.75, count),
+            generator.uniform(38.0, 48.0, count))
 
 
 def package(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
@@ -45,7 +48,8 @@ def package(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np
 
 
 def polyval2d(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.ndarray:
-    rate = output - np.polynomial.polynomial.polyval2d((temperature - MIDDLE) / SPAN, (output - CENTRE) / SCALE, C)
+    rate = output - np.polynomial.polynomial.polyval2d((temperature - MIDDLE) / SPAN,
+                                                       (output - CENTRE) / SCALE, C)
     return np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (rate[1:] + rate[:-1]))])
 
 
@@ -59,7 +63,8 @@ def floor(time: np.ndarray, output: np.ndarray, temperature: np.ndarray) -> np.n
     return heading
 
 
-def _floor_rate(output: np.ndarray, temperature: np.ndarray, rate: np.ndarray, work: np.ndarray) -> None:
+def _floor_rate(output: np.ndarray, temperature: np.ndarray, rate: np.ndarray,
+                work: np.ndarray) -> None:
     x, y, total, row = work
     np.subtract(output, CENTRE, out=x)
     np.divide(x, SCALE, out=x)
@@ -78,7 +83,8 @@ def _floor_rate(output: np.ndarray, temperature: np.ndarray, rate: np.ndarray, w
     np.subtract(output, total, out=rate)
 
 
-def _floor_heading(time: np.ndarray, rate: np.ndarray, heading: np.ndarray, begin: int, end: int, work: np.ndarray) -> None:
+def _floor_heading(time: np.ndarray, rate: np.ndarray, heading: np.ndarray, begin: int, end: int,
+                   work: np.ndarray) -> None:
     if begin == 1:
         heading[0] = 0.0
     turned, interval = heading[begin:end], work[:end - begin]
@@ -90,8 +96,9 @@ def _floor_heading(time: np.ndarray, rate: np.ndarray, heading: np.ndarray, begi
     np.cumsum(turned, out=turned)
 
 
-SIDES: Mapping[str, Callable[..., np.ndarray]] = {
-    'numpy polyval2d': polyval2d, 'Horner in place, in blocks (floor)': floor, 'compensate, integrate': package}
+SIDES: Mapping[str, Callable[..., np.ndarray]] = {'numpy polyval2d': polyval2d,
+                                                  'Horner in place, in blocks (floor)': floor,
+                                                  'compensate, integrate': package}
 
 
 def seconds(work: Callable[[], object], times: int = 1) -> float:
@@ -107,19 +114,25 @@ def side_by_side(count: int = 10 ** 7, repeats: int = 9) -> str:
     log = samples(count, np.random.default_rng(0))
     wanted = floor(*log)
     assert all(np.allclose(side(*log), wanted, rtol=0.0, atol=1e-9) for side in SIDES.values())
-    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()] for _ in range(repeats)])  # noqa: B023
+    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()]
+                      for _ in range(repeats)])  # noqa: B023
     medians, ratios = np.median(taken, axis=0), np.median(taken / taken[:, 1:2], axis=0)
-    lines = [f'| {count:.0e} samples | million samples/s | time over the floor |', '|:---|---:|---:|']
-    lines += [f'| {name} | {count / median / 1e6:.0f} | {ratio:.2f} |' for name, median, ratio in zip(SIDES, medians, ratios)]
+    lines = [f'| {count:.0e} samples | million samples/s | time over the floor |',
+             '|:---|---:|---:|']
+    lines += [f'| {name} | {count / median / 1e6:.0f} | {ratio:.2f} |'
+              for name, median, ratio in zip(SIDES, medians, ratios)]
     return '\n'.join(lines)
 
 
-def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7), repeats: int = 9) -> str:
+def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7),
+              repeats: int = 9) -> str:
     """Return a table of the cost of a sample in logs of several lengths, and of single samples."""
     logs = [samples(count, np.random.default_rng(0)) for count in counts]
-    taken = [[seconds(lambda: package(*log), max(10 ** 6 // len(log[0]), 1)) for log in logs] for _ in range(repeats)]  # noqa: B023
+    taken = [[seconds(lambda: package(*log), max(10 ** 6 // len(log[0]), 1)) for log in logs]
+             for _ in range(repeats)]  # noqa: B023
     costs = np.median(taken, axis=0) / counts
-    alone = np.median([seconds(lambda: compensate(MODEL, 0.5, 42.0), 10 ** 4) for _ in range(repeats)])
+    alone = np.median([seconds(lambda: compensate(MODEL, 0.5, 42.0), 10 ** 4)
+                       for _ in range(repeats)])
     lines = ['| samples in one call | ns a sample |', '|---:|---:|']
     lines += [f'| {count:.0e} | {1e9 * cost:.1f} |' for count, cost in zip(counts, costs)]
     return '\n'.join(lines + [f'| 1, a float, without integration | {1e9 * alone:.0f} |'])
@@ -134,12 +147,14 @@ def long_log(count: int = 10 ** 8, block: int = 10 ** 6) -> str:
         heading = integrate(time, compensate(MODEL, output, temperature).rate, heading)[-1]
         taken += clock.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return f'{count:.0e} samples in blocks of {block:.0e}: {1e9 * taken / count:.1f} ns a sample, peak memory {peak:.0f} MiB'
+    return (f'{count:.0e} samples in blocks of {block:.0e}: {1e9 * taken / count:.1f} ns a '
+            f'sample, peak memory {peak:.0f} MiB')
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--long', action='store_true', help='a hundred million samples in blocks, and nothing else')
+    parser.add_argument('--long', action='store_true',
+                        help='a hundred million samples in blocks, and nothing else')
     if parser.parse_args().long:
         print(long_log())
     else:

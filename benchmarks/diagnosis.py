@@ -97,9 +97,12 @@ class Case:
     @property
     def row(self) -> str:
         """The row of the table that it belongs to."""
-        return {'nothing': f'nothing, {self.noise}', 'effects': f'one effect, {self.multiple:g} times',
-                'pairs': f'two effects, {self.multiple:g} times', 'triples': f'three effects, {self.multiple:g} times',
-                'outside': f'outside the catalogue, {self.multiple:g} times', 'sets': 'twins, not to be told apart'}[self.part]
+        return {'nothing': f'nothing, {self.noise}',
+                'effects': f'one effect, {self.multiple:g} times',
+                'pairs': f'two effects, {self.multiple:g} times',
+                'triples': f'three effects, {self.multiple:g} times',
+                'outside': f'outside the catalogue, {self.multiple:g} times',
+                'sets': 'twins, not to be told apart'}[self.part]
 
 
 @dataclass(frozen=True)
@@ -122,15 +125,18 @@ class Answer:
 def cases(part: str, logs: int) -> Iterator[Case]:
     """Go through the cases of a part."""
     if part == 'nothing':
-        yield from (Case(part, (), 0.0, noise, _turn(REFERENCES, number), number) for number in range(logs) for noise in ALARMS)
+        yield from (Case(part, (), 0.0, noise, _turn(REFERENCES, number), number)
+                    for number in range(logs) for noise in ALARMS)
     elif part == 'sets':
         yield from (Case(part, (name,), 0.0, 'white', 'rate', number, pair)
                     for number in range(logs) for pair in TWINS for name in pair)
     else:
         multiples = (3.0,) if part == 'outside' else MULTIPLES
-        names: Sequence[tuple[str, ...]] = [(name,) for name in {'effects': FORMS, 'outside': OUTSIDE}.get(part, ())] or [()]
-        yield from (Case(part, each, multiple, _turn(NOISES, number + place), _reference(each, number + place), number)
-                    for number in range(logs) for multiple in multiples for place, each in enumerate(names))
+        names: Sequence[tuple[str, ...]] = (
+            [(name,) for name in {'effects': FORMS, 'outside': OUTSIDE}.get(part, ())] or [()])
+        yield from (Case(part, each, multiple, _turn(NOISES, number + place),
+                         _reference(each, number + place), number) for number in range(logs)
+                    for multiple in multiples for place, each in enumerate(names))
 
 
 def _turn(choices: Sequence[str], number: int) -> str:
@@ -139,19 +145,22 @@ def _turn(choices: Sequence[str], number: int) -> str:
 
 def _reference(names: Sequence[str], number: int) -> str:
     """Choose a reference; figures of the noise are sized without encoder steps."""
-    return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise' for name in names) else _turn(REFERENCES, number)
+    return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise'
+                         for name in names) else _turn(REFERENCES, number)
 
 
 def made(case: Case, generator: np.random.Generator) -> HiddenLog:
     """Hide what a case asks for."""
     if case.twins is not None:
         return twin(case.twins, case.names[0], generator)
-    step = {'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder' else {'reference': case.reference}
+    step = ({'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder'
+            else {'reference': case.reference})
     if case.part not in ('pairs', 'triples'):
         return hide(case.names, case.multiple, generator, noise=case.noise, **step)[0]
     choices = [name for name in FORMS if name not in ALONE]
     while True:
-        names = [str(name) for name in generator.choice(choices, 2 if case.part == 'pairs' else 3, replace=False)]
+        names = [str(name) for name in generator.choice(choices, 2 if case.part == 'pairs' else 3,
+                                                        replace=False)]
         log, = hide(names, case.multiple, generator, noise=case.noise, **step)
         if all(not cause.apart < LEFT * cause.multiple for cause in log.truth.gyro.causes):
             return log
@@ -169,26 +178,33 @@ def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
-    findings, beyond = ((), []) if found is None else (found.findings, [each.along for each in found.unexplained])
+    findings, beyond = ((), []) if found is None else (found.findings,
+                                                       [each.along for each in found.unexplained])
     # an encoder does have steps
-    how = judged(hidden, findings, beyond, ['reference_quantization'] if case.reference == 'encoder' else [])
-    return Answer(
-        str(case), case.row, {cause.name: _told(cause) for cause in hidden.truth.gyro.causes}, [_answer(each) for each in findings],
-        problem, seconds, how, won(hidden, found) if found is not None and hidden.truth.names else {}, how.right and not problem)
+    how = judged(hidden, findings, beyond,
+                 ['reference_quantization'] if case.reference == 'encoder' else [])
+    return Answer(str(case), case.row,
+                  {cause.name: _told(cause) for cause in hidden.truth.gyro.causes},
+                  [_answer(each) for each in findings], problem, seconds, how, won(hidden, found)
+                  if found is not None and hidden.truth.names else {}, how.right and not problem)
 
 
 def _told(cause: Cause) -> dict[str, Any]:
-    return {key: value for key, value in asdict(cause).items() if key != 'name' and not (isinstance(value, float) and math.isnan(value))}
+    return {key: value for key, value in asdict(cause).items() if key != 'name'
+            and not (isinstance(value, float) and math.isnan(value))}
 
 
 def _answer(finding: Finding) -> dict[str, Any]:
-    return {'effect': finding.effect, 'ambiguous_with': list(finding.ambiguous_with), 'p_value': finding.p_value,
-            'parameters': {name: [each.estimate, *each.interval] for name, each in finding.parameters.items()}}
+    return {'effect': finding.effect, 'ambiguous_with': list(finding.ambiguous_with),
+            'p_value': finding.p_value,
+            'parameters': {name: [each.estimate, *each.interval]
+                           for name, each in finding.parameters.items()}}
 
 
 # the table
 
-HEADER = '| hidden | logs | detected | first | in set | set size | extra | beyond | right | interval | gain | heading | time, s |'
+HEADER = ('| hidden | logs | detected | first | in set | set size | extra | beyond | right '
+          '| interval | gain | heading | time, s |')
 
 
 def line(row: str, answers: Sequence[Answer]) -> str:
@@ -196,11 +212,14 @@ def line(row: str, answers: Sequence[Answer]) -> str:
     sizes = [size for each in answers for size in each.how.set_sizes]
     held = [value for each in answers for value in each.how.held.values()]
     cells = [row, str(len(answers)), _percent([each.how.detected for each in answers])]
-    hidden = [_percent([getattr(each.how, name) for each in answers]) for name in ('first', 'in_set')]
+    hidden = [_percent([getattr(each.how, name) for each in answers])
+              for name in ('first', 'in_set')]
     cells += hidden if any(each.hidden for each in answers) else ['', '']
-    cells += [f'{np.mean(sizes):.2f}' if sizes else '', f'{np.mean([len(each.how.extra) for each in answers]):.3f}',
-              f'{np.mean([len(each.how.beyond) for each in answers]):.3f}', _percent([each.right for each in answers]), _percent(held),
-              _share(answers, 'rate'), _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}']
+    cells += [f'{np.mean(sizes):.2f}' if sizes else '',
+              f'{np.mean([len(each.how.extra) for each in answers]):.3f}',
+              f'{np.mean([len(each.how.beyond) for each in answers]):.3f}',
+              _percent([each.right for each in answers]), _percent(held), _share(answers, 'rate'),
+              _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}']
     return f'| {" | ".join(cells)} |'
 
 
@@ -217,16 +236,19 @@ def _share(answers: Sequence[Answer], name: str) -> str:
 def failing(answer: Answer) -> str:
     """Return what went wrong in a case, in a line or two."""
     hidden = ', '.join(f'{name} {_short(each)}' for name, each in answer.hidden.items())
-    said = [f'{"|".join([each["effect"], *each["ambiguous_with"]])} p={each["p_value"]:.1e} {_short(each["parameters"])}'
-            for each in answer.findings]
-    said += [f'unexplained along {along}' for along in answer.how.beyond] + [answer.problem] * bool(answer.problem)
-    return f'{answer.case}\n    hidden: {hidden or "nothing"}\n    answer: {"; ".join(said) or "nothing"}'
+    said = [f'{"|".join([each["effect"], *each["ambiguous_with"]])} p={each["p_value"]:.1e} '
+            f'{_short(each["parameters"])}' for each in answer.findings]
+    said += [f'unexplained along {along}'
+             for along in answer.how.beyond] + [answer.problem] * bool(answer.problem)
+    return (f'{answer.case}\n    hidden: {hidden or "nothing"}\n'
+            f'    answer: {"; ".join(said) or "nothing"}')
 
 
 def _short(value: Any) -> str:
     """Return numbers with four digits."""
     if isinstance(value, Mapping):
-        return '{' + ', '.join(f'{name}: {_short(each)}' for name, each in value.items() if name != 'unit') + '}'
+        return '{' + ', '.join(f'{name}: {_short(each)}'
+                               for name, each in value.items() if name != 'unit') + '}'
     if isinstance(value, (list, tuple)):
         return f'[{", ".join(_short(each) for each in value)}]'
     return f'{value:.4g}' if isinstance(value, float) else str(value)
@@ -236,15 +258,19 @@ def main(words: Sequence[str] | None = None) -> None:
     """Run the parts and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--logs', type=int, default=2, help='of each kind; default: 2')
-    parser.add_argument('--part', nargs='+', default=['nothing', 'effects', 'pairs', 'triples', 'outside', 'sets'])
+    parser.add_argument('--part', nargs='+',
+                        default=['nothing', 'effects', 'pairs', 'triples', 'outside', 'sets'])
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--only', default='', help='cases in whose names this regular expression is found')
-    parser.add_argument('--with-model', action='store_true', help='of the simulation, right but for what is hidden')
+    parser.add_argument('--only', default='',
+                        help='cases in whose names this regular expression is found')
+    parser.add_argument('--with-model', action='store_true',
+                        help='of the simulation, right but for what is hidden')
     parser.add_argument('--processes', type=int, default=1)
     parser.add_argument('--verbose', action='store_true', help='print each case that fails')
     parser.add_argument('--out', help='a file for all cases, JSON, one a line')
     given = parser.parse_args(words)
-    print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 12}', flush=True)
+    print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 12}',
+          flush=True)
     for part in given.part:
         chosen = [case for case in cases(part, given.logs) if re.search(given.only, str(case))]
         _print(_run(chosen, given))

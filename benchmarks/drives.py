@@ -36,10 +36,12 @@ class Gyro:
         return s, b
 
 
-def _gyro(name: str, interval: float, scale_factor_error: float, bias: float, walk: float, instability: float) -> Gyro:
+def _gyro(name: str, interval: float, scale_factor_error: float, bias: float, walk: float,
+          instability: float) -> Gyro:
     """Return a gyro from figures in the units of data sheets: deg/s, deg/√h, deg/h."""
     noise = Noise(walk * DEGREE / 60.0, instability * DEGREE / 3600.0)
-    return Gyro(name, GyroModel((Term(SCALE_FACTOR_ERROR, (scale_factor_error,)), Term(BIAS, (bias * DEGREE,))), noise=noise), interval)
+    return Gyro(name, GyroModel((Term(SCALE_FACTOR_ERROR, (scale_factor_error,)),
+                                 Term(BIAS, (bias * DEGREE,))), noise=noise), interval)
 
 
 GYROS = {
@@ -113,7 +115,8 @@ def _flank(count: int, ramp: float) -> Array:
 def _wobble(count: int, generator: np.random.Generator) -> Array:
     """Return the yaw on a straight line: shake of 0.5 to 2 deg/s at 0.5 to 2 Hz, and wander."""
     time = np.arange(count) * STEP
-    shake = generator.uniform(0.5, 2.0) * np.sin(2.0 * np.pi * (generator.uniform(0.5, 2.0) * time + generator.uniform()))
+    shake = generator.uniform(0.5, 2.0) * np.sin(
+        2.0 * np.pi * (generator.uniform(0.5, 2.0) * time + generator.uniform()))
     knots = np.arange(0.0, time[-1] + 1.0)
     wander = np.interp(time, knots, generator.normal(0.0, 0.2, len(knots)))
     return (shake + wander) * DEGREE * _flank(count, 0.3)
@@ -130,7 +133,8 @@ def _turn(generator: np.random.Generator) -> Array:
 def _slow_turn(generator: np.random.Generator) -> Array:
     """Return a turn at 0.5 to 3 deg/s for 10 to 40 s, every other time with a wobble."""
     count = _count(generator.uniform(10.0, 40.0))
-    turn = generator.choice((-1.0, 1.0)) * generator.uniform(0.5, 3.0) * DEGREE * _flank(count, 0.5)
+    turn = generator.choice((-1.0, 1.0)) * generator.uniform(0.5, 3.0) * DEGREE * _flank(
+        count, 0.5)
     return turn + generator.integers(2) * _wobble(count, generator)
 
 
@@ -144,7 +148,8 @@ def _rest(shortest: float, longest: float, generator: np.random.Generator) -> Ar
 
 #: Probability of each kind of stretch; about half of the time the robot rests or goes straight.
 STRETCHES: tuple[tuple[float, Callable[[np.random.Generator], Array]], ...] = (
-    (0.2, partial(_rest, 3.0, 20.0)), (0.2, partial(_rest, 0.2, 0.5)), (0.2, _straight), (0.3, _turn), (0.1, _slow_turn))
+    (0.2, partial(_rest, 3.0, 20.0)), (0.2, partial(_rest, 0.2, 0.5)), (0.2, _straight),
+    (0.3, _turn), (0.1, _slow_turn))
 
 
 def random_path(duration: float, generator: np.random.Generator) -> Path:
@@ -161,9 +166,11 @@ def random_path(duration: float, generator: np.random.Generator) -> Path:
     return path(np.pad(rate, rest), np.pad(np.concatenate(moving)[:count], rest))
 
 
-def slow_path(rate: float, generator: np.random.Generator, rest: float = 30.0, duration: float = 600.0) -> Path:
+def slow_path(rate: float, generator: np.random.Generator, rest: float = 30.0,
+              duration: float = 600.0) -> Path:
     """Return a rest and then one turn at a rate, rad/s, either way."""
-    still, turn = np.zeros(_count(rest)), generator.choice((-1.0, 1.0)) * rate * _flank(_count(duration), 0.5)
+    still, turn = (np.zeros(_count(rest)),
+                   generator.choice((-1.0, 1.0)) * rate * _flank(_count(duration), 0.5))
     whole = np.concatenate([still, turn, [0.0]])
     return path(whole, whole != 0.0)
 
@@ -176,7 +183,8 @@ def begun_any_time(way: Path, generator: np.random.Generator) -> Path:
 
     """
     late = int(generator.integers(round(GRID / STEP)))
-    rate, moving = (np.append(np.append(np.zeros(late), each[:len(each) - 1 - late]), 0.0) for each in (way.rate, way.moving))
+    rate, moving = (np.append(np.append(np.zeros(late), each[:len(each) - 1 - late]), 0.0)
+                    for each in (way.rate, way.moving))
     return path(rate, moving > 0.5)
 
 
@@ -209,5 +217,5 @@ def simulate(gyro: Gyro, course: Course, generator: np.random.Generator) -> Driv
     bias = b + simulate_noise(slow, before + count, gyro.interval, generator)[before:]
     output, time = (1.0 + s) * rate + bias + white, np.arange(count) * gyro.interval
     moving = np.convolve(way.moving, np.ones(2 * every + 1), 'same')[::every] > 0.5
-    return Drive(gyro, time[first:] - time[first], output[first:], rate[first:], bias[first:], way.heading[::every], moving,
-                 (time[:first + 1], output[:first + 1]))
+    return Drive(gyro, time[first:] - time[first], output[first:], rate[first:], bias[first:],
+                 way.heading[::every], moving, (time[:first + 1], output[:first + 1]))

@@ -40,15 +40,18 @@ TIME = np.arange(2001) * INTERVAL
 HEADING, RATE = CALIBRATION.heading_at(TIME), CALIBRATION.rate_at(TIME)
 SCALE_FACTOR_ERROR, BIAS = 0.03, 0.5 * DEGREE
 #: Step of the encoder, rad, and standard deviation of the noise of one sample of the rate, rad/s.
-CASES = {'0.088 deg, 0.02 deg/s': (0.088 * DEGREE, 0.02 * DEGREE), '0.088 deg, 0.5 deg/s': (0.088 * DEGREE, 0.5 * DEGREE),
-         '5 deg, 0.02 deg/s': (5.0 * DEGREE, 0.02 * DEGREE), '5 deg, 0.5 deg/s': (5.0 * DEGREE, 0.5 * DEGREE)}
+CASES = {'0.088 deg, 0.02 deg/s': (0.088 * DEGREE, 0.02 * DEGREE),
+         '0.088 deg, 0.5 deg/s': (0.088 * DEGREE, 0.5 * DEGREE),
+         '5 deg, 0.02 deg/s': (5.0 * DEGREE, 0.02 * DEGREE),
+         '5 deg, 0.5 deg/s': (5.0 * DEGREE, 0.5 * DEGREE)}
 
 
 def fit_increments(time: Array, rate: Array, motion: Motion) -> tuple[float, float]:
     """Return (s, b) by least squares of the rate's increments on the raw ones of the encoder."""
     heading = motion.heading_at(time)
     turned = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
-    scale, bias = np.linalg.lstsq(np.column_stack([np.diff(heading), np.diff(time)]), turned, rcond=None)[0]
+    scale, bias = np.linalg.lstsq(np.column_stack([np.diff(heading), np.diff(time)]), turned,
+                                  rcond=None)[0]
     return scale - 1.0, bias
 
 
@@ -59,7 +62,8 @@ def _of(fit: Callable) -> Callable:
     return values
 
 
-METHODS = {'likelihood': _of(fit_likelihood), 'cumulative least squares (Hong and Park, eq. 7)': _of(fit_heading),
+METHODS = {'likelihood': _of(fit_likelihood),
+           'cumulative least squares (Hong and Park, eq. 7)': _of(fit_heading),
            'least squares on increments': fit_increments}
 
 
@@ -78,7 +82,8 @@ def bound(step: float, noise: float, rests: bool) -> Array:
     walk[1:, 0] = 0.5 * INTERVAL * noise
     moves = np.abs(np.diff(HEADING, prepend=-1.0)) > 1e-12
     error = np.cumsum(moves) if rests else np.arange(len(TIME))
-    covariance = walk @ walk.T + (1.0 + SCALE_FACTOR_ERROR) ** 2 * step ** 2 / 12.0 * (error[:, None] == error)
+    covariance = walk @ walk.T + (1.0 + SCALE_FACTOR_ERROR) ** 2 * step ** 2 / 12.0 * (
+        error[:, None] == error)
     matrix = np.column_stack([HEADING, TIME, np.ones(len(TIME)), RATE, np.gradient(RATE, TIME)])
     return np.diag(np.linalg.inv(matrix.T @ np.linalg.solve(covariance, matrix)))[:2]
 
@@ -88,21 +93,27 @@ def errors(step: float, noise: float, seed: int) -> Array:
     generator = np.random.default_rng([seed, round(1e6 * step), round(1e6 * noise)])
     rate = (1.0 + SCALE_FACTOR_ERROR) * RATE + BIAS + noise * generator.standard_normal(len(TIME))
     motion = from_headings(TIME, np.round((HEADING + generator.uniform(0.0, step)) / step) * step)
-    return np.array([method(TIME, rate, motion) for method in METHODS.values()]) - (SCALE_FACTOR_ERROR, BIAS)
+    return np.array([method(TIME, rate, motion) for method in METHODS.values()]) - (
+        SCALE_FACTOR_ERROR, BIAS)
 
 
 def table(runs: int) -> str:
     """Return a table of mean squares of the errors of s and b over the nominal and other bound."""
-    lines = ['| encoder step, noise | method | s over nominal bound | b | one error a rest: s | b | mean error of s |',
+    lines = ['| encoder step, noise | method | s over nominal bound | b | one error a rest: s | b '
+             '| mean error of s |',
              '|---|---|---|---|---|---|---|']
     with ProcessPoolExecutor() as pool:
         for name, (step, noise) in CASES.items():
-            found = np.array(list(pool.map(partial(errors, step, noise), range(runs), chunksize=10)))
-            squares, limits = (found ** 2).mean(axis=0), [bound(step, noise, rests) for rests in (False, True)]
+            found = np.array(list(pool.map(partial(errors, step, noise), range(runs),
+                                           chunksize=10)))
+            squares, limits = (found ** 2).mean(axis=0), [bound(step, noise, rests)
+                                                          for rests in (False, True)]
             (s, b), rest = (np.sqrt(limit) * (100.0, 1.0 / DEGREE) for limit in limits)
-            lines.append(f'| {name} | bound | {s:.5f} % | {b:.5f} deg/s | {rest[0]:.5f} % | {rest[1]:.5f} deg/s | |')
+            lines.append(f'| {name} | bound | {s:.5f} % | {b:.5f} deg/s | {rest[0]:.5f} % '
+                         f'| {rest[1]:.5f} deg/s | |')
             for method, square, mean in zip(METHODS, squares, found.mean(axis=0)):
-                ratios = ' | '.join(f'{ratio:.3g}' for ratio in np.concatenate([square / limit for limit in limits]))
+                ratios = ' | '.join(f'{ratio:.3g}' for ratio in np.concatenate(
+                    [square / limit for limit in limits]))
                 lines.append(f'| | {method} | {ratios} | {100.0 * mean[0]:+.4f} % |')
     return '\n'.join(lines)
 

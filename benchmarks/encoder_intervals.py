@@ -37,24 +37,29 @@ def swing(duration: float, generator: np.random.Generator, half: float = 4.0) ->
     """Return a motion to and fro at 55 to 65 deg/s, each way in `half` s, with rests of 0.4 s."""
     starts = np.arange(0.0, duration, half)
     knots = (starts[:, None] + (0.0, 0.3, half - 0.7, half - 0.4)).ravel()
-    speeds = np.where(np.arange(len(starts)) % 2, -1.0, 1.0) * generator.uniform(55.0, 65.0, len(starts)) * DEGREE
+    speeds = np.where(np.arange(len(starts)) % 2, -1.0,
+                      1.0) * generator.uniform(55.0, 65.0, len(starts)) * DEGREE
     return from_rates(knots, (speeds[:, None] * (0.0, 1.0, 1.0, 0.0)).ravel())
 
 
-def simulated(noise: Noise, drift: float, generator: np.random.Generator, duration: float) -> tuple[Log, Array]:
+def simulated(noise: Noise, drift: float, generator: np.random.Generator,
+              duration: float) -> tuple[Log, Array]:
     """Return a log, and the true (s, b)."""
     time = np.arange(round(duration / INTERVAL)) * INTERVAL
     motion = swing(duration, generator)
     warming = drift * (1.0 - np.exp(-3.0 * time / duration))
-    output = (1.0 + SCALE_FACTOR_ERROR) * motion.rate_at(time) + BIAS + warming + simulate_noise(noise, len(time), INTERVAL, generator)
+    output = (1.0 + SCALE_FACTOR_ERROR) * motion.rate_at(time) + BIAS + warming + simulate_noise(
+        noise, len(time), INTERVAL, generator)
     heading = np.round((motion.heading_at(time) + generator.uniform(0.0, STEP)) / STEP) * STEP
-    return Log(output=output, time=time, reference_heading=heading), np.array([SCALE_FACTOR_ERROR, BIAS + warming.mean()])
+    return (Log(output=output, time=time, reference_heading=heading),
+            np.array([SCALE_FACTOR_ERROR, BIAS + warming.mean()]))
 
 
 def run(case: tuple[str, int, float]) -> Array:
     """Return error and standard deviation of s and b of one run, shape (2, 2)."""
     name, seed, duration = case
-    log, truth = simulated(*CASES[name], np.random.default_rng([seed, list(CASES).index(name)]), duration)
+    log, truth = simulated(*CASES[name], np.random.default_rng([seed, list(CASES).index(name)]),
+                           duration)
     fit = calibrate_encoder(log).fit
     return np.array([(fit.scale_factor_error, fit.bias) - truth, np.sqrt(np.diag(fit.covariance))])
 
@@ -65,11 +70,13 @@ def table(runs: int, duration: float = 600.0) -> Iterator[str]:
     yield '|---|---|---|---|---|---|---|'
     with ProcessPoolExecutor() as pool:
         for name in CASES:
-            found = np.array(list(pool.map(run, [(name, seed, duration) for seed in range(runs)], chunksize=5)))
+            found = np.array(list(pool.map(run, [(name, seed, duration) for seed in range(runs)],
+                                           chunksize=5)))
             within = 100.0 * (np.abs(found[:, 0]) < 1.96 * found[:, 1]).mean(axis=0)
-            (s, b), (s_stated, b_stated) = np.sqrt((found ** 2).mean(axis=0)) * (100.0, 1.0 / DEGREE)
-            yield (f'| {name} | {within[0]:.1f} % | {within[1]:.1f} % | {s:.5f} % | {s_stated:.5f} % | {b:.5f} deg/s | '
-                   f'{b_stated:.5f} deg/s |')
+            (s, b), (s_stated,
+                     b_stated) = np.sqrt((found ** 2).mean(axis=0)) * (100.0, 1.0 / DEGREE)
+            yield (f'| {name} | {within[0]:.1f} % | {within[1]:.1f} % | {s:.5f} % '
+                   f'| {s_stated:.5f} % | {b:.5f} deg/s | {b_stated:.5f} deg/s |')
 
 
 if __name__ == '__main__':

@@ -75,25 +75,30 @@ class Drive:
     interval: float
 
 
-def simulate(gyro: Gyro, interval: float, duration: float, generator: np.random.Generator) -> Drive:
+def simulate(gyro: Gyro, interval: float, duration: float,
+             generator: np.random.Generator) -> Drive:
     """Return a drive with the calibration before it; one that is refused is run again."""
-    begin, way = of_motion(CALIBRATION), begun_any_time(random_path(duration, generator), generator)
+    begin, way = of_motion(CALIBRATION), begun_any_time(random_path(duration, generator),
+                                                        generator)
     coarse = np.concatenate([begin.rate[:-1], way.rate])
     time = np.arange(round((len(coarse) - 1) * STEP / interval) + 1) * interval
     true = np.interp(time, np.arange(len(coarse)) * STEP, coarse)
     s, b = gyro.true
     first = round(CALIBRATION.duration / interval)
     while True:
-        output = (1.0 + s) * true + b + simulate_noise(gyro.model.noise, len(true), interval, generator)
+        output = (1.0 + s) * true + b + simulate_noise(gyro.model.noise, len(true), interval,
+                                                       generator)
         try:
-            fit = self_calibrate(time[:first + 1], output[:first + 1], CALIBRATION, noise=gyro.model.noise)
+            fit = self_calibrate(time[:first + 1], output[:first + 1], CALIBRATION,
+                                 noise=gyro.model.noise)
             break
         except DataRefused:
             continue
     calibration = record(fit, 'likelihood', '', None)
     model = replace(gyro.model, terms=(), self_calibration=calibration)
     heading = integrate(time[first:], true[first:])
-    return Drive(time[first:] - time[first], np.asarray(calibration.correct(output[first:])), heading, model, interval)
+    return Drive(time[first:] - time[first], np.asarray(calibration.correct(output[first:])),
+                 heading, model, interval)
 
 
 def arrivals(time: Array, generator: np.random.Generator) -> Array:
@@ -103,7 +108,8 @@ def arrivals(time: Array, generator: np.random.Generator) -> Array:
     return np.asarray(burst * BURST + generator.exponential(WAKE_UP, number.max() + 1)[number])
 
 
-def stamped(time: Array, number: Array, stamps: str, interval: float, generator: np.random.Generator) -> Array:
+def stamped(time: Array, number: Array, stamps: str, interval: float,
+            generator: np.random.Generator) -> Array:
     """Return the stamps, s, of samples that were sent at times, s, and were so many there."""
     if stamps == 'gyro':
         return time
@@ -115,7 +121,8 @@ def stamped(time: Array, number: Array, stamps: str, interval: float, generator:
     clock = SampleClock(1.0 / interval, MODULUS if stamps == 'sequence' else 0)
     pieces = np.split(number, np.flatnonzero(np.diff(come) > 0.0) + 1)
     ends = come[np.cumsum([len(piece) for piece in pieces]) - 1]
-    found = [clock.stamp([Sample(0.0, sequence=int(each) % MODULUS) for each in piece], float(end)) for piece, end in zip(pieces, ends)]
+    found = [clock.stamp([Sample(0.0, sequence=int(each) % MODULUS) for each in piece], float(end))
+             for piece, end in zip(pieces, ends)]
     return np.concatenate([np.array(stamps) for stamps in found])
 
 
@@ -124,10 +131,14 @@ def errors(drive: Drive, fault: Fault, generator: np.random.Generator) -> tuple[
     comes = generator.random(len(drive.time)) >= fault.lost
     comes[0] = comes[-1] = True
     number = np.flatnonzero(comes)
-    stamps, rate = stamped(drive.time[comes], number, fault.stamps, drive.interval, generator), drive.rate[comes]
-    sensitivity, still = (rate_sensitivity(drive.model, value, value, 25.0) for value in (rate, 0.0))
-    found = track(stamps, rate, sensitivity, drive.model.noise, covariance(drive.model), Settings(), still=still)
-    looks = np.searchsorted(drive.time[comes], np.arange(LOOK, drive.time[-1] + 0.5 * LOOK, LOOK)).clip(max=len(rate) - 1)
+    stamps, rate = (stamped(drive.time[comes], number, fault.stamps, drive.interval, generator),
+                    drive.rate[comes])
+    sensitivity, still = (rate_sensitivity(drive.model, value, value, 25.0)
+                          for value in (rate, 0.0))
+    found = track(stamps, rate, sensitivity, drive.model.noise, covariance(drive.model),
+                  Settings(), still=still)
+    looks = np.searchsorted(drive.time[comes], np.arange(LOOK, drive.time[-1] + 0.5 * LOOK,
+                                                         LOOK)).clip(max=len(rate) - 1)
     return (found.heading - drive.heading[comes])[looks], found.variance[looks]
 
 
@@ -135,28 +146,34 @@ def one(job: tuple[str, float, float, int, tuple[str, ...]]) -> dict[str, tuple[
     """Return errors and variances of one drive with each fault."""
     name, interval, duration, seed, faults = job
     drive = simulate(GYROS[name], interval, duration, np.random.default_rng(seed))
-    return {fault: errors(drive, FAULTS[fault], np.random.default_rng([seed, number])) for number, fault in enumerate(faults)}
+    return {fault: errors(drive, FAULTS[fault], np.random.default_rng([seed, number]))
+            for number, fault in enumerate(faults)}
 
 
-def growth(clean: Array, faulty: Array, generator: np.random.Generator) -> tuple[float, float, float]:
+def growth(clean: Array, faulty: Array,
+           generator: np.random.Generator) -> tuple[float, float, float]:
     """Return the growth of the error, %, and its 95 % interval, for errors (drives, looks)."""
     squares = np.array([np.mean(each ** 2, axis=1) for each in (clean, faulty)])
     drawn = squares[:, generator.integers(0, len(clean), (4000, len(clean)))].mean(axis=2)
     low, high = np.quantile(np.sqrt(drawn[1] / drawn[0]), [0.025, 0.975])
-    return tuple(100.0 * (ratio - 1.0) for ratio in (math.sqrt(squares[1].mean() / squares[0].mean()), low, high))
+    return tuple(100.0 * (ratio - 1.0)
+                 for ratio in (math.sqrt(squares[1].mean() / squares[0].mean()), low, high))
 
 
 def table(name: str, interval: float, found: list[dict[str, tuple[Array, Array]]]) -> str:
     """Return the table of a gyro in Markdown."""
     lines = [f'{name} at {1.0 / interval:g} Hz, {len(found)} drives', '',
-             '| line | error, deg | growth, % | 95 % | added, deg | error² / variance |', '|:---|---:|---:|---:|---:|---:|']
+             '| line | error, deg | growth, % | 95 % | added, deg | error² / variance |',
+             '|:---|---:|---:|---:|---:|---:|']
     clean, _ = (np.array(values) for values in zip(*(each['clean'] for each in found)))
     for fault in found[0]:
         faulty, variance = (np.array(values) for values in zip(*(each[fault] for each in found)))
         grown, low, high = growth(clean, faulty, np.random.default_rng(0))
-        error, added = (math.sqrt(np.mean(values ** 2)) / DEGREE for values in (faulty, faulty - clean))
+        error, added = (math.sqrt(np.mean(values ** 2)) / DEGREE
+                        for values in (faulty, faulty - clean))
         size = np.mean(faulty ** 2 / variance)
-        lines.append(f'| {fault} | {error:.3f} | {grown:.1f} | {low:.1f} to {high:.1f} | {added:.3f} | {size:.2f} |')
+        lines.append(f'| {fault} | {error:.3f} | {grown:.1f} | {low:.1f} to {high:.1f} '
+                     f'| {added:.3f} | {size:.2f} |')
     return '\n'.join(lines)
 
 
@@ -172,7 +189,8 @@ def main() -> None:
     interval, faults = 1.0 / given.rate, tuple(dict.fromkeys(['clean', *given.faults]))
     with ProcessPoolExecutor(os.cpu_count()) as workers:
         for name in given.gyros:
-            jobs = [(name, interval, 60.0 * given.minutes, seed, faults) for seed in range(given.drives)]
+            jobs = [(name, interval, 60.0 * given.minutes, seed, faults)
+                    for seed in range(given.drives)]
             print(table(name, interval, list(workers.map(one, jobs))), end='\n\n', flush=True)
 
 

@@ -55,10 +55,12 @@ class Run:
 
     def _wobble(self, rate: Array) -> Array:
         draw = np.random.default_rng(int(1e9 * self.late)).uniform
-        wheel, shake = (draw(*limits) * 2.0 * np.pi * TIME + draw(0.0, 2.0 * np.pi) for limits in ((0.5, 2.0), (5.0, 30.0)))
+        wheel, shake = (draw(*limits) * 2.0 * np.pi * TIME + draw(0.0, 2.0 * np.pi)
+                        for limits in ((0.5, 2.0), (5.0, 30.0)))
         speed = float(np.gradient(wheel, TIME)[0])
         turning = np.minimum(np.abs(rate) / (10.0 * DEGREE), 1.0)
-        return turning * (draw(0.0, 0.1) * DEGREE * speed * np.cos(wheel) + draw(0.0, 0.5) * DEGREE * np.sin(shake))
+        return turning * (draw(0.0, 0.1) * DEGREE * speed * np.cos(wheel)
+                          + draw(0.0, 0.5) * DEGREE * np.sin(shake))
 
     def gyro(self, rate: Array) -> Array:
         """Return what the gyro says of a rate, rad/s."""
@@ -69,7 +71,8 @@ def drawn(number: int, level: float) -> Run:
     """Return a run by its number."""
     generator = np.random.default_rng([number, round(10 * level)])
     noise = Noise(level * XV3500.noise.angle_random_walk, level * XV3500.noise.bias_instability)
-    return Run(generator, 0.03 * generator.standard_normal(), 0.05 * DEGREE * generator.standard_normal(), generator.uniform(0.0, 1.0),
+    return Run(generator, 0.03 * generator.standard_normal(),
+               0.05 * DEGREE * generator.standard_normal(), generator.uniform(0.0, 1.0),
                generator.uniform(0.0, 0.2), simulate_noise(noise, len(TIME), INTERVAL, generator))
 
 
@@ -105,7 +108,8 @@ def bump(run: Run) -> Array:
     start, duration = run.late + run.generator.uniform(0.5, 19.0), run.generator.uniform(0.05, 0.5)
     inside = (start <= TIME) & (start + duration > TIME)
     degrees = run.generator.uniform(2.0, 15.0) * run.generator.choice([-1.0, 1.0])
-    return run.gyro(run.follow(profile()) + np.where(inside, degrees * DEGREE / (inside.sum() * INTERVAL), 0.0))
+    return run.gyro(run.follow(profile())
+                    + np.where(inside, degrees * DEGREE / (inside.sum() * INTERVAL), 0.0))
 
 
 def early_end(run: Run) -> Array:
@@ -117,7 +121,9 @@ def another_profile(run: Run) -> Array:
     """Drive four to six legs of 2 to 5 s at 15 to 60 deg/s either way, with rests of 1 s."""
     legs: list[tuple[float, float]] = [(1.0, 0.0)]
     for _ in range(run.generator.integers(4, 7)):
-        legs += [(run.generator.uniform(2.0, 5.0), run.generator.uniform(15.0, 60.0) * run.generator.choice([-1.0, 1.0])), (1.0, 0.0)]
+        legs += [(run.generator.uniform(2.0, 5.0),
+                  run.generator.uniform(15.0, 60.0) * run.generator.choice([-1.0, 1.0])),
+                 (1.0, 0.0)]
     return run.gyro(run.follow(profile(turns(legs))))
 
 
@@ -160,12 +166,16 @@ def saturated(run: Run) -> Array:
 
 
 #: Unit of the gyro's output and unit assumed -> their ratio, and the text of the refusal.
-UNITS = {'deg/s read as rad/s': (1.0 / DEGREE, 'deg/s and read as rad/s'), 'rad/s read as deg/s': (DEGREE, 'rad/s and read as deg/s'),
-         'mdeg/s read as deg/s': (1e3, 'thousandths'), 'mdeg/s read as rad/s': (1e3 / DEGREE, 'mdeg/s and read as rad/s'),
-         'mrad/s read as rad/s': (1e3, 'thousandths'), 'mrad/s read as deg/s': (1e3 * DEGREE, 'mrad/s and read as deg/s'),
+UNITS = {'deg/s read as rad/s': (1.0 / DEGREE, 'deg/s and read as rad/s'),
+         'rad/s read as deg/s': (DEGREE, 'rad/s and read as deg/s'),
+         'mdeg/s read as deg/s': (1e3, 'thousandths'),
+         'mdeg/s read as rad/s': (1e3 / DEGREE, 'mdeg/s and read as rad/s'),
+         'mrad/s read as rad/s': (1e3, 'thousandths'),
+         'mrad/s read as deg/s': (1e3 * DEGREE, 'mrad/s and read as deg/s'),
          'revolutions/s read as rad/s': (0.5 / np.pi, 'revolutions/s and read as rad/s'),
          'revolutions/s read as deg/s': (1.0 / 360.0, 'revolutions/s and read as deg/s')}
-PROFILES = {'deg read as rad': (1.0 / DEGREE, 'deg and read as rad'), 'rad read as deg': (DEGREE, 'rad and read as deg'),
+PROFILES = {'deg read as rad': (1.0 / DEGREE, 'deg and read as rad'),
+            'rad read as deg': (DEGREE, 'rad and read as deg'),
             'mdeg read as deg': (1e3, 'thousandths')}
 
 
@@ -202,10 +212,12 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
     'saturated gyro': (saturated, CALIBRATION, 'saturated'),
     'half the sensitivity': (of_scale(0.5), CALIBRATION, 'half its sensitivity'),
     'twice the sensitivity': (of_scale(2.0), CALIBRATION, 'twice its sensitivity'),
-    'one speed': (lambda run: run.gyro(run.follow(profile(one_speed()))), one_speed(), 'cannot be parted'),
+    'one speed': (lambda run: run.gyro(run.follow(profile(one_speed()))), one_speed(),
+                  'cannot be parted'),
     **{f'gyro in {name}': (of_scale(factor), CALIBRATION, f'gyro is in {said}')
        for name, (factor, said) in UNITS.items()},
-    **{f'profile in {name}': (good, scaled(factor), f'profile in {said}') for name, (factor, said) in PROFILES.items()},
+    **{f'profile in {name}': (good, scaled(factor), f'profile in {said}')
+       for name, (factor, said) in PROFILES.items()},
 }
 
 
@@ -218,23 +230,27 @@ def tried(case: tuple[str, int, float]) -> tuple[str, tuple[float, ...]]:
         fit = self_calibrate(TIME, way(run), motion, noise=XV3500.noise)
     except DataRefused as reason:
         return str(reason), ()
-    errors = np.array([fit.scale_factor_error - run.s, fit.bias - run.b]) / np.sqrt(np.diag(fit.covariance))
+    errors = np.array([fit.scale_factor_error - run.s, fit.bias - run.b]) / np.sqrt(
+        np.diag(fit.covariance))
     assert fit.goodness is not None
     return '', (*errors.tolist(), fit.goodness.probability)
 
 
 def table(runs: int) -> Iterator[str]:
     """Yield the lines of the table: runs refused at each level, and those with the right name."""
-    yield '| run | ' + ' | '.join(f'refused of {runs}, {level:g} times the noise (named right)' for level in LEVELS) + ' |'
+    yield '| run | ' + ' | '.join(f'refused of {runs}, {level:g} times the noise (named right)'
+                                  for level in LEVELS) + ' |'
     yield '|---|' + '---|' * len(LEVELS)
     accepted: dict[tuple[str, float], list[tuple[float, ...]]] = {}
     with ProcessPoolExecutor(2) as pool:
         for name, (_, _, word) in WAYS.items():
             cells = []
             for level in LEVELS:
-                found = list(pool.map(tried, [(name, number, level) for number in range(runs)], chunksize=10))
+                found = list(pool.map(tried, [(name, number, level) for number in range(runs)],
+                                      chunksize=10))
                 refused = [reason for reason, _ in found if reason]
-                cells.append(f'{len(refused)} ({sum(word in reason for reason in refused)})' if word else f'{len(refused)}')
+                cells.append(f'{len(refused)} ({sum(word in reason for reason in refused)})'
+                             if word else f'{len(refused)}')
                 if not word:
                     accepted[name, level] = [errors for _, errors in found if errors]
             yield f'| {name} | ' + ' | '.join(cells) + ' |'
@@ -242,12 +258,15 @@ def table(runs: int) -> Iterator[str]:
 
 
 def _coverage(accepted: dict[tuple[str, float], list[tuple[float, ...]]]) -> Iterator[str]:
-    yield '\n| run | noise | s in its 95 % interval | b in its 95 % interval | residual said to be more than the noise explains |'
+    yield ('\n| run | noise | s in its 95 % interval | b in its 95 % interval '
+           '| residual said to be more than the noise explains |')
     yield '|---|---|---|---|---|'
     for (name, level), errors in accepted.items():
         s, b, probability = np.array(errors).T
-        shares = [100 * np.mean(each) for each in (np.abs(s) < 1.96, np.abs(b) < 1.96, probability < UNLIKELY)]
-        yield f'| {name} | {level:g} times | ' + ' | '.join(f'{share:.1f} %' for share in shares) + ' |'
+        shares = [100 * np.mean(each)
+                  for each in (np.abs(s) < 1.96, np.abs(b) < 1.96, probability < UNLIKELY)]
+        yield f'| {name} | {level:g} times | ' + ' | '.join(f'{share:.1f} %'
+                                                            for share in shares) + ' |'
 
 
 if __name__ == '__main__':

@@ -37,11 +37,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 PACKAGE = Path(__file__).parents[1] / 'gyro_calibration'
 GIGABYTE = 1 << 30
 #: What reads the bytes of a target, in the package.
-FILES = {
-    'decoder': ('protocols/protocol.py', 'protocols/frames.py', 'protocols/lines.py'), 'listening': ('protocols/listening.py',),
-    'sample clock': ('sample_clock.py',), 'log': ('log.py',), 'compressed log': ('log.py',), 'model': ('model_file.py', 'settings_file.py'),
-    'bias table': ('bias_table.py', 'settings_file.py'), 'motion profile': ('motion.py',), 'motion limits': ('settings_file.py',),
-    'recording': ('recording.py', 'storage.py', 'messages.py'), 'parameters': ('node.py',), 'arguments': ('verbs/verb.py',),
+FILES = {'decoder': ('protocols/protocol.py', 'protocols/frames.py', 'protocols/lines.py'),
+         'listening': ('protocols/listening.py',),
+         'sample clock': ('sample_clock.py',), 'log': ('log.py',), 'compressed log': ('log.py',),
+         'model': ('model_file.py', 'settings_file.py'),
+         'bias table': ('bias_table.py', 'settings_file.py'), 'motion profile': ('motion.py',),
+         'motion limits': ('settings_file.py',),
+         'recording': ('recording.py', 'storage.py', 'messages.py'), 'parameters': ('node.py',),
+         'arguments': ('verbs/verb.py',),
 }
 
 
@@ -73,7 +76,8 @@ def main() -> int:
     begun = time.monotonic()
     targets = _instrumented()
     names = [name for name in targets if not given.only or name in given.only]
-    weights = {name: targets[name].weight * (given.decoders if name.startswith('decoder') else 1.0) for name in names}
+    weights = {name: targets[name].weight * (given.decoders if name.startswith('decoder') else 1.0)
+               for name in names}
     left = given.seconds - (time.monotonic() - begun)
     outcomes = []
     if not given.json:
@@ -83,7 +87,8 @@ def main() -> int:
         for name in names:
             share = max(left * weights[name] / sum(weights.values()) - 0.6, 1.0)
             outcome = _run(name, targets[name], corpus / name.replace(' ', '_'), share, given.seed)
-            outcome.lines = _lines(name, targets[name], corpus / name.replace(' ', '_')) if given.lines else 0.0
+            outcome.lines = _lines(name, targets[name],
+                                   corpus / name.replace(' ', '_')) if given.lines else 0.0
             outcomes.append(outcome)
             if not given.json:
                 _show(outcome)
@@ -97,9 +102,13 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--only', nargs='+', metavar='TARGET')
     parser.add_argument('--corpus', metavar='DIR', help='keeps inputs that reached something new')
     parser.add_argument('--repeat', nargs=2, metavar=('TARGET', 'HEX'))
-    parser.add_argument('--seed', type=int, default=0, help='of libFuzzer; 0 is another one each time')
-    parser.add_argument('--decoders', type=float, default=1.0, metavar='TIMES', help='give them so many times as much of the time')
-    parser.add_argument('--lines', action='store_true', help='measure the share of lines that was reached; takes time beyond --seconds')
+    parser.add_argument('--seed', type=int, default=0,
+                        help='of libFuzzer; 0 is another one each time')
+    parser.add_argument('--decoders', type=float, default=1.0, metavar='TIMES',
+                        help='give them so many times as much of the time')
+    parser.add_argument('--lines', action='store_true',
+                        help='measure the share of lines that was reached; takes time beyond '
+                             '--seconds')
     parser.add_argument('--json', action='store_true')
     return parser.parse_args()
 
@@ -108,10 +117,13 @@ def _instrumented():
     """Import the targets, with only their code watched by atheris; watching all takes 20 s."""
     import atheris
     watched = {file for files in FILES.values() for file in files}
-    others = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob('*.py') if str(path.relative_to(PACKAGE)) not in watched]
-    exclude = ['.'.join(path.with_suffix('').parts) for path in others if path.parent.name != 'protocols']
+    others = [path.relative_to(PACKAGE.parent)
+              for path in PACKAGE.rglob('*.py') if str(path.relative_to(PACKAGE)) not in watched]
+    exclude = ['.'.join(path.with_suffix('').parts)
+               for path in others if path.parent.name != 'protocols']
     # It tells of each module.
-    with contextlib.redirect_stderr(io.StringIO()), atheris.instrument_imports(include=['gyro_calibration', 'yaml'], exclude=exclude):
+    with contextlib.redirect_stderr(io.StringIO()), atheris.instrument_imports(
+            include=['gyro_calibration', 'yaml'], exclude=exclude):
         import fuzzed
         if fuzzed.HAS_ROS:
             import gyro_calibration.ros.driver_node  # noqa: F401  here, so that it is watched
@@ -132,7 +144,8 @@ def _run(name, target, corpus: Path, share: float, seed: int) -> Outcome:
                 os._exit(1)  # only where libFuzzer did not end the process itself
         _, status, usage = os.wait4(process, 0)
         said = (Path(folder) / 'said').read_text(errors='replace')
-        outcome = Outcome(name, 0, time.monotonic() - begun, usage.ru_utime + usage.ru_stime, peak_mb=usage.ru_maxrss / 1024.0)
+        outcome = Outcome(name, 0, time.monotonic() - begun, usage.ru_utime + usage.ru_stime,
+                          peak_mb=usage.ru_maxrss / 1024.0)
         _read(outcome, said, Path(folder), status)
     return outcome
 
@@ -145,10 +158,12 @@ def _fuzz(target, corpus: Path, folder: Path, share: float, seed: int) -> None:
     memory = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (memory + GIGABYTE, memory + GIGABYTE))
     words = folder / 'words'
-    words.write_text(''.join(f'"{"".join(f"{chr(92)}x{byte:02x}" for byte in word)}"\n' for word in target.words or (b'0',)))
-    atheris.Setup(['fuzz', str(corpus), f'-max_total_time={max(round(share), 1)}', f'-max_len={target.longest}', '-print_final_stats=1',
-                   '-timeout=60', '-rss_limit_mb=0', f'-artifact_prefix={folder}/', f'-dict={words}', '-verbosity=1', f'-seed={seed}',
-                   '-reload=0'], _watched(target.check, folder))
+    words.write_text(''.join(f'"{"".join(f"{chr(92)}x{byte:02x}" for byte in word)}"\n'
+                             for word in target.words or (b'0',)))
+    atheris.Setup(['fuzz', str(corpus), f'-max_total_time={max(round(share), 1)}',
+                   f'-max_len={target.longest}', '-print_final_stats=1', '-timeout=60',
+                   '-rss_limit_mb=0', f'-artifact_prefix={folder}/', f'-dict={words}',
+                   '-verbosity=1', f'-seed={seed}', '-reload=0'], _watched(target.check, folder))
     atheris.Fuzz()
 
 
@@ -187,14 +202,17 @@ def _read(outcome: Outcome, said: str, folder: Path, status: int) -> None:
         outcome.fault, _, outcome.said = (folder / 'fault').read_text().partition('\n')
     elif status:
         inputs = [*folder.glob('timeout-*'), *folder.glob('crash-*'), *folder.glob('oom-*')]
-        outcome.fault, outcome.said = inputs[0].read_bytes().hex() if inputs else 'unknown', said[-2000:]
+        outcome.fault, outcome.said = (inputs[0].read_bytes().hex() if inputs else 'unknown',
+                                       said[-2000:])
 
 
 def _lines(name: str, target, corpus: Path) -> float:
     """Return the share of lines of the files of a target that the kept inputs reach."""
-    own = {str(PACKAGE / file): set() for file in FILES[next(key for key in sorted(FILES, key=len, reverse=True) if name.startswith(key))]}
+    own = {str(PACKAGE / file): set() for file in FILES[next(
+        key for key in sorted(FILES, key=len, reverse=True) if name.startswith(key))]}
     if name.startswith('decoder'):
-        own[sys.modules[type(target).__module__].WIRES[name.split()[1]].protocol.parser.__module__] = set()
+        own[sys.modules[type(
+            target).__module__].WIRES[name.split()[1]].protocol.parser.__module__] = set()
 
     def trace(frame, event, argument):
         file = frame.f_code.co_filename
@@ -210,7 +228,8 @@ def _lines(name: str, target, corpus: Path) -> float:
     finally:
         sys.settrace(None)
     every = {file: set(_code_lines(file)) for file in own if os.path.exists(file)}
-    return sum(len(own[file] & lines) for file, lines in every.items()) / max(sum(map(len, every.values())), 1)
+    return sum(len(own[file] & lines)
+               for file, lines in every.items()) / max(sum(map(len, every.values())), 1)
 
 
 def _code_lines(file: str) -> Iterator[int]:
@@ -220,27 +239,32 @@ def _code_lines(file: str) -> Iterator[int]:
         code = codes.pop()
         codes += [each for each in code.co_consts if hasattr(each, 'co_code')]
         if code.co_name not in ('<module>',) and code.co_flags & 2:  # a function, not a class
-            yield from (line for _, _, line in code.co_lines() if line and line != code.co_firstlineno)
+            yield from (line for _, _, line in code.co_lines() if line
+                        and line != code.co_firstlineno)
 
 
-HEADER = f'{"target":22} {"inputs":>10} {"a second":>9} {"edges":>6} {"kept":>5} {"lines":>6} {"slowest":>9} {"memory":>8}'
+HEADER = (f'{"target":22} {"inputs":>10} {"a second":>9} {"edges":>6} {"kept":>5} {"lines":>6} '
+          f'{"slowest":>9} {"memory":>8}')
 
 
 def _show(outcome: Outcome) -> None:
-    print(f'{outcome.target:22} {outcome.inputs:10} {outcome.inputs / max(outcome.seconds, 1e-9):9.0f} {outcome.edges:6} {outcome.kept:5} '
-          f'{100 * outcome.lines:5.0f}% {1000 * outcome.slowest_s:6.0f} ms {outcome.peak_mb:5.0f} MB', flush=True)
+    print(f'{outcome.target:22} {outcome.inputs:10} '
+          f'{outcome.inputs / max(outcome.seconds, 1e-9):9.0f} {outcome.edges:6} {outcome.kept:5} '
+          f'{100 * outcome.lines:5.0f}% {1000 * outcome.slowest_s:6.0f} ms {outcome.peak_mb:5.0f} '
+          'MB', flush=True)
     if outcome.fault:
-        print(f'\nFAULT in {outcome.target!r}. Repeat it with:\n    python benchmarks/fuzz.py --repeat {outcome.target!r} {outcome.fault}\n'
-              f'{outcome.said}', flush=True)
+        print(f'\nFAULT in {outcome.target!r}. Repeat it with:\n    python benchmarks/fuzz.py '
+              f'--repeat {outcome.target!r} {outcome.fault}\n{outcome.said}', flush=True)
 
 
 def _sum(outcomes: list[Outcome], as_json: bool) -> None:
     if as_json:
         print(json.dumps([asdict(outcome) for outcome in outcomes]))
         return
-    inputs, seconds, clock = (sum(getattr(each, name) for each in outcomes) for name in ('inputs', 'seconds', 'clock_s'))
-    print(f'{inputs} inputs in {clock:.0f} s, of which a processor had {seconds:.0f} s for them: {inputs / seconds:.0f} a second; '
-          f'{sum(bool(each.fault) for each in outcomes)} faults.')
+    inputs, seconds, clock = (sum(getattr(each, name) for each in outcomes)
+                              for name in ('inputs', 'seconds', 'clock_s'))
+    print(f'{inputs} inputs in {clock:.0f} s, of which a processor had {seconds:.0f} s for them: '
+          f'{inputs / seconds:.0f} a second; {sum(bool(each.fault) for each in outcomes)} faults.')
 
 
 if __name__ == '__main__':

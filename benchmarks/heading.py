@@ -81,7 +81,8 @@ def known(gyro: Gyro, course: Course, generator: np.random.Generator) -> Known:
             likely = self_calibrate(*drive.run, CALIBRATION, noise=gyro.model.noise)
         except DataRefused:
             continue
-        return Known(drive, record(likely, 'likelihood', '', None), record(fit_heading(*drive.run, CALIBRATION), 'heading', '', None))
+        return Known(drive, record(likely, 'likelihood', '', None),
+                     record(fit_heading(*drive.run, CALIBRATION), 'heading', '', None))
 
 
 # Rows
@@ -92,12 +93,14 @@ Row = Callable[[Known], Iterator[tuple[str, Estimate]]]
 def _simple(known: Known) -> Iterator[tuple[str, Estimate]]:
     """Yield integrals of rates: of the paper, and of its parts put right."""
     time, output = known.drive.time, known.drive.output
-    rates = {'pure integration': output, 'self-calibration by eq. 7': known.published.correct(output)}
+    rates = {'pure integration': output,
+             'self-calibration by eq. 7': known.published.correct(output)}
     filtered = {'threshold as published': (PUBLISHED, output),
                 'both as published': (PUBLISHED, rates['self-calibration by eq. 7']),
                 'eq. 7, threshold on 0.2 s': (WINDOWED, rates['self-calibration by eq. 7']),
                 'likelihood, threshold on 0.2 s': (WINDOWED, known.likely.correct(output))}
-    rates |= {name: filter_rates(settings, time, rate) for name, (settings, rate) in filtered.items()}
+    rates |= {name: filter_rates(settings, time, rate)
+              for name, (settings, rate) in filtered.items()}
     rates['likelihood'] = known.likely.correct(output)
     for name, rate in rates.items():
         yield name, Estimate(integrate(time, rate))
@@ -107,12 +110,14 @@ def _tracked(known: Known, noise: Noise, wheels: bool = False) -> tuple[Estimate
     """Return what this program makes of a drive, live and with hindsight."""
     drive, model = known.drive, GyroModel(self_calibration=known.likely)
     rate = np.asarray(known.likely.correct(drive.output))
-    sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0) for value in (rate, 0.0))
+    sensitivity, still = (rate_sensitivity(model, drive.output, value, 25.0)
+                          for value in (rate, 0.0))
     tracker = HeadingTracker(noise, covariance(model), Settings(), keep=True)
     looks = _looks(drive)
     heading, variance, looked = np.empty(len(rate)), [], set(looks.tolist())
     moving = drive.moving.tolist() if wheels else [None] * len(rate)
-    for index, sample in enumerate(zip(drive.time.tolist(), rate.tolist(), np.ascontiguousarray(sensitivity.T), moving)):
+    for index, sample in enumerate(zip(drive.time.tolist(), rate.tolist(),
+                                       np.ascontiguousarray(sensitivity.T), moving)):
         tracker.add(*sample, still)
         heading[index] = tracker.heading
         if index in looked:
@@ -147,10 +152,12 @@ def _program_misled(factor: float, known: Known) -> Iterator[tuple[str, Estimate
     yield f'this program told {words} the noise, with hindsight', later
 
 
-def _peer(name: str, settings: Mapping[str, float], known: Known) -> Iterator[tuple[str, Estimate]]:
+def _peer(name: str, settings: Mapping[str, float],
+          known: Known) -> Iterator[tuple[str, Estimate]]:
     peer = PEERS[name]
     if peer.installed:
-        yield f'{name}, as published', Estimate(peer.run(known.drive, known.likely, peer.published))
+        yield f'{name}, as published', Estimate(peer.run(known.drive, known.likely,
+                                                         peer.published))
         yield f'{name}, best settings', Estimate(peer.run(known.drive, known.likely, settings))
 
 
@@ -158,26 +165,33 @@ def _bounds(known: Known) -> Iterator[tuple[str, Estimate]]:
     looks = _looks(known.drive)
     yield 'knows s and b(t)', Estimate(bounds.knows_errors(known.drive))
     yield 'knows s, b(t) and the rests', Estimate(bounds.knows_errors_and_rests(known.drive))
-    for name, (heading, variance) in zip(('live', 'with hindsight'), bounds.knows_rests(known.drive)):
+    for name, (heading, variance) in zip(('live', 'with hindsight'),
+                                         bounds.knows_rests(known.drive)):
         yield f'knows the rests, {name}', Estimate(heading, variance[looks])
 
 
 #: What makes rows, and the rows it makes.
 MAKERS: dict[Row, tuple[str, ...]] = {
-    _simple: ('pure integration', 'self-calibration by eq. 7', 'threshold as published', 'both as published', 'eq. 7, threshold on 0.2 s',
+    _simple: ('pure integration', 'self-calibration by eq. 7', 'threshold as published',
+              'both as published', 'eq. 7, threshold on 0.2 s',
               'likelihood', 'likelihood, threshold on 0.2 s'),
     _program: ('this program, live', 'this program, with hindsight'),
-    partial(_program_misled, 0.5): tuple(f'this program told half the noise, {way}' for way in ('live', 'with hindsight')),
-    partial(_program_misled, 2.0): tuple(f'this program told twice the noise, {way}' for way in ('live', 'with hindsight')),
-    _program_with_wheels: ('this program with wheels, live', 'this program with wheels, with hindsight'),
-    _bounds: ('knows the rests, live', 'knows the rests, with hindsight', 'knows s and b(t)', 'knows s, b(t) and the rests'),
+    partial(_program_misled, 0.5): tuple(f'this program told half the noise, {way}'
+                                         for way in ('live', 'with hindsight')),
+    partial(_program_misled, 2.0): tuple(f'this program told twice the noise, {way}'
+                                         for way in ('live', 'with hindsight')),
+    _program_with_wheels: ('this program with wheels, live',
+                           'this program with wheels, with hindsight'),
+    _bounds: ('knows the rests, live', 'knows the rests, with hindsight', 'knows s and b(t)',
+              'knows s, b(t) and the rests'),
 }
 
 
 def makers(settings: Mapping[str, Mapping[str, float]]) -> dict[Row, tuple[str, ...]]:
     """Return what makes rows, with the peers in place, and the rows."""
     of_peers: dict[Row, tuple[str, ...]] = {
-        partial(_peer, name, found): (f'{name}, as published', f'{name}, best settings') for name, found in settings.items()}
+        partial(_peer, name, found): (f'{name}, as published', f'{name}, best settings')
+        for name, found in settings.items()}
     program = list(MAKERS.items())
     return dict([*program[:-1], *of_peers.items(), program[-1]])
 
@@ -209,11 +223,13 @@ def score(drive: Drive, estimate: Estimate, generator: np.random.Generator) -> S
     inside = (np.nan, np.nan, np.nan)
     if estimate.variance is not None:
         inner = error[_looks(drive)] ** 2 <= BAND * estimate.variance
-        inside = float(inner[-1]), float(inner[generator.integers(len(inner))]), float(inner.mean())
+        inside = (float(inner[-1]), float(inner[generator.integers(len(inner))]),
+                  float(inner.mean()))
     return Score(float(np.abs(error).mean()), np.abs(error[spread]), inside)
 
 
-def scores(job: tuple[str, str, int, int, str, Mapping[str, Mapping[str, float]]]) -> dict[str, Score]:
+def scores(job: tuple[str, str, int, int, str,
+                      Mapping[str, Mapping[str, float]]]) -> dict[str, Score]:
     """Return the scores of all rows of one drive."""
     gyro, course, number, seed, only, settings = job
     generator = np.random.default_rng([seed, number, *gyro.encode(), *course.encode()])
@@ -221,7 +237,8 @@ def scores(job: tuple[str, str, int, int, str, Mapping[str, Mapping[str, float]]
     found: dict[str, Score] = {}
     for maker, names in makers(settings).items():
         if any(re.search(only, name) for name in names):
-            found |= {name: score(drive.drive, estimate, generator) for name, estimate in maker(drive)}
+            found |= {name: score(drive.drive, estimate, generator)
+                      for name, estimate in maker(drive)}
     return found
 
 
@@ -241,12 +258,14 @@ def tune(job: tuple[str, str, str, int]) -> Mapping[str, float]:
 Columns = Mapping[tuple[str, str], Sequence[Mapping[str, Score]]]
 
 
-def table(columns: Columns, names: Iterable[str], cell: Callable[[Sequence[Score]], str], title: str) -> str:
+def table(columns: Columns, names: Iterable[str], cell: Callable[[Sequence[Score]], str],
+          title: str) -> str:
     """Return a table of rows by gyros and courses."""
     heads = [f'{gyro}, {course}' for gyro, course in columns]
     lines = [f'| {title} | {" | ".join(heads)} |', f'|:---|{"---:|" * len(heads)}']
     for name in names:
-        several = [[drive[name] for drive in drives if name in drive] for drives in columns.values()]
+        several = [[drive[name] for drive in drives if name in drive]
+                   for drives in columns.values()]
         cells = [cell(each) if each else 'not installed' for each in several]
         if any(cells):
             lines.append(f'| {name} | {" | ".join(cells)} |')
@@ -269,26 +288,35 @@ def inside(several: Sequence[Score]) -> str:
 
 def drives_tables(given: argparse.Namespace) -> Iterator[str]:
     """Yield the tables of the drives, and the settings of the peers."""
-    places = [(gyro, course) for gyro in given.gyros for course in COURSES if re.search(given.courses, course)]
-    wanted = [peer for peer in PEERS if re.search(given.only, f'{peer}, best settings') or re.search(given.only, f'{peer}, as published')]
+    places = [(gyro, course) for gyro in given.gyros
+              for course in COURSES if re.search(given.courses, course)]
+    wanted = [peer for peer in PEERS if re.search(given.only, f'{peer}, best settings')
+              or re.search(given.only, f'{peer}, as published')]
     with get_context('fork').Pool(given.processes) as pool:
         tunings = [(peer, *place, given.seed) for place in places for peer in wanted]
-        best: dict[tuple[str, str], dict[str, Mapping[str, float]]] = {place: {} for place in places}
+        best: dict[tuple[str, str],
+                   dict[str, Mapping[str, float]]] = {place: {} for place in places}
         for (peer, *place, _), found in zip(tunings, pool.map(tune, tunings, chunksize=1)):
             best[place[0], place[1]][peer] = found
-        jobs = [(*place, number, given.seed, given.only, best[place]) for place in places for number in range(given.drives)]
+        jobs = [(*place, number, given.seed, given.only, best[place]) for place in places
+                for number in range(given.drives)]
         found_scores = pool.map(scores, jobs, chunksize=1)
-    columns = {place: found_scores[given.drives * index:given.drives * (index + 1)] for index, place in enumerate(places)}
-    names = [name for each in makers({peer: {} for peer in wanted}).values() for name in each if re.search(given.only, name)]
+    columns = {place: found_scores[given.drives * index:given.drives * (index + 1)]
+               for index, place in enumerate(places)}
+    names = [name for each in makers({peer: {} for peer in wanted}).values()
+             for name in each if re.search(given.only, name)]
     yield table(columns, names, mean_error, f'mean error, deg, {given.drives} drives')
     yield table(columns, names, error_of_most, '95 % of the errors are below, deg')
-    yield table(columns, names, inside, 'inside of its 95 %: at the end / at a random time / of all samples, %')
-    yield '\n'.join(f'* {gyro}, {course}: {peer}: {settings}' for (gyro, course), each in best.items() for peer, settings in each.items())
+    yield table(columns, names, inside,
+                'inside of its 95 %: at the end / at a random time / of all samples, %')
+    yield '\n'.join(f'* {gyro}, {course}: {peer}: {settings}'
+                    for (gyro, course), each in best.items() for peer, settings in each.items())
 
 
 # Slow turns
 
-def slow_errors(job: tuple[str, float, int, int, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
+def slow_errors(job: tuple[str, float, int, int,
+                           Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
     """Return the error at the end of a slow turn as a share of the turn."""
     gyro, rate, number, seed, settings = job
     generator = np.random.default_rng([seed, number, round(1e6 * rate), *gyro.encode()])
@@ -296,22 +324,26 @@ def slow_errors(job: tuple[str, float, int, int, Mapping[str, Mapping[str, float
     found: dict[str, float] = {}
     for maker, names in makers(settings).items():
         if any(name in SLOW_ROWS for name in names):
-            found |= {name: abs((estimate.heading[-1] / one.drive.heading[-1]) - 1.0) for name, estimate in maker(one)}
+            found |= {name: abs((estimate.heading[-1] / one.drive.heading[-1]) - 1.0)
+                      for name, estimate in maker(one)}
     return found
 
 
-SLOW_ROWS = ('likelihood', 'likelihood, threshold on 0.2 s', 'this program, live', 'this program with wheels, live',
-             *(f'{peer}, {which}' for peer in ('VQF', 'x-io Fusion') for which in ('as published', 'best settings')))
+SLOW_ROWS = ('likelihood', 'likelihood, threshold on 0.2 s', 'this program, live',
+             'this program with wheels, live',
+             *(f'{peer}, {which}' for peer in ('VQF', 'x-io Fusion')
+               for which in ('as published', 'best settings')))
 
 
 def slow_table(given: argparse.Namespace) -> str:
     """Return the table of slow turns; peers have the best settings for random drives of 30 min."""
     peers = ('VQF', 'x-io Fusion')
     lines = [f'| mean error of a turn of 10 min, % of the turn, {given.slow_drives} drives | '
-             + ' | '.join(f'{gyro}, {rate:g} deg/s' for gyro in given.gyros for rate in SLOW) + ' |',
-             '|:---|' + '---:|' * (len(SLOW) * len(given.gyros))]
+             + ' | '.join(f'{gyro}, {rate:g} deg/s' for gyro in given.gyros for rate in SLOW)
+             + ' |', '|:---|' + '---:|' * (len(SLOW) * len(given.gyros))]
     with get_context('fork').Pool(given.processes) as pool:
-        tunings = [(peer, gyro, 'random, 30 min', given.seed) for gyro in given.gyros for peer in peers]
+        tunings = [(peer, gyro, 'random, 30 min', given.seed) for gyro in given.gyros
+                   for peer in peers]
         best: dict[str, dict[str, Mapping[str, float]]] = {gyro: {} for gyro in given.gyros}
         for (peer, gyro, *_), settings in zip(tunings, pool.map(tune, tunings, chunksize=1)):
             best[gyro][peer] = settings
@@ -321,7 +353,8 @@ def slow_table(given: argparse.Namespace) -> str:
     for row in SLOW_ROWS:
         cells = [[each[row] for each in errors[begin:begin + given.slow_drives] if row in each]
                  for begin in range(0, len(jobs), given.slow_drives)]
-        lines.append(f'| {row} | ' + ' | '.join(f'{100.0 * np.mean(cell):.1f}' if cell else 'not installed' for cell in cells) + ' |')
+        lines.append(f'| {row} | ' + ' | '.join(f'{100.0 * np.mean(cell):.1f}' if cell
+                                                else 'not installed' for cell in cells) + ' |')
     return '\n'.join(lines)
 
 
@@ -330,9 +363,12 @@ def main() -> None:
     parser.add_argument('--drives', type=int, default=200, help='of each gyro and course')
     parser.add_argument('--slow-drives', type=int, default=50, help='of each gyro and slow rate')
     parser.add_argument('--gyros', nargs='+', choices=list(GYROS), default=list(GYROS))
-    parser.add_argument('--courses', default='', help='in whose names this regular expression is found')
-    parser.add_argument('--only', default='', help='rows in whose names this regular expression is found')
-    parser.add_argument('--part', nargs='+', choices=['drives', 'slow'], default=['drives', 'slow'])
+    parser.add_argument('--courses', default='',
+                        help='in whose names this regular expression is found')
+    parser.add_argument('--only', default='',
+                        help='rows in whose names this regular expression is found')
+    parser.add_argument('--part', nargs='+', choices=['drives', 'slow'],
+                        default=['drives', 'slow'])
     parser.add_argument('--processes', type=int, default=2)
     parser.add_argument('--seed', type=int, default=0)
     given = parser.parse_args()

@@ -56,7 +56,8 @@ COMMANDS = {
     'driver': [sys.executable, '-m', 'gyro_calibration.ros.driver_node'],
 }
 COMPARED = ('relay', 'node')
-PUBLISHED = {'imu/data': Imu, 'heading': PoseWithCovarianceStamped, 'yaw_rate': TwistWithCovarianceStamped}
+PUBLISHED = {'imu/data': Imu, 'heading': PoseWithCovarianceStamped,
+             'yaw_rate': TwistWithCovarianceStamped}
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,11 @@ def model() -> GyroModel:
     """Return the model of a good fibre-optic gyro from a rate table, with all node options."""
     polynomial = rate_temperature_polynomial(3, 2)
     coefficients = 1e-4 * np.random.default_rng(1).standard_normal(len(polynomial.coefficients))
-    terms = (Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(polynomial, (0.0, 1.7, 20.0, 30.0, *coefficients.tolist())))
+    terms = (Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)),
+             Term(polynomial, (0.0, 1.7, 20.0, 30.0, *coefficients.tolist())))
     noise = Noise(angle_random_walk=2.4e-5, bias_instability=5e-6, rate_random_walk=1e-7)
-    return GyroModel(terms, 1e-12 * np.eye(2 + len(coefficients)), (-100 * DEGREE, 100 * DEGREE), (-10.0, 50.0), noise=noise,
+    return GyroModel(terms, 1e-12 * np.eye(2 + len(coefficients)), (-100 * DEGREE, 100 * DEGREE),
+                     (-10.0, 50.0), noise=noise,
                      self_calibration=SelfCalibration(0.002, 1e-4, ((1e-8, 0.0), (0.0, 1e-12))))
 
 
@@ -133,7 +136,8 @@ class Probe:
         self._node = rclpy.create_node('probe', namespace=subject)
         self._imu = self._node.create_publisher(Imu, 'imu/data_raw', SENSOR_QOS)
         self._temperature = self._node.create_publisher(Temperature, 'imu/temperature', SENSOR_QOS)
-        self._subscription = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QOS).handle
+        self._subscription = self._node.create_subscription(Imu, 'imu/data', print,
+                                                            SENSOR_QOS).handle
         self._wait_set = implementation.WaitSet(1, 0, 0, 0, 0, 0, self._node.context.handle)
         self._listen_idly()
         self._message = Imu()
@@ -158,7 +162,8 @@ class Probe:
         deadline = time.monotonic() + 20.0
         while len(self._latencies) < 50:
             if time.monotonic() > deadline:
-                raise TimeoutError(f'the {self._subject} does not answer: is the package installed for {sys.executable}?')
+                raise TimeoutError(f'the {self._subject} does not answer: is the package '
+                                   f'installed for {sys.executable}?')
             self._send(0.0)
             self._serve_until(time.monotonic() + 0.02)
 
@@ -187,7 +192,8 @@ class Probe:
                 self._receive(taken[0])
 
     def _stamp(self, message: Imu | Temperature) -> None:
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.monotonic_ns(), 1_000_000_000)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.monotonic_ns(),
+                                                                        1_000_000_000)
 
     def _send(self, rate: float) -> None:
         self._message.angular_velocity.z = rate
@@ -208,10 +214,12 @@ class Probe:
 def compare(folder: Path) -> dict[str, dict[int, list[Block]]]:
     """Return the blocks of relay and node, by subject and rate."""
     write_model(folder / 'model.yaml', model())
-    parameters = {'relay': {}, 'node': {'model_file': folder / 'model.yaml', 'calibration_file': folder / 'calibration.yaml'}}
+    parameters = {'relay': {}, 'node': {'model_file': folder / 'model.yaml',
+                                        'calibration_file': folder / 'calibration.yaml'}}
     blocks = {name: {rate: [] for rate in RATES} for name in COMPARED}
     with ExitStack() as stack:
-        probes = {name: Probe(name, stack.enter_context(running(name, folder, **parameters[name]))) for name in COMPARED}
+        probes = {name: Probe(name, stack.enter_context(running(name, folder, **parameters[name])))
+                  for name in COMPARED}
         for probe in probes.values():
             probe.wait_for_subject()
         for turn, rate in itertools.product(range(ROUNDS), RATES):
@@ -223,7 +231,8 @@ def compare(folder: Path) -> dict[str, dict[int, list[Block]]]:
 def driver_load(rate: int, folder: Path) -> float:
     """Return the load of the driver, % of a core, at a rate of the gyro."""
     samples = (Sample(0.5, None, index / rate) for index in itertools.count())
-    with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro, running('driver', folder, port=gyro.path) as process:
+    with Emulator(find('kvh_dsp3000'), samples, wait_for_reader=True) as gyro, running(
+            'driver', folder, port=gyro.path) as process:
         while not gyro.sent_bytes:
             time.sleep(0.05)
         time.sleep(1.0)
@@ -247,7 +256,8 @@ def table(blocks: dict[str, dict[int, list[Block]]]) -> Iterator[str]:
         for title, figure in FIGURES.items():
             relays, nodes = ([figure(block) for block in blocks[name][rate]] for name in COMPARED)
             ratio = statistics.median(node / relay for relay, node in zip(relays, nodes))
-            yield f'| {rate} Hz | {title} | {statistics.median(relays):.2f} | {statistics.median(nodes):.2f} | {ratio:.2f} |'
+            yield (f'| {rate} Hz | {title} | {statistics.median(relays):.2f} '
+                   f'| {statistics.median(nodes):.2f} | {ratio:.2f} |')
         lost = ' | '.join(_lost(blocks[name][rate]) for name in COMPARED)
         yield f'| {rate} Hz | lost messages | {lost} | |'
 
@@ -260,14 +270,16 @@ def main() -> None:
     """Measure and print, apart from all other ROS 2 programs."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-        os.environ.update(ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
-                          ROS_LOG_DIR=folder)
+        os.environ.update(ROS_DOMAIN_ID=str(random.randint(1, 101)),
+                          ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=folder)
         rclpy.init()
         try:
-            print(f'{os.cpu_count()} cores; load average of the minute before: {os.getloadavg()[0]:.1f}\n')
+            print(f'{os.cpu_count()} cores; load average of the minute before: '
+                  f'{os.getloadavg()[0]:.1f}\n')
             print('\n'.join(table(compare(Path(folder)))))
             for rate in RATES:
-                print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, Path(folder)):.1f} % of a core')
+                print(f'\ndriver_node at {rate} Hz: load {driver_load(rate, Path(folder)):.1f} % '
+                      'of a core')
         finally:
             rclpy.try_shutdown()
 

@@ -56,11 +56,13 @@ class Peer:
         """Tell whether it can be run here."""
         return not self.package or _module(self.package) is not None
 
-    def run(self, drive: Drive, calibration: SelfCalibration, settings: Mapping[str, float]) -> Array:
+    def run(self, drive: Drive, calibration: SelfCalibration,
+            settings: Mapping[str, float]) -> Array:
         """Return the heading; the setting 'calibrated' selects calibrated rates."""
         if not settings['calibrated']:
             return self.heading(drive, drive.output, None, settings)
-        return self.heading(drive, np.asarray(calibration.correct(drive.output)), calibration.standard_deviations[1], settings)
+        return self.heading(drive, np.asarray(calibration.correct(drive.output)),
+                            calibration.standard_deviations[1], settings)
 
 
 @cache
@@ -92,21 +94,25 @@ def _yaw(quaternions: Array) -> Array:
     return heading - heading[0]
 
 
-def vqf(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
+def vqf(drive: Drive, rate: Array, deviation: float | None,
+        settings: Mapping[str, float]) -> Array:
     """Return the heading by VQF without magnetometer, and with what it is told of the bias."""
     module: Any = _module('vqf')
     own = {name: value for name, value in settings.items() if name != 'calibrated'}
     estimator = module.VQF(drive.gyro.interval, **own)
     if deviation is not None:
         estimator.setBiasEstimate(np.zeros(3), deviation)
-    return _yaw(estimator.updateBatch(_vertical(rate), _vertical(np.full(len(rate), GRAVITY)))['quat6D'])
+    return _yaw(estimator.updateBatch(_vertical(rate),
+                                      _vertical(np.full(len(rate), GRAVITY)))['quat6D'])
 
 
-def fusion(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
+def fusion(drive: Drive, rate: Array, deviation: float | None,
+           settings: Mapping[str, float]) -> Array:
     """Return the heading by bias estimation and filter of x-io Fusion, at the gyro's rate."""
     module: Any = _module('imufusion')
     bias, filtered = module.Bias(), module.Ahrs()
-    bias.set_settings(module.BiasSettings(sample_rate=1.0 / drive.gyro.interval, stationary_threshold=settings['threshold'],
+    bias.set_settings(module.BiasSettings(sample_rate=1.0 / drive.gyro.interval,
+                                          stationary_threshold=settings['threshold'],
                                           stationary_period=settings['period']))
     filtered.set_settings(module.AhrsSettings(sample_rate=1.0 / drive.gyro.interval))
     filtered.skip_startup()  # in which it keeps the heading at zero for 3 s
@@ -117,7 +123,8 @@ def fusion(drive: Drive, rate: Array, deviation: float | None, settings: Mapping
     return _yaw(quaternions)
 
 
-def bias_average(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
+def bias_average(drive: Drive, rate: Array, deviation: float | None,
+                 settings: Mapping[str, float]) -> Array:
     """
     Return the heading less an exponential average of nearly constant rates.
 
@@ -125,7 +132,8 @@ def bias_average(drive: Drive, rate: Array, deviation: float | None, settings: M
     complementary filter of imu_tools, as long as the accelerometer shows gravity alone.
 
     """
-    threshold, change, gain = settings['threshold'] * DEGREE, settings['change'] * DEGREE, settings['gain']
+    threshold, change, gain = (settings['threshold'] * DEGREE, settings['change'] * DEGREE,
+                               settings['gain'])
     steady = (np.abs(np.diff(rate, prepend=rate[0])) < change).tolist()
     bias, biases = 0.0, []
     for value, still in zip(rate.tolist(), steady):
@@ -135,24 +143,30 @@ def bias_average(drive: Drive, rate: Array, deviation: float | None, settings: M
     return integrate(drive.time, rate - np.array(biases))
 
 
-def wheel_bias_average(drive: Drive, rate: Array, deviation: float | None, settings: Mapping[str, float]) -> Array:
+def wheel_bias_average(drive: Drive, rate: Array, deviation: float | None,
+                       settings: Mapping[str, float]) -> Array:
     """Return the heading less an exponential average while the wheels stand (imu_bias_remover)."""
     gain, still = settings['gain'], ~drive.moving
     average = lfilter([gain], [1.0, gain - 1.0], rate[still])
     counted = np.cumsum(still)
-    return integrate(drive.time, rate - np.where(counted, np.append(average, 0.0)[counted - 1], 0.0))
+    return integrate(drive.time,
+                     rate - np.where(counted, np.append(average, 0.0)[counted - 1], 0.0))
 
 
 PEERS = {
-    'VQF': Peer(vqf, 'vqf', {'calibrated': True}, {
-        'biasClip': (2.0, 0.5, 0.2, 0.1), 'restThGyr': (2.0, 1.0, 0.5, 0.2), 'biasSigmaRest': (0.03, 0.01, 0.003, 0.001),
-        'biasForgettingTime': (100.0, 300.0, 1000.0, 3000.0), 'restMinT': (1.5, 0.5, 3.0), 'calibrated': (True, False)}),
-    'x-io Fusion': Peer(fusion, 'imufusion', {'threshold': 3.0, 'period': 3.0, 'calibrated': True}, {
-        'threshold': (3.0, 2.0, 1.5, 1.0, 0.5, 0.2, 0.1, 0.05), 'period': (3.0, 1.0, 5.0), 'calibrated': (True, False)}),
+    'VQF': Peer(vqf, 'vqf', {'calibrated': True},
+                {'biasClip': (2.0, 0.5, 0.2, 0.1), 'restThGyr': (2.0, 1.0, 0.5, 0.2),
+                 'biasSigmaRest': (0.03, 0.01, 0.003, 0.001),
+                 'biasForgettingTime': (100.0, 300.0, 1000.0, 3000.0), 'restMinT': (1.5, 0.5, 3.0),
+                 'calibrated': (True, False)}),
+    'x-io Fusion': Peer(fusion, 'imufusion', {'threshold': 3.0, 'period': 3.0, 'calibrated': True},
+                        {'threshold': (3.0, 2.0, 1.5, 1.0, 0.5, 0.2, 0.1, 0.05),
+                         'period': (3.0, 1.0, 5.0), 'calibrated': (True, False)}),
     'complementary filter, bias average': Peer(
-        bias_average, '', {'threshold': 0.2 / DEGREE, 'change': 0.01 / DEGREE, 'gain': 0.01, 'calibrated': True}, {
-            'threshold': (0.2 / DEGREE, 2.0, 1.0, 0.5, 0.2, 0.1), 'change': (0.01 / DEGREE, 2.0, 0.1),
-            'gain': (0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5), 'calibrated': (True, False)}),
+        bias_average, '',
+        {'threshold': 0.2 / DEGREE, 'change': 0.01 / DEGREE, 'gain': 0.01, 'calibrated': True},
+        {'threshold': (0.2 / DEGREE, 2.0, 1.0, 0.5, 0.2, 0.1), 'change': (0.01 / DEGREE, 2.0, 0.1),
+         'gain': (0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5), 'calibrated': (True, False)}),
     'bias average while the wheels stand': Peer(
         wheel_bias_average, '', {'gain': 0.01, 'calibrated': True},
         {'gain': (0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5), 'calibrated': (True, False)}),
@@ -162,7 +176,8 @@ PEERS = {
 def tuned(peer: Peer, drives: Sequence[tuple[Drive, SelfCalibration]]) -> Mapping[str, float]:
     """Return the settings of least mean error, each improved twice in turn from the published."""
     def cost(settings: Mapping[str, float]) -> float:
-        return float(np.mean([np.abs(peer.run(drive, known, settings) - drive.heading).mean() for drive, known in drives]))
+        return float(np.mean([np.abs(peer.run(drive, known, settings) - drive.heading).mean()
+                              for drive, known in drives]))
     best, least = peer.published, cost(peer.published)
     for _ in range(2):
         for name, choices in peer.choices.items():

@@ -39,10 +39,11 @@ LENGTHS = (20.0, 30.0, 60.0, 120.0)
 #: Flicker and its drift begin so long before the run, s.
 BEFORE = 160.0
 DRIVES = {'robot': ROBOT, 'ten rounds': turns([(DRIVE, 22.5)])}
-ABILITIES = {
-    'cable, 180 deg': Ability(60.0 * DEGREE, 120.0 * DEGREE, lowest=-180.0 * DEGREE, highest=180.0 * DEGREE),
-    'cable, 20 deg': Ability(60.0 * DEGREE, 60.0 * DEGREE, lowest=-20.0 * DEGREE, highest=20.0 * DEGREE),
-    'free': Ability(60.0 * DEGREE, 120.0 * DEGREE),
+ABILITIES = {'cable, 180 deg': Ability(60.0 * DEGREE, 120.0 * DEGREE, lowest=-180.0 * DEGREE,
+                                       highest=180.0 * DEGREE),
+             'cable, 20 deg': Ability(60.0 * DEGREE, 60.0 * DEGREE, lowest=-20.0 * DEGREE,
+                                      highest=20.0 * DEGREE),
+             'free': Ability(60.0 * DEGREE, 120.0 * DEGREE),
 }
 
 
@@ -50,7 +51,8 @@ def followed(motion: Motion, time: Array, late: float, lag: float) -> Array:
     """Return the rate, rad/s, of a robot with a first-order lag, s, by a gyro with a delay, s."""
     fine = np.arange(round(time[-1] * 1000.0) + 1) / 1000.0
     response = np.exp(-np.arange(2000) / 1000.0 / lag) if lag else np.ones(1)
-    return np.convolve(motion.rate_at(fine - late), response / response.sum())[:len(fine):1000 // RATE]
+    return np.convolve(motion.rate_at(fine - late),
+                       response / response.sum())[:len(fine):1000 // RATE]
 
 
 def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
@@ -60,8 +62,10 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
     before, run, drive = (round(length * RATE) for length in (BEFORE, motion.duration, DRIVE))
     # the drive is at the end of the record: same noise for motions of any length
     count = before + round(LENGTHS[-1] * RATE) + drive
-    wander = simulate_noise(replace(XV3500.noise, angle_random_walk=0.0), count, 1.0 / RATE, generator)
-    noise = wander + simulate_noise(Noise(XV3500.noise.angle_random_walk), count, 1.0 / RATE, generator)
+    wander = simulate_noise(replace(XV3500.noise, angle_random_walk=0.0), count, 1.0 / RATE,
+                            generator)
+    noise = wander + simulate_noise(Noise(XV3500.noise.angle_random_walk), count, 1.0 / RATE,
+                                    generator)
     begin = count - drive - run
     time = np.arange(run + 1) / RATE
     output = (1.0 + s) * followed(motion, time, late, lag) + b + noise[begin:begin + run + 1]
@@ -69,9 +73,10 @@ def errors(motion: Motion, late: float, lag: float, seed: int) -> Array:
     bias = fit.bias - b - wander[begin + run:].mean()
     after = (np.arange(drive) + 1.0) / RATE
     walked = np.cumsum(noise[begin + run:]) / RATE
-    headings = [((1.0 + s) * each.heading_at(after) + walked + (b - fit.bias) * after) / (1.0 + fit.scale_factor_error)
-                - each.heading_at(after) for each in DRIVES.values()]
-    return np.array([fit.scale_factor_error - s, bias, *(np.abs(heading).mean() for heading in headings)])
+    headings = [((1.0 + s) * each.heading_at(after) + walked + (b - fit.bias) * after) / (
+        1.0 + fit.scale_factor_error) - each.heading_at(after) for each in DRIVES.values()]
+    return np.array([fit.scale_factor_error - s, bias,
+                     *(np.abs(heading).mean() for heading in headings)])
 
 
 def forecasts(duration: float) -> list[Forecast]:
@@ -79,17 +84,20 @@ def forecasts(duration: float) -> list[Forecast]:
 
 
 def planned(place: str, duration: float) -> Motion:
-    return best(ABILITIES[place], forecasts(duration)[0], duration, np.random.default_rng(1)).motion
+    return best(ABILITIES[place], forecasts(duration)[0], duration,
+                np.random.default_rng(1)).motion
 
 
-def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0, lag: float = 0.0) -> str:
+def row(pool: Executor, runs: int, name: str, motion: Motion, late: float = 0.0,
+        lag: float = 0.0) -> str:
     """Return a row of the table, with what was predicted / simulated."""
     predicted = [forecast.predict(motion) for forecast in forecasts(motion.duration)]
     found = np.array(list(pool.map(partial(errors, motion, late, lag), range(runs), chunksize=10)))
     scale, bias = np.sqrt((found[:, :2] ** 2).mean(axis=0))
     cells = [f'{100.0 * predicted[0].scale_deviation:.4f} / {100.0 * scale:.4f} %',
              f'{predicted[0].bias_deviation / DEGREE:.5f} / {bias / DEGREE:.5f} deg/s']
-    cells += [f'{each.heading_error / DEGREE:.3f} / {mean / DEGREE:.3f} deg' for each, mean in zip(predicted, found[:, 2:].mean(axis=0))]
+    cells += [f'{each.heading_error / DEGREE:.3f} / {mean / DEGREE:.3f} deg'
+              for each, mean in zip(predicted, found[:, 2:].mean(axis=0))]
     return f'| {name} | {" | ".join(cells)} |'
 
 
@@ -99,13 +107,17 @@ def main(runs: int) -> None:
     motions = {place: planned(place, twenty) for place in ABILITIES}
     rows = [('built-in profile', CALIBRATION)]
     for place, motion in motions.items():
-        rows += [(f'{place}: one turn there and back', plain(ABILITIES[place], twenty)), (f'{place}: planned', motion)]
+        rows += [(f'{place}: one turn there and back', plain(ABILITIES[place], twenty)),
+                 (f'{place}: planned', motion)]
     cable = motions['cable, 180 deg']
-    late = [('cable, 180 deg: planned, gyro 20 ms late', cable, 0.02), ('cable, 180 deg: planned, gyro 50 ms late', cable, 0.05),
+    late = [('cable, 180 deg: planned, gyro 20 ms late', cable, 0.02),
+            ('cable, 180 deg: planned, gyro 50 ms late', cable, 0.05),
             ('cable, 180 deg: planned, robot lags by 0.1 s', cable, 0.0, 0.1),
             ('cable, 20 deg: planned, robot lags by 0.1 s', motions['cable, 20 deg'], 0.0, 0.1)]
-    longer = [(f'cable, 180 deg: planned, {length:g} s', planned('cable, 180 deg', length)) for length in LENGTHS[1:]]
-    print(f'Predicted / simulated, {runs} runs a row.\n\n| motion | scale | bias | mean heading error, {" | ".join(DRIVES)} |')
+    longer = [(f'cable, 180 deg: planned, {length:g} s', planned('cable, 180 deg', length))
+              for length in LENGTHS[1:]]
+    print(f'Predicted / simulated, {runs} runs a row.\n\n'
+          f'| motion | scale | bias | mean heading error, {" | ".join(DRIVES)} |')
     print('|---|---|---|---|---|')
     with ProcessPoolExecutor() as pool:
         for arguments in rows + late + longer:

@@ -51,14 +51,13 @@ def chosen(technology: str | None) -> Fit:
     return lambda dwells: select_effects(dwells, technology).calibration.model
 
 
-FITS = {
-    'bias': of(BIAS),
-    'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
-    '... and scale factor over temperature, cubic': of(*THERMAL, CUBIC_NONLINEARITY),
-    '... and scale factor over temperature, sine': of(*THERMAL, SINE_RESPONSE),
-    'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
-    'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
-    **{f'default, {technology or "no technology said"}': chosen(technology) for technology in (None, *TECHNOLOGIES)},
+FITS = {'bias': of(BIAS), 'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
+        '... and scale factor over temperature, cubic': of(*THERMAL, CUBIC_NONLINEARITY),
+        '... and scale factor over temperature, sine': of(*THERMAL, SINE_RESPONSE),
+        'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
+        'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
+        **{f'default, {technology or "no technology said"}': chosen(technology)
+           for technology in (None, *TECHNOLOGIES)},
 }
 
 
@@ -69,12 +68,14 @@ def table(data: Path) -> Dwells:
 
 def error(model: GyroModel, dwells: Dwells) -> np.ndarray:
     """Return the error of compensated rates, rad/s, without clipping the temperature."""
-    return compensate(replace(model, temperature_range=(-np.inf, np.inf)), dwells.output, dwells.temperature).rate - dwells.rate
+    return compensate(replace(model, temperature_range=(-np.inf, np.inf)), dwells.output,
+                      dwells.temperature).rate - dwells.rate
 
 
 def left_out(fit: Fit, dwells: Dwells) -> float:
     """Return the root mean square error in sweeps that were left out, rad/s."""
-    parts = [(take(dwells, dwells.sweep != number), take(dwells, dwells.sweep == number)) for number in np.unique(dwells.sweep)]
+    parts = [(take(dwells, dwells.sweep != number), take(dwells, dwells.sweep == number))
+             for number in np.unique(dwells.sweep)]
     return rms(np.concatenate([error(fit(seen), unseen) for seen, unseen in parts]))
 
 
@@ -87,9 +88,11 @@ def beyond(fit: Fit, dwells: Dwells) -> float:
 def main() -> None:
     """Print the table."""
     dwells = table(Path(os.environ['GYRO_CALIBRATION_DATA']))
-    print('| calibration | left-out sweeps | slower than 60 deg/s seen, 60 to 101 predicted |\n|---|---|---|')
+    print('| calibration | left-out sweeps | slower than 60 deg/s seen, 60 to 101 predicted |\n'
+          '|---|---|---|')
     for name, fit in FITS.items():
-        print(f'| {name} | {left_out(fit, dwells) / DEGREE:.4f} | {beyond(fit, dwells) / DEGREE:.4f} |', flush=True)
+        print(f'| {name} | {left_out(fit, dwells) / DEGREE:.4f} '
+              f'| {beyond(fit, dwells) / DEGREE:.4f} |', flush=True)
 
 
 if __name__ == '__main__':

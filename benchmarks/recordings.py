@@ -56,7 +56,8 @@ def fits(time: Array, output: Array, heading: Array, seconds: float) -> tuple[di
     blocks = fit_likelihood(*given, 0.25)
     plain = fit_heading(*given)
     found = {'none': replace(blocks, scale_factor_error=0.0, bias=0.0),
-             'eq. 7': replace(blocks, scale_factor_error=plain.scale_factor_error, bias=plain.bias), 'blocks': blocks}
+             'eq. 7': replace(blocks, scale_factor_error=plain.scale_factor_error,
+                              bias=plain.bias), 'blocks': blocks}
     reason = ''
     for name, limits in (('slow', Limits(repeating=math.inf)), ('now', Limits())):
         try:
@@ -69,36 +70,42 @@ def fits(time: Array, output: Array, heading: Array, seconds: float) -> tuple[di
 def follow(fit: Fit, time: Array, output: Array, heading: Array) -> tuple[Array, Array]:
     """Return the error of the heading and its stated sigma, rad, without the last second."""
     turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
-    turned = np.interp(time + fit.time_offset, time, turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
-    known = quadratic_form(fit.covariance, np.array([heading, time])) / (1.0 + fit.scale_factor_error) ** 2
+    turned = np.interp(time + fit.time_offset, time,
+                       turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
+    known = quadratic_form(fit.covariance,
+                           np.array([heading, time])) / (1.0 + fit.scale_factor_error) ** 2
     variance = known + NOISE.heading_variance(time) + fit.start_heading_deviation ** 2
     kept = time < time[-1] - 1.0
     return (turned + fit.start_heading - heading)[kept], np.sqrt(variance)[kept]
 
 
-def row(log: Log, sense: float, begin: float, seconds: float) -> tuple[list[float], list[float], str]:
+def row(log: Log, sense: float, begin: float,
+        seconds: float) -> tuple[list[float], list[float], str]:
     """Return rms errors, sigmas of bias and final heading (deg), share inside, and refusal."""
     time, output, heading = part(log, sense, begin)
     found, reason = fits(time, output, heading, seconds)
     followed = {name: follow(fit, time, output, heading) for name, fit in found.items()}
-    errors = [math.sqrt(np.mean(followed[name][0] ** 2)) / DEGREE if name in followed else math.nan for name in METHODS]
+    errors = [math.sqrt(np.mean(followed[name][0] ** 2)) / DEGREE if name in followed else math.nan
+              for name in METHODS]
     if 'slow' not in followed:
         return errors, [math.nan] * 3, reason
     error, deviation = followed['slow']
-    stated = [math.sqrt(found['slow'].covariance[1, 1]) / DEGREE, deviation[-1] / DEGREE, float(np.mean(np.abs(error) < 1.96 * deviation))]
+    stated = [math.sqrt(found['slow'].covariance[1, 1]) / DEGREE, deviation[-1] / DEGREE,
+              float(np.mean(np.abs(error) < 1.96 * deviation))]
     return errors, stated, reason
 
 
 def line(name: str, seconds: float, errors: Array, stated: Array, last: str) -> str:
     """Return a line of a table."""
     numbers = ['-' if math.isnan(value) else f'{value:.2f}' for value in errors]
-    said = ['-'] * 3 if math.isnan(stated[0]) else [f'{stated[0]:.3f}', f'{stated[1]:.1f}', f'{100 * stated[2]:.1f} %']
+    said = ['-'] * 3 if math.isnan(stated[0]) else [f'{stated[0]:.3f}', f'{stated[1]:.1f}',
+                                                    f'{100 * stated[2]:.1f} %']
     return f'| `{name}` | {seconds:.0f} s | ' + ' | '.join([*numbers, *said, last]) + ' |'
 
 
 def header(last: str) -> list[str]:
-    return [f'| recording | on | none | eq. 7 | blocks | slow | now | stated (slow): bias, deg/s | '
-            f'heading at the end, deg | inside 95 % | {last} |',
+    return ['| recording | on | none | eq. 7 | blocks | slow | now | stated (slow): bias, deg/s '
+            f'| heading at the end, deg | inside 95 % | {last} |',
             '|---|---|---|---|---|---|---|---|---|---|---|']
 
 
@@ -111,7 +118,8 @@ def root_mean_square(values: Array) -> float:
 def summary(stated: Array) -> Array:
     """Return the medians of the stated values, and the least share inside, of given runs."""
     known = stated[np.isfinite(stated[:, 0])]
-    return np.append(np.median(known[:, :2], axis=0), known[:, 2].min()) if len(known) else np.full(3, math.nan)
+    return np.append(np.median(known[:, :2], axis=0),
+                     known[:, 2].min()) if len(known) else np.full(3, math.nan)
 
 
 def tables(folder: Path, step: float) -> tuple[str, str]:
@@ -124,13 +132,16 @@ def tables(folder: Path, step: float) -> tuple[str, str]:
             rows = [row(log, sense, begin, seconds) for begin in begins]
             errors, stated = (np.array([each[place] for each in rows]) for place in (0, 1))
             first.append(line(name, seconds, errors[0], stated[0], rows[0][2]))
-            many.append(line(name, seconds, np.array([root_mean_square(column) for column in errors.T]), summary(stated),
-                             f'{np.isnan(errors[:, -1]).sum()} of {len(begins)}'))
+            many.append(line(name, seconds,
+                             np.array([root_mean_square(column) for column in errors.T]),
+                             summary(stated), f'{np.isnan(errors[:, -1]).sum()} of {len(begins)}'))
     return '\n'.join(first), '\n'.join(many)
 
 
 if __name__ == '__main__':
-    found = tables(Path(os.environ['GYRO_CALIBRATION_DATA']), float(sys.argv[1]) if len(sys.argv) > 1 else 60.0)
-    print('From the beginning of each recording, rms errors over five minutes in deg:\n\n' + found[0])
-    print('\nFrom many beginnings, root mean squares (slow, now: of those not refused), medians of what was stated, and the least part '
-          'inside:\n\n' + found[1])
+    found = tables(Path(os.environ['GYRO_CALIBRATION_DATA']),
+                   float(sys.argv[1]) if len(sys.argv) > 1 else 60.0)
+    print('From the beginning of each recording, rms errors over five minutes in deg:\n\n'
+          + found[0])
+    print('\nFrom many beginnings, root mean squares (slow, now: of those not refused), medians '
+          'of what was stated, and the least part inside:\n\n' + found[1])

@@ -41,15 +41,20 @@ from gyro_calibration.model import GyroModel, Term
 
 #: An effect of clear size each; those of temperature count from 36 degC.
 TRUTH = {term.effect.name: term for term in (
-    Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(SCALE_FACTOR_ASYMMETRY, (0.003,)),
-    Term(QUADRATIC_NONLINEARITY, (0.002,)), Term(CUBIC_NONLINEARITY, (-0.005,)), Term(SINE_RESPONSE, (0.25, 1.0)),
-    Term(BIAS_TEMPERATURE, (36.0, 1e-5)), Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 1e-6)), Term(SCALE_FACTOR_TEMPERATURE, (36.0, 3e-4)))}
+    Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (0.01,)),
+    Term(SCALE_FACTOR_ASYMMETRY, (0.003,)), Term(QUADRATIC_NONLINEARITY, (0.002,)),
+    Term(CUBIC_NONLINEARITY, (-0.005,)), Term(SINE_RESPONSE, (0.25, 1.0)),
+    Term(BIAS_TEMPERATURE, (36.0, 1e-5)), Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 1e-6)),
+    Term(SCALE_FACTOR_TEMPERATURE, (36.0, 3e-4)))}
 #: Orders (3, 2), by the matrix of the paper for deg/s and degC.
-POLYNOMIAL = Term(*polynomial_from_matrix([[0, 0, -1e-5, 1e-5], [0, 0, 4e-4, -1e-3], [-3e-6, 1e-5, 8e-3, 3e-2]]))
+POLYNOMIAL = Term(*polynomial_from_matrix([[0, 0, -1e-5, 1e-5], [0, 0, 4e-4, -1e-3],
+                                           [-3e-6, 1e-5, 8e-3, 3e-2]]))
 LINEAR = tuple(TRUTH[name] for name in ('bias', 'scale_factor_error'))
-CUBIC = (*LINEAR, *(TRUTH[name] for name in ('scale_factor_asymmetry', 'cubic_nonlinearity', 'bias_temperature',
-                                             'bias_temperature_quadratic', 'scale_factor_temperature')))
-SINE = (*LINEAR, *(TRUTH[name] for name in ('quadratic_nonlinearity', 'sine_response', 'bias_temperature', 'scale_factor_temperature')))
+CUBIC = (*LINEAR, *(TRUTH[name] for name in ('scale_factor_asymmetry', 'cubic_nonlinearity',
+                                             'bias_temperature', 'bias_temperature_quadratic',
+                                             'scale_factor_temperature')))
+SINE = (*LINEAR, *(TRUTH[name] for name in ('quadratic_nonlinearity', 'sine_response',
+                                            'bias_temperature', 'scale_factor_temperature')))
 
 
 @dataclass(frozen=True)
@@ -86,11 +91,15 @@ class Table:
         rate = np.concatenate([self._pass(number) for number in range(self.sweeps)])
         warming = np.tile(np.linspace(0.0, 2.0, self.rates), self.sweeps)
         temperature = np.repeat(np.linspace(*self.temperatures, self.sweeps), self.rates) + warming
-        deviation = self.dwell * (np.exp(0.5 * generator.standard_normal(len(rate))) if self.told else np.ones(len(rate)))
-        scale = self.dwell_scale * generator.standard_normal(len(rate)) + self.sweep_scale * generator.standard_normal(self.sweeps)[sweep]
-        bias = deviation * generator.standard_normal(len(rate)) + self.sweep_bias * generator.standard_normal(self.sweeps)[sweep]
+        deviation = self.dwell * (np.exp(0.5 * generator.standard_normal(len(rate))) if self.told
+                                  else np.ones(len(rate)))
+        scale = (self.dwell_scale * generator.standard_normal(len(rate))
+                 + self.sweep_scale * generator.standard_normal(self.sweeps)[sweep])
+        bias = (deviation * generator.standard_normal(len(rate))
+                + self.sweep_bias * generator.standard_normal(self.sweeps)[sweep])
         return Dwells(rate, gyro.output(rate, temperature) + bias + scale * rate, temperature,
-                      deviation if self.told else np.full(len(rate), np.nan), sweep, tuple(f'row {row + 1}' for row in range(len(rate))))
+                      deviation if self.told else np.full(len(rate), np.nan), sweep,
+                      tuple(f'row {row + 1}' for row in range(len(rate))))
 
     def _pass(self, number: int) -> np.ndarray:
         way = 1.0 if number % 2 else -1.0
@@ -100,54 +109,66 @@ class Table:
 SCATTERS = {
     'alike for all dwells': Table(),
     'grows with the rate': Table(dwell=0.01 * DEGREE, dwell_scale=7e-4),
-    'differs by dwell, told': Table(told=True),
-    '3 sweeps, one temperature each': Table(sweeps=3),
+    'differs by dwell, told': Table(told=True), '3 sweeps, one temperature each': Table(sweeps=3),
     '4 sweeps': Table(sweeps=4),
     'little from sweep to sweep': Table(sweep_bias=0.006 * DEGREE, sweep_scale=1e-4),
     'from sweep to sweep': Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4),
     'much from sweep to sweep': Table(sweep_bias=0.1 * DEGREE, sweep_scale=3e-3),
-    'from sweep to sweep, one way': Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4, one_way=True),
-    'much from sweep to sweep, one way': Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True),
+    'from sweep to sweep, one way': Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4,
+                                          one_way=True),
+    'much from sweep to sweep, one way': Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3,
+                                               one_way=True),
     '24 sweeps, from sweep to sweep': Table(sweeps=24, sweep_bias=0.02 * DEGREE, sweep_scale=3e-4),
-    '24 sweeps, from sweep to sweep, one way': Table(sweeps=24, sweep_bias=0.02 * DEGREE, sweep_scale=3e-4, one_way=True),
+    '24 sweeps, from sweep to sweep, one way': Table(sweeps=24, sweep_bias=0.02 * DEGREE,
+                                                     sweep_scale=3e-4, one_way=True),
 }
 
 
 def gyros() -> dict[str, tuple[Term, ...]]:
     """Return a gyro for each effect, with what it needs besides."""
-    needed = {'bias': (), 'scale_factor_error': (TRUTH['bias'],), 'bias_temperature_quadratic': (*LINEAR, TRUTH['bias_temperature'])}
-    return {**{name: (*needed.get(name, LINEAR), term) for name, term in TRUTH.items()}, 'polynomial 3,2': (POLYNOMIAL,)}
+    needed = {'bias': (), 'scale_factor_error': (TRUTH['bias'],),
+              'bias_temperature_quadratic': (*LINEAR, TRUTH['bias_temperature'])}
+    return {**{name: (*needed.get(name, LINEAR), term) for name, term in TRUTH.items()},
+            'polynomial 3,2': (POLYNOMIAL,)}
 
 
 def expressed(truth: GyroModel, fitted: GyroModel) -> np.ndarray:
     """Return the true values in the fitted model's terms: temperature, centres and scales."""
-    rate, temperature = (each.ravel() for each in np.meshgrid(np.linspace(-1.7, 1.7, 11), np.linspace(25.0, 47.0, 7)))
+    rate, temperature = (each.ravel() for each in np.meshgrid(np.linspace(-1.7, 1.7, 11),
+                                                              np.linspace(25.0, 47.0, 7)))
     channels = Channels(rate, truth.output(rate, temperature), temperature)
-    shapes = {term.effect.name: term.values[:len(term.effect.shapes)] for term in truth.terms if term.effect is SINE_RESPONSE}
-    terms = [Term(term.effect, (*shapes.get(term.effect.name, term.values[:len(term.effect.shapes)]),
-                                *term.values[len(term.effect.shapes):])) for term in fitted.terms]
+    shapes = {term.effect.name: term.values[:len(term.effect.shapes)]
+              for term in truth.terms if term.effect is SINE_RESPONSE}
+    terms = [Term(term.effect,
+                  (*shapes.get(term.effect.name, term.values[:len(term.effect.shapes)]),
+                   *term.values[len(term.effect.shapes):])) for term in fitted.terms]
     linear = [term for term in terms if term.effect is not SINE_RESPONSE]
-    rest = truth.error(channels) - sum(term.error(channels) for term in terms if term.effect is SINE_RESPONSE)
+    rest = truth.error(channels) - sum(term.error(channels)
+                                       for term in terms if term.effect is SINE_RESPONSE)
     columns = np.column_stack([column for term in linear for column in term.columns(channels)])
     found = iter(np.linalg.lstsq(columns, rest, rcond=None)[0].tolist())
-    return np.array([value for term in terms for value in
-                     (term.values[:1] if term.effect is SINE_RESPONSE else [next(found) for _ in term.fitted])])
+    return np.array([value for term in terms for value in (
+        term.values[:1] if term.effect is SINE_RESPONSE else [next(found) for _ in term.fitted])])
 
 
-def run(terms: Sequence[Term], table: Table, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def run(terms: Sequence[Term], table: Table,
+        generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the normalized errors of the fitted values, and of the compensated rates."""
     truth = GyroModel(tuple(terms))
     model = fit_effects(table.measure(truth, generator), [term.effect for term in terms]).model
     found = np.array([term.values[place] for term in model.terms for place in term.fitted])
     errors = (found - expressed(truth, model)) / np.sqrt(np.diag(model.covariance))
-    rate, temperature = (each.ravel() for each in np.meshgrid(np.linspace(-1.0, 1.0, 5) * table.fastest, np.array(table.temperatures)))
+    rate, temperature = (each.ravel() for each in np.meshgrid(
+        np.linspace(-1.0, 1.0, 5) * table.fastest, np.array(table.temperatures)))
     output = truth.output(rate, temperature)
     given = compensate(model, output, temperature)
-    variance = quadratic_form(covariance(model), rate_sensitivity(model, output, given.rate, given.temperature))
+    variance = quadratic_form(covariance(model),
+                              rate_sensitivity(model, output, given.rate, given.temperature))
     return errors, (given.rate - rate) / np.sqrt(variance)
 
 
-def coverage(terms: Sequence[Term], table: Table, runs: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def coverage(terms: Sequence[Term], table: Table, runs: int,
+             seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return how often the interval of each value held the truth, and that of each rate."""
     generator = np.random.default_rng(seed)
     errors = [run(terms, table, generator) for _ in range(runs)]
@@ -157,16 +178,19 @@ def coverage(terms: Sequence[Term], table: Table, runs: int, seed: int) -> tuple
 
 def row(name: str, held: tuple[np.ndarray, np.ndarray]) -> str:
     """Return a row of a table in Markdown, in percent."""
-    figures = [f'{100 * each.mean():.1f} | {100 * each.min():.1f} to {100 * each.max():.1f}' for each in held]
+    figures = [f'{100 * each.mean():.1f} | {100 * each.min():.1f} to {100 * each.max():.1f}'
+               for each in held]
     return f'| {name} | {figures[0]} | {figures[1]} |'
 
 
 def main(runs: int) -> None:
     """Print both tables."""
-    header = 'values, % | lowest to highest | rates, % | lowest to highest |\n|---|---|---|---|---|'
+    header = ('values, % | lowest to highest | rates, % | lowest to highest |\n'
+              '|---|---|---|---|---|')
     print(f'| effect | {header}', flush=True)
     for seed, (name, terms) in enumerate(gyros().items()):
-        print(row(f'`{name}`' if name in TRUTH else name, coverage(terms, Table(), runs, seed)), flush=True)
+        print(row(f'`{name}`' if name in TRUTH else name, coverage(terms, Table(), runs, seed)),
+              flush=True)
     print(f'\n| scatter | {header}', flush=True)
     for seed, (name, table) in enumerate(SCATTERS.items()):
         for words, terms in (('cubic', CUBIC), ('sine', SINE)):

@@ -58,7 +58,8 @@ class Interface:
 
 OLD = Interface('gyro_calibration.compensation_node', '/', 'drive_profile')
 MOVED = Interface('gyro_calibration.ros.compensation_node', '/', 'drive_profile')
-NEW = Interface('gyro_calibration.ros.compensation_node', '/compensation_node/', 'calibration.drive')
+NEW = Interface('gyro_calibration.ros.compensation_node', '/compensation_node/',
+                'calibration.drive')
 
 
 def interface(tree):
@@ -84,13 +85,15 @@ class Row:
     def cells(self):
         """Return the columns as text."""
         turned = f'{self.turned:.0f}{" and still turning" if self.still else ""}'
-        zero = 'never' if self.zero == math.inf else '-' if math.isnan(self.zero) else f'{self.zero:.2f}'
+        zero = ('never' if self.zero == math.inf else '-' if math.isnan(self.zero)
+                else f'{self.zero:.2f}')
         heading = f'{self.error:+.1f} +- {self.deviation:.1f}'
-        return [self.fault, turned, zero, heading, f'{self.level}: {_short(self.message)}', _short(self.answer)]
+        return [self.fault, turned, zero, heading, f'{self.level}: {_short(self.message)}',
+                _short(self.answer)]
 
 
-HEADER = ['fault', 'turned after it, deg', 'zero commanded after, s', 'heading error +- claimed, deg', 'diagnostics',
-          'answer']
+HEADER = ['fault', 'turned after it, deg', 'zero commanded after, s',
+          'heading error +- claimed, deg', 'diagnostics', 'answer']
 
 
 def _short(text, most=150):
@@ -101,7 +104,8 @@ class Stage:
     """A robot, a node under test, and everything that is heard of both."""
 
     def __init__(self, tree, folder, closing):
-        self._tree, self._folder, self._closing, self.names = tree, folder, closing, interface(tree)
+        self._tree, self._folder, self._closing, self.names = (tree, folder, closing,
+                                                               interface(tree))
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node('robot', context=context)
@@ -130,14 +134,16 @@ class Stage:
     def _on_report(self, message):
         for status in message.status:
             if status.name.endswith(': heading'):
-                self._reports.append((now(), int.from_bytes(status.level, 'little'), status.message))
+                self._reports.append((now(), int.from_bytes(status.level, 'little'),
+                                      status.message))
 
     def start(self, *, parameters=None, speed=None, **robot):
         """Start robot and node, and wait until the robot has rested for a while."""
         self.robot = RosRobot(self.node, Robot(**robot), speed=speed)
         self._closing.callback(self.robot.close)
         (self._folder / 'model.yaml').write_text(MODEL)
-        given = {'model_file': self._folder / 'model.yaml', 'calibration_file': self._folder / 'calibration.yaml',
+        given = {'model_file': self._folder / 'model.yaml',
+                 'calibration_file': self._folder / 'calibration.yaml',
                  self.names.drive: True, **(parameters or {})}
         command = [sys.executable, '-m', self.names.module, '--ros-args']
         texts = {name: str(value).lower() if isinstance(value, bool) else value
@@ -155,7 +161,8 @@ class Stage:
         limit = now() + timeout
         while not condition():
             if now() > limit:
-                raise TimeoutError(f'not within {timeout:g} s: {what}; {(self._folder / "node.txt").read_text()[-400:]}')
+                raise TimeoutError(f'not within {timeout:g} s: {what}; '
+                                   f'{(self._folder / "node.txt").read_text()[-400:]}')
             time.sleep(0.005)
 
     def call(self, name):
@@ -168,7 +175,8 @@ class Stage:
     def calibrate(self):
         """Call calibrate, and return when the robot turns at full rate, or the answer has come."""
         self._answer = self.call('calibrate')
-        self.wait(lambda: abs(self.robot.robot.rate) > FULL_RATE or self._answer.done(), 20.0, 'full rate')
+        self.wait(lambda: abs(self.robot.robot.rate) > FULL_RATE or self._answer.done(), 20.0,
+                  'full rate')
 
     def fault(self):
         """Let the row begin here."""
@@ -177,7 +185,8 @@ class Stage:
     def watch(self, seconds=WATCHED, until_answer=False):
         """Look on, until the end of the run if that is wanted."""
         limit = now() + seconds
-        while now() < limit and not (until_answer and self._answer.done() and abs(self.robot.robot.rate) < 0.01):
+        while now() < limit and not (until_answer and self._answer.done()
+                                     and abs(self.robot.robot.rate) < 0.01):
             time.sleep(0.02)
 
     def row(self, name, others=()):
@@ -185,15 +194,18 @@ class Stage:
         row, began = Row(name), self._began
         row.turned = math.degrees(self.robot.turned_since(began))
         row.still = abs(self.robot.robot.rate) > 0.01
-        commands = [(when, rate) for when, rate in self.robot.commands if when >= began and rate not in others]
+        commands = [(when, rate) for when, rate in self.robot.commands if when >= began
+                    and rate not in others]
         driving = [when for when, rate in commands if rate]
-        zeros = [when for when, rate in commands if not rate and when > max(driving, default=began)]
+        zeros = [when for when, rate in commands if not rate
+                 and when > max(driving, default=began)]
         row.zero = zeros[0] - began if zeros else math.inf if driving else math.nan
         row.error, row.deviation = self._heading()
         reports = [(level, message) for when, level, message in self._reports if when >= began]
         if reports:
             worst = max(level for level, _ in reports)
-            row.level, row.message = LEVELS[worst], [message for level, message in reports if level == worst][-1]
+            row.level, row.message = LEVELS[worst], [message for level, message in reports
+                                                     if level == worst][-1]
         if self._answer:
             row.answer = 'none' if not self._answer.done() else self._answer.result().message
         return row
@@ -327,7 +339,8 @@ def _two_publishers(stage, name, change):
 
 
 def _shift(message, seconds):
-    nanoseconds = message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec + round(seconds * 1e9)
+    nanoseconds = message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec + round(
+        seconds * 1e9)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10 ** 9)
 
 
@@ -341,7 +354,8 @@ def second_gyro(stage):
 
 def second_driver(stage):
     """The same samples once more, 0.3 s old"""
-    return _two_publishers(stage, 'second publisher: stamps 0.3 s older', lambda message: _shift(message, -0.3))
+    return _two_publishers(stage, 'second publisher: stamps 0.3 s older',
+                           lambda message: _shift(message, -0.3))
 
 
 def killed(stage):
@@ -398,8 +412,9 @@ def busy(stage):
     return stage.row('two processes spin (should work)')
 
 
-FAULTS = (clock_absent, clock_paused, clock_paused_unplugged, clock_fast, stamps_stand, unplugged, soft_stop, teleop,
-          begun_in_teleop, second_gyro, second_driver, killed, killed_with_timeout, deaf, wheels, busy)
+FAULTS = (clock_absent, clock_paused, clock_paused_unplugged, clock_fast, stamps_stand, unplugged,
+          soft_stop, teleop, begun_in_teleop, second_gyro, second_driver, killed,
+          killed_with_timeout, deaf, wheels, busy)
 
 
 @contextmanager
@@ -415,7 +430,8 @@ def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--tree', type=Path, default=ROOT, help='version whose node is tested')
-    parser.add_argument('--only', default='', help='only faults whose function has this in its name')
+    parser.add_argument('--only', default='',
+                        help='only faults whose function has this in its name')
     given = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)

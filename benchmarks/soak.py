@@ -63,8 +63,10 @@ INTERVAL = 1.0  # s between looks at the processes
 LARGEST_RATE = 1000.0  # Hz; above it the driver is told to average
 SENSITIVITY = {'fizoptika': DEGREE / 27880.0}  # rad/s a count; what the wire format leaves open
 PROCESSES = ('gyro', 'driver_node', 'compensation_node', 'count')
-MODEL = GyroModel((Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), 1e-10 * np.eye(2), (-8.0, 8.0), (-10.0, 50.0),
-                  noise=Noise(angle_random_walk=2.4e-5, bias_instability=5e-6, rate_random_walk=1e-7))
+MODEL = GyroModel((Term(BIAS, (1e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), 1e-10 * np.eye(2),
+                  (-8.0, 8.0), (-10.0, 50.0),
+                  noise=Noise(angle_random_walk=2.4e-5, bias_instability=5e-6,
+                              rate_random_walk=1e-7))
 FINEST, RATIO = 1e-2, 1.02  # ms, and between the edges of the classes of latencies
 
 # Shared by all processes of a run: times of begin and early end; due time of the first numbered
@@ -91,7 +93,8 @@ def full_rate(name: str) -> float:
     """Return how many samples a second the line of a format carries."""
     protocol = find(name)
     encode, count = protocol.encoder(settings_of(name)), 16
-    length = sum(len(encode(Sample(0.5, 25.0, 1000.0 + 0.001 * number, number))) for number in range(count)) / count
+    length = sum(len(encode(Sample(0.5, 25.0, 1000.0 + 0.001 * number, number)))
+                 for number in range(count)) / count
     return protocol.baud / (10.0 * length)
 
 
@@ -113,14 +116,16 @@ def arriving(name: str, output: float, rate: float) -> float:
     """Return what comes of an output by a wire format, which rounds it."""
     settings, protocol = settings_of(name, rate), find(name)
     encode, decoder = protocol.encoder(settings), protocol.decoder(settings)
-    data = protocol.preamble + b''.join(encode(Sample(output, 25.0, 1.0, number)) for number in range(4))
+    data = protocol.preamble + b''.join(encode(Sample(output, 25.0, 1.0, number))
+                                        for number in range(4))
     return decoder.feed(data)[-1].output
 
 
 def turning(name: str, rate: float) -> Iterator[tuple[float, float]]:
     """Yield true rate and output of each sample: numbered, or to and fro without rounding."""
     if name == SOAKED and rate == SOAKED_RATE:
-        yield from ((turned, MODEL.output(turned, 25.0)) for turned in map(numbered_rate, itertools.count()))
+        yield from ((turned, MODEL.output(turned, 25.0))
+                    for turned in map(numbered_rate, itertools.count()))
     outputs = [arriving(name, sign * SMALLEST, rate) for sign in (1.0, -1.0)]
     for index in itertools.count():
         output = outputs[int(index / (STRETCH * rate)) % 2]
@@ -129,7 +134,8 @@ def turning(name: str, rate: float) -> Iterator[tuple[float, float]]:
 
 def samples_of(given: argparse.Namespace, numbers: np.memmap) -> Iterator[Sample]:
     """Yield leading samples until all is ready, counted ones, then leading ones for 1 s."""
-    interval, begin, leading, turned = 1.0 / given.rate, time.monotonic(), given.leading, given.leading
+    interval, begin, leading, turned = (1.0 / given.rate, time.monotonic(), given.leading,
+                                        given.leading)
     for first in itertools.count():
         if numbers[GO]:
             break
@@ -154,7 +160,8 @@ def gyro(given: argparse.Namespace) -> None:
     numbers = shared(given.folder)
     settings = settings_of(given.protocol, given.rate)
     speed = 1.0 + 1e-9 if given.patient else 1.0  # faster than real time is a replay, which waits
-    emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, speed, given.folder / 'port', wait_for_reader=True)
+    emulator = Emulator(find(given.protocol), samples_of(given, numbers), settings, speed,
+                        given.folder / 'port', wait_for_reader=True)
     signal.signal(signal.SIGINT, lambda *_: emulator.stop())
     emulate(emulator)
     numbers[LOST_BYTES] = emulator.lost_bytes
@@ -170,7 +177,8 @@ class Counter:
         self._given, self._numbers = given, shared(given.folder)
         self._node = rclpy.create_node('counter')
         self._rates = self._node.create_subscription(Imu, 'imu/data', print, SENSOR_QOS).handle
-        self._reports = self._node.create_subscription(DiagnosticArray, '/diagnostics', print, 10).handle
+        self._reports = self._node.create_subscription(DiagnosticArray, '/diagnostics', print,
+                                                       10).handle
         self._wait_set = implementation.WaitSet(2, 0, 0, 0, 0, 0, self._node.context.handle)
         self._latencies = np.zeros(1000, int)
         self.messages = self.missing = self.repeated = 0
@@ -188,7 +196,8 @@ class Counter:
             while taken := self._rates.take_message(Imu, False):
                 self._count(taken[0], time.monotonic())
             while taken := self._reports.take_message(DiagnosticArray, False):
-                self._said |= {f'{status.name} {pair.key}': pair.value for status in taken[0].status for pair in status.values}
+                self._said |= {f'{status.name} {pair.key}': pair.value
+                               for status in taken[0].status for pair in status.values}
 
     def _count(self, message: Imu, now: float) -> None:
         self.messages += 1
@@ -208,15 +217,19 @@ class Counter:
         self.missing += number - self._last - 1
         self._last = number
         latency = 1e3 * (now - self._numbers[BEGIN] - number / self._given.rate)
-        self._latencies[min(len(self._latencies) - 1, max(0, int(math.log(max(latency, FINEST) / FINEST) / math.log(RATIO))))] += 1
+        self._latencies[min(len(self._latencies) - 1, max(
+            0, int(math.log(max(latency, FINEST) / FINEST) / math.log(RATIO))))] += 1
 
     def say(self) -> dict[str, object]:
         """Return what has been seen so far."""
         share = np.cumsum(self._latencies) / max(1, self._latencies.sum())
-        classes = {str(wanted): int(np.searchsorted(share, wanted / 100.0)) for wanted in (50, 99, 99.9, 100)}
-        latency = {name: FINEST * RATIO ** (place + 0.5) for name, place in classes.items()} if self._latencies.any() else {}
+        classes = {str(wanted): int(np.searchsorted(share, wanted / 100.0))
+                   for wanted in (50, 99, 99.9, 100)}
+        latency = {name: FINEST * RATIO ** (place + 0.5)
+                   for name, place in classes.items()} if self._latencies.any() else {}
         turned = None if self._first_heading is None else self._heading - self._first_heading
-        return {'messages': self.messages, 'last': self._last, 'missing': self.missing, 'repeated': self.repeated, 'turned': turned,
+        return {'messages': self.messages, 'last': self._last, 'missing': self.missing,
+                'repeated': self.repeated, 'turned': turned,
                 'latency_ms': latency, 'said': self._said}
 
 
@@ -241,7 +254,8 @@ class Run:
         self.given, self._folder, self._stack = given, folder, stack
         self.numbers = shared(folder)
         self.numbers[:] = 0.0
-        write_model(folder / 'model.yaml', MODEL if given.leading else GyroModel(noise=MODEL.noise))
+        write_model(folder / 'model.yaml',
+                    MODEL if given.leading else GyroModel(noise=MODEL.noise))
         self.processes: dict[str, subprocess.Popen] = {}
         self.memory: dict[str, list[int]] = {name: [] for name in PROCESSES}
         self.used: dict[str, float] = {}
@@ -249,16 +263,20 @@ class Run:
     def start(self) -> None:
         """Start all, and let the gyro begin to count once its rates arrive."""
         own = [sys.executable, __file__]
-        words = ['--folder', self._folder, '--protocol', self.given.protocol, '--rate', self.given.rate, '--leading', self.given.leading,
+        words = ['--folder', self._folder, '--protocol', self.given.protocol, '--rate',
+                 self.given.rate, '--leading', self.given.leading,
                  '--samples', self.given.samples, *['--patient'] * self.given.patient]
-        self._begin('compensation_node', self._node('compensation_node', model_file=self._folder / 'model.yaml',
-                                                    calibration_file=self._folder / 'calibration.yaml'))
-        self._begin('driver_node', self._node('driver_node', port=self._folder / 'port', protocol=self.given.protocol, **self._wiring()))
+        self._begin('compensation_node',
+                    self._node('compensation_node', model_file=self._folder / 'model.yaml',
+                               calibration_file=self._folder / 'calibration.yaml'))
+        self._begin('driver_node', self._node('driver_node', port=self._folder / 'port',
+                                              protocol=self.given.protocol, **self._wiring()))
         self._begin('count', [*own, 'count', *words])
         self._begin('gyro', [*own, 'gyro', *words])
         self._wait_for_rates()
         self.numbers[GO] = 1.0
-        self.since, self._used = time.monotonic(), {name: processor_time(process.pid) for name, process in self.processes.items()}
+        self.since, self._used = time.monotonic(), {name: processor_time(process.pid)
+                                                    for name, process in self.processes.items()}
 
     def _wiring(self) -> dict[str, object]:
         """Return the parameters of the driver beyond its port and format."""
@@ -273,11 +291,13 @@ class Run:
 
     def _node(self, name: str, **parameters: object) -> list[object]:
         return [sys.executable, '-m', f'gyro_calibration.ros.{name}', '--ros-args',
-                *itertools.chain.from_iterable(('-p', f'{key}:={value}') for key, value in parameters.items())]
+                *itertools.chain.from_iterable(('-p', f'{key}:={value}')
+                                               for key, value in parameters.items())]
 
     def _begin(self, name: str, command: list[object]) -> None:
         with open(self._folder / name, 'wb') as output:
-            process = subprocess.Popen(list(map(str, command)), stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+            process = subprocess.Popen(list(map(str, command)), stdout=output,
+                                       stderr=subprocess.STDOUT, start_new_session=True)
         self.processes[name] = process
         self._stack.callback(end, process)
 
@@ -290,16 +310,19 @@ class Run:
             time.sleep(0.1)
 
     def _look_for_ends(self) -> None:
-        ended = [name for name, process in self.processes.items() if process.poll() is not None and name != 'gyro']
+        ended = [name for name, process in self.processes.items() if process.poll() is not None
+                 and name != 'gyro']
         if ended:
             raise RuntimeError(f'{", ".join(ended)} ended:\n{self._outputs()}')
 
     def _outputs(self) -> str:
-        return '\n'.join(f'--- {name}\n{(self._folder / name).read_text(errors="replace")[-2000:]}' for name in self.processes)
+        return '\n'.join(f'--- {name}\n{(self._folder / name).read_text(errors="replace")[-2000:]}'
+                         for name in self.processes)
 
     def seen(self) -> SimpleNamespace:
         """Return what the counter said last."""
-        lines = [line for line in (self._folder / 'count').read_text().splitlines() if line.startswith('{') and line.endswith('}')]
+        lines = [line for line in (self._folder / 'count').read_text().splitlines()
+                 if line.startswith('{') and line.endswith('}')]
         return SimpleNamespace(**(json.loads(lines[-1]) if lines else {'messages': 0}))
 
     def watch(self) -> None:
@@ -318,18 +341,25 @@ class Run:
         time.sleep(2.0 * INTERVAL)
         seen, numbers = self.seen(), self.numbers
         unsettled = seen.turned - numbers[ANGLE]
-        gyro_said = {name.partition(': gyro ')[2]: value for name, value in seen.said.items() if ': gyro ' in name}
-        return {
-            'protocol': self.given.protocol, 'rate_hz': self.given.rate, 'lasted_s': self.lasted, 'sent': int(numbers[SENT]),
-            'sent_with_leading': int(numbers[ALL]), 'read_by_driver': int(gyro_said.get('samples', -1)),
-            'lost_by_driver': int(gyro_said.get('lost_samples', -1)), 'bytes_nobody_took': int(numbers[LOST_BYTES]),
-            'messages': seen.messages, 'missing': seen.missing + int(numbers[SENT]) - seen.last - 1 if self.given.leading else None,
-            'repeated': seen.repeated if self.given.leading else None, 'latency_ms': seen.latency_ms,
-            'heading_error_deg': math.remainder(unsettled, 2.0 * math.pi) / DEGREE,
-            'memory_mib': {name: round(median(values) / 2 ** 20, 1) for name, values in self.memory.items()},
-            'memory_growth_percent': {name: round(growth(values), 2) for name, values in self.memory.items()},
-            'load_percent': {name: round(100.0 * used / self.lasted, 1) for name, used in self.used.items()},
-            'driver_said': gyro_said,
+        gyro_said = {name.partition(': gyro ')[2]: value
+                     for name, value in seen.said.items() if ': gyro ' in name}
+        return {'protocol': self.given.protocol, 'rate_hz': self.given.rate,
+                'lasted_s': self.lasted, 'sent': int(numbers[SENT]),
+                'sent_with_leading': int(numbers[ALL]),
+                'read_by_driver': int(gyro_said.get('samples', -1)),
+                'lost_by_driver': int(gyro_said.get('lost_samples', -1)),
+                'bytes_nobody_took': int(numbers[LOST_BYTES]),
+                'messages': seen.messages, 'missing': seen.missing + int(numbers[SENT]) - seen.last
+                - 1 if self.given.leading else None, 'repeated': seen.repeated
+                if self.given.leading else None, 'latency_ms': seen.latency_ms,
+                'heading_error_deg': math.remainder(unsettled, 2.0 * math.pi) / DEGREE,
+                'memory_mib': {name: round(median(values) / 2 ** 20, 1)
+                               for name, values in self.memory.items()},
+                'memory_growth_percent': {name: round(growth(values), 2)
+                                          for name, values in self.memory.items()},
+                'load_percent': {name: round(100.0 * used / self.lasted, 1)
+                                 for name, used in self.used.items()},
+                'driver_said': gyro_said,
         }
 
 
@@ -349,9 +379,11 @@ def growth(values: list[int]) -> float:
     return 100.0 * (median(values[-tenth:]) / median(values[tenth:2 * tenth] or values) - 1.0)
 
 
-def soak(protocol: str, rate: float, seconds: float, leading: float, patient: bool) -> dict[str, object]:
+def soak(protocol: str, rate: float, seconds: float, leading: float,
+         patient: bool) -> dict[str, object]:
     """Run the graph for some time, or until Ctrl-C, and return the figures."""
-    given = argparse.Namespace(protocol=protocol, rate=rate, samples=round(seconds * rate), leading=leading, patient=patient)
+    given = argparse.Namespace(protocol=protocol, rate=rate, samples=round(seconds * rate),
+                               leading=leading, patient=patient)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         run = Run(given, Path(folder), stack)
         run.start()
@@ -374,22 +406,28 @@ def outcomes(given: argparse.Namespace) -> Iterator[dict[str, object]]:
 
 def text(found: dict[str, object]) -> Iterator[str]:
     """Yield what was found, in words."""
-    yield (f'{found["protocol"]} at {found["rate_hz"]:.0f} Hz for {found["lasted_s"]:.0f} s: {found["sent"]} samples sent, '
-           f'{found["read_by_driver"]} of {found["sent_with_leading"]} read by the driver with those before and after')
+    yield (f'{found["protocol"]} at {found["rate_hz"]:.0f} Hz for {found["lasted_s"]:.0f} s: '
+           f'{found["sent"]} samples sent, {found["read_by_driver"]} of '
+           f'{found["sent_with_leading"]} read by the driver with those before and after')
     if found['missing'] is not None:
-        yield f'  {found["missing"]} missing and {found["repeated"]} repeated among the corrected rates'
-        yield '  latency, ms: ' + ', '.join(f'{name} % {value:.2f}' for name, value in found['latency_ms'].items())
-    yield f'  heading off by {found["heading_error_deg"]:.4f} deg at the end; bytes nobody took: {found["bytes_nobody_took"]}'
+        yield (f'  {found["missing"]} missing and {found["repeated"]} repeated among the '
+               'corrected rates')
+        yield '  latency, ms: ' + ', '.join(f'{name} % {value:.2f}'
+                                            for name, value in found['latency_ms'].items())
+    yield (f'  heading off by {found["heading_error_deg"]:.4f} deg at the end; bytes nobody took: '
+           f'{found["bytes_nobody_took"]}')
     yield '  process: load in % of a core, resident memory in MiB, its growth in %'
     for name in PROCESSES:
-        yield f'    {name}: {found["load_percent"][name]}, {found["memory_mib"][name]}, {found["memory_growth_percent"][name]}'
+        yield (f'    {name}: {found["load_percent"][name]}, {found["memory_mib"][name]}, '
+               f'{found["memory_growth_percent"][name]}')
 
 
 @contextmanager
 def own_domain() -> Iterator[int]:
     """Return a domain that no other run uses meanwhile: each holds the lock of its own."""
     for number in random.sample(range(1, 102), 101):
-        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock, suppress(BlockingIOError):
+        with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}',
+                  'w') as lock, suppress(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield number
             return
@@ -400,9 +438,12 @@ def arguments() -> argparse.Namespace:
     """Return what was asked for; the words `gyro` and `count` start the processes of a run."""
     parser = argparse.ArgumentParser(description='the whole graph under load, for long')
     parser.add_argument('--minutes', type=float, default=60.0)
-    parser.add_argument('--protocols', action='store_true', help='every wire format at its full line rate, at most a minute each')
+    parser.add_argument('--protocols', action='store_true',
+                        help='every wire format at its full line rate, at most a minute each')
     parser.add_argument('--only', nargs='*', metavar='NAME', help='of these formats')
-    parser.add_argument('--patient', action='store_true', help='let the gyro wait for a driver that a busy machine does not let read')
+    parser.add_argument('--patient', action='store_true',
+                        help='let the gyro wait for a driver that a busy machine does not let '
+                             'read')
     parser.add_argument('--json', action='store_true')
     return parser.parse_args()
 
@@ -428,7 +469,8 @@ def main() -> None:
         os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
         os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=folder)
         if not given.json:
-            print(f'{os.cpu_count()} cores; load average of the minute before: {os.getloadavg()[0]:.1f}', flush=True)
+            print(f'{os.cpu_count()} cores; load average of the minute before: '
+                  f'{os.getloadavg()[0]:.1f}', flush=True)
         for found in outcomes(given):
             found['load_average'] = os.getloadavg()[0]
             print(json.dumps(found) if given.json else '\n'.join(text(found)), flush=True)

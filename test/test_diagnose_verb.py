@@ -18,7 +18,8 @@ SHORT = {'duration': 400.0, 'sample_rate': 20.0}
 
 def log_of(hidden):
     """Return what the program reads of a hidden log."""
-    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1] for name, values in hidden.columns.items()})
+    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1]
+                  for name, values in hidden.columns.items()})
 
 
 @pytest.fixture
@@ -57,7 +58,8 @@ def is_interval(values):
 
 
 def check_finding(finding):
-    assert finding['effect'] in CAUSES and finding['cause'].endswith('.') and 0.0 <= finding['p_value'] <= 1.0
+    assert (finding['effect'] in CAUSES and finding['cause'].endswith('.')
+            and 0.0 <= finding['p_value'] <= 1.0)
     assert finding['minimum_detectable'] is None or finding['minimum_detectable'] > 0.0
     assert set(finding['ambiguous_with']) <= set(CAUSES) - {finding['effect']}
     assert bool(finding['ambiguous_with']) <= bool(finding['separate_by'])
@@ -77,7 +79,8 @@ def test_the_files_hold_what_they_say(log, run, tmp_path):
     assert set(told['noise']) == {'angle_random_walk', 'bias_instability', 'rate_random_walk'}
     gain = told['gain']
     assert gain['held_out'] and gain['heading_rms']['window_s'] == 60
-    assert all(gain[name]['after'] < gain[name]['before'] and is_interval(gain[name]['ci95']) for name in ('rate_rms', 'heading_rms'))
+    assert all(gain[name]['after'] < gain[name]['before'] and is_interval(gain[name]['ci95'])
+               for name in ('rate_rms', 'heading_rms'))
     model = read_model(tmp_path / 'found/model.yaml')
     assert 'warm_up' in {term.effect.name for term in model.terms}
     assert model.origin['files'][0]['name'] == 'drive.csv'
@@ -86,10 +89,12 @@ def test_the_files_hold_what_they_say(log, run, tmp_path):
 
 def test_json_is_the_same_as_in_the_file_and_all_there_is(log, run, tmp_path):
     code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found', '--json')
-    assert code == 0 and json.loads(text) == json.loads((tmp_path / 'found/diagnosis.json').read_text())
+    assert (code == 0
+            and json.loads(text) == json.loads((tmp_path / 'found/diagnosis.json').read_text()))
 
 
-def test_a_seed_gives_the_same_answer_again_and_nothing_is_written_without_a_folder(log, run, tmp_path, monkeypatch):
+def test_a_seed_gives_the_same_answer_again_and_nothing_is_written_without_a_folder(
+        log, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answers = [run('diagnose', 'drive.csv', '--seed', '7', '--json') for _ in range(2)]
     assert answers[0] == answers[1] and answers[0][0] == 0
@@ -98,7 +103,8 @@ def test_a_seed_gives_the_same_answer_again_and_nothing_is_written_without_a_fol
 
 def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(log, run, tmp_path):
     run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
-    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--model', tmp_path / 'found/model.yaml', '--json')
+    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--model',
+                        tmp_path / 'found/model.yaml', '--json')
     told = json.loads(text)
     assert code == 0 and told['verdict'] == 'adequate' and told['gain'] is None, told['findings']
 
@@ -106,16 +112,19 @@ def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(log, run, 
 def test_the_extended_model_simulates_and_compensates(log, run, tmp_path):
     run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
     model = tmp_path / 'found/model.yaml'
-    assert run('compensate', tmp_path / 'drive.csv', '--model', model, '--out', tmp_path / 'rates.csv')[0] == 0
+    assert run('compensate', tmp_path / 'drive.csv', '--model', model, '--out',
+               tmp_path / 'rates.csv')[0] == 0
     rate = np.array(read_log(tmp_path / 'rates.csv').others['rate_rad_s'], float)
     left = [np.std(each - log.reference_rate) for each in (log.output, rate)]
     assert left[1] < left[0]
-    assert run('simulate', '--model', model, '--motion', 'robot', '--out', tmp_path / 'simulated.csv', '--seed', '1')[0] == 0
+    assert run('simulate', '--model', model, '--motion', 'robot', '--out',
+               tmp_path / 'simulated.csv', '--seed', '1')[0] == 0
 
 
 def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
     names = ['first.csv', 'second.csv']
-    for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', runs=2, **SHORT)):
+    for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white',
+                                     runs=2, **SHORT)):
         write_log(tmp_path / name, log_of(log))
     answer = told(run('diagnose', *(tmp_path / name for name in names), '--json'))
     assert [name.rpartition('/')[2] for name in answer['logs']] == names
@@ -126,22 +135,27 @@ def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
 
 def one_sentence(errors):
     """Tell whether the program said one thing, in one line, and no traceback."""
-    return len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors and len(errors.strip()) > 20
+    return (len(errors.strip().splitlines()) == 1 and 'Traceback' not in errors
+            and len(errors.strip()) > 20)
 
 
 def until(log, count):
-    return Log(**{name: getattr(log, name)[:count] for name in ('time', 'output', 'temperature', 'reference_rate', 'moving')})
+    return Log(**{name: getattr(log, name)[:count]
+                  for name in ('time', 'output', 'temperature', 'reference_rate', 'moving')})
 
 
-REFUSED = {
-    'without reference': (lambda log: replace(log, reference_rate=None, moving=None), 'no reference'),
-    'too short': (lambda log: until(log, 300), 'lasts 14.9'),
-    'too few samples': (lambda log: until(log, 50), 'samples'),
-    'constant gyro': (lambda log: replace(log, output=0.0 * log.output + 0.01), 'in 100 % of the samples'),
-    'reference that is the gyro': (lambda log: replace(log, reference_rate=log.output), 'one is made of the other'),
-    'nan everywhere': (lambda log: replace(log, output=np.nan * log.output), 'has a value in 0 of'),
-    'reference lost': (lambda log: replace(log, reference_rate=np.where(log.time < 2.0, log.reference_rate, np.nan)),
-                       'reference has a value'),
+REFUSED = {'without reference': (lambda log: replace(log, reference_rate=None, moving=None),
+                                 'no reference'),
+           'too short': (lambda log: until(log, 300), 'lasts 14.9'),
+           'too few samples': (lambda log: until(log, 50), 'samples'),
+           'constant gyro': (lambda log: replace(log, output=0.0 * log.output + 0.01),
+                             'in 100 % of the samples'),
+           'reference that is the gyro': (lambda log: replace(log, reference_rate=log.output),
+                                          'one is made of the other'),
+           'nan everywhere': (lambda log: replace(log, output=np.nan * log.output),
+                              'has a value in 0 of'),
+           'reference lost': (lambda log: replace(log, reference_rate=np.where(
+               log.time < 2.0, log.reference_rate, np.nan)), 'reference has a value'),
 }
 
 
@@ -153,13 +167,15 @@ def test_what_allows_no_answer_is_refused_in_one_sentence(spoilt, reason, log, d
 
 
 def test_a_model_of_other_units_is_refused(log, diagnose, tmp_path):
-    (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: 56.3}}\n')
+    (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: '
+                                         '56.3}}\n')
     code, text, errors = diagnose(log, '--model', tmp_path / 'wrong.yaml')
     assert code == 1 and not text and 'of other units' in errors and one_sentence(errors)
     assert not (tmp_path / 'found').exists()
 
 
-@pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)], ids=' '.join)
+@pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)],
+                         ids=' '.join)
 def test_a_wrong_use_is_one_sentence_and_writes_nothing(words, log, diagnose, tmp_path):
     code, text, errors = diagnose(log, *words)
     assert code in (1, 2) and not text and 'Traceback' not in errors and errors.strip()
@@ -201,7 +217,8 @@ def say(diagnose, run, tmp_path):
 
 def test_one_temperature_says_what_cannot_be_shown(log, say):
     answer = say(replace(log, temperature=np.full(len(log), 25.0)))
-    assert {'bias_temperature', 'scale_factor_temperature', 'thermal_lag'} <= set(answer['cannot_show'])
+    assert {'bias_temperature', 'scale_factor_temperature',
+            'thermal_lag'} <= set(answer['cannot_show'])
     assert 'temperature' in answer['cannot_show']['bias_temperature']
 
 
@@ -211,7 +228,8 @@ def test_without_motion_what_the_motion_shows_cannot_be_shown(hidden, log, say):
     answer = say(replace(log, output=rest, reference_rate=0.0 * rest, moving=0.0 * rest))
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
     reasons = answer['cannot_show']
-    of_motion = {reasons[name] for name in ('scale_factor_asymmetry', 'time_offset', 'reference_once_per_rev')}
+    of_motion = {reasons[name]
+                 for name in ('scale_factor_asymmetry', 'time_offset', 'reference_once_per_rev')}
     assert of_motion == {'the reference shows no motion'}
 
 
@@ -219,19 +237,23 @@ def test_stretches_of_nan_are_left_out(log, say):
     output, reference = log.output.copy(), log.reference_rate.copy()
     output[1000:1400], reference[5000:5300] = np.nan, np.nan
     answer = say(replace(log, output=output, reference_rate=reference))
-    assert [finding['effect'] for finding in answer['findings'] if finding['effect'] != 'dropped_samples'] == ['warm_up']
+    assert [finding['effect'] for finding in answer['findings']
+            if finding['effect'] != 'dropped_samples'] == ['warm_up']
 
 
 def test_a_log_without_temperature_supply_and_force_says_what_it_cannot_show(log, say):
     answer = say(replace(log, temperature=None, supply=None, specific_force=None))
     shown = answer['cannot_show']
     assert all(word in shown[name] for name, word in (
-        ('bias_temperature', 'temperature'), ('supply_sensitivity', 'supply'), ('acceleration_sensitivity', 'specific force')))
+        ('bias_temperature', 'temperature'), ('supply_sensitivity', 'supply'),
+        ('acceleration_sensitivity', 'specific force')))
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
 
 
 def test_a_log_in_degrees_and_one_in_radians_are_the_same(log, run, tmp_path):
-    rows = np.column_stack([log.time, log.output / DEGREE, log.temperature, log.reference_rate / DEGREE])
-    np.savetxt(tmp_path / 'degrees.csv', rows, '%.12g', ',', header='time_s,gyro_dps,temperature_degc,reference_rate_dps', comments='')
+    rows = np.column_stack([log.time, log.output / DEGREE, log.temperature,
+                            log.reference_rate / DEGREE])
+    np.savetxt(tmp_path / 'degrees.csv', rows, '%.12g', ',',
+               header='time_s,gyro_dps,temperature_degc,reference_rate_dps', comments='')
     answer = told(run('diagnose', tmp_path / 'degrees.csv', '--json'))
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']

@@ -26,7 +26,8 @@ from gyro_calibration.simulation import respond
 
 SHORT = {'duration': 600.0, 'sample_rate': 25.0}
 #: References in turn.
-REFERENCES = ({'reference': 'rate'}, {'reference': 'heading'}, {'reference': 'heading', 'encoder_step': 2.0 * np.pi / 65536})
+REFERENCES = ({'reference': 'rate'}, {'reference': 'heading'},
+              {'reference': 'heading', 'encoder_step': 2.0 * np.pi / 65536})
 ENCODER = ('reference_quantization',)  # an encoder does have steps
 
 
@@ -38,7 +39,8 @@ def hidden_in(names, multiple, seed, noise=None, reference=None, **how):
     """Hide effects in a log with the noise and the reference whose turn it is."""
     noise = noise or turn(KINDS, seed)
     reference = turn(REFERENCES, seed) if reference is None else reference
-    return hide(names, multiple, np.random.default_rng(seed), noise=noise, **{**SHORT, **reference, **how})
+    return hide(names, multiple, np.random.default_rng(seed), noise=noise,
+                **{**SHORT, **reference, **how})
 
 
 def names_of(found):
@@ -57,19 +59,22 @@ def test_an_effect_is_named_with_its_size_and_its_gain(seed, name):
     assert how.right, told(log, found)
     # an encoder blurs where a zone ends by more than the noise does
     ends_blurred = name == 'dead_zone' and 'encoder_step' in reference
-    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(log, found)
+    assert ends_blurred or all(held(log.truth.gyro.causes, found.findings, 4.0).values()), told(
+        log, found)
     for measure, (mine, oracle) in won(log, found).items():
         # gains are compared where they exceed the scatter by noise and encoder steps; the oracle
         # knows the rate of the temperature, which a thermometer of 1/16 K shows in leaps
-        blurred = measure == 'rate' and ('encoder_step' in reference or name == 'bias_temperature_rate')
+        blurred = measure == 'rate' and ('encoder_step' in reference
+                                         or name == 'bias_temperature_rate')
         if oracle > {'rate': 0.01, 'heading': 1.0}[measure] and not blurred:
             assert mine > 0.8 * oracle, (measure, mine, oracle, told(log, found))
 
 
-TOGETHER = [
-    ('bias_temperature', 'cubic_nonlinearity'), ('warm_up', 'heading_sensitivity'), ('time_offset', 'scale_factor_asymmetry'),
-    ('interference_tone', 'thermal_lag'), ('outliers', 'vibration_rectification'),
-    ('reference_once_per_rev', 'bias_step'), ('bandwidth', 'supply_sensitivity', 'saturation')]
+TOGETHER = [('bias_temperature', 'cubic_nonlinearity'), ('warm_up', 'heading_sensitivity'),
+            ('time_offset', 'scale_factor_asymmetry'),
+            ('interference_tone', 'thermal_lag'), ('outliers', 'vibration_rectification'),
+            ('reference_once_per_rev', 'bias_step'),
+            ('bandwidth', 'supply_sensitivity', 'saturation')]
 
 
 @pytest.mark.parametrize('seed, names', list(enumerate(TOGETHER)), ids=map('+'.join, TOGETHER))
@@ -91,12 +96,15 @@ def test_a_coarse_output_and_another_effect_are_both_named():
 def test_where_nothing_is_hidden_nothing_is_found(seed, noise, reference):
     log, = hidden_in([], 0.0, seed, noise, REFERENCES[reference])
     # every other log has a right model, so that bias, scale factor and noise must fit as well
-    found = diagnosis_of([log], np.random.default_rng(seed), with_model=bool((seed + reference) % 2))
-    assert judged_diagnosis(log, found, ENCODER).right and set(names_of(found)) <= set(ENCODER), told(log, found)
+    found = diagnosis_of([log], np.random.default_rng(seed),
+                         with_model=bool((seed + reference) % 2))
+    assert judged_diagnosis(
+        log, found, ENCODER).right and set(names_of(found)) <= set(ENCODER), told(log, found)
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
 
-@pytest.mark.parametrize('name', ['third_harmonic_of_heading', 'resonance_at_a_speed', 'bias_pulse', 'supply_times_rate'])
+@pytest.mark.parametrize('name', ['third_harmonic_of_heading', 'resonance_at_a_speed',
+                                  'bias_pulse', 'supply_times_rate'])
 def test_what_the_catalogue_does_not_have_is_said_to_be_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
@@ -125,7 +133,8 @@ def test_random_effects_are_found():
 def test_a_wrong_reference_is_blamed_on_the_reference(name, reference):
     log, = hidden_in([name], 10.0, reference, 'mixed', REFERENCES[reference])
     found = diagnosis_of([log], np.random.default_rng(1))
-    assert judged_diagnosis(log, found, ENCODER).right and CAUSES[name].of == 'reference', told(log, found)
+    assert judged_diagnosis(log, found,
+                            ENCODER).right and CAUSES[name].of == 'reference', told(log, found)
     assert name not in {term.effect.name for term in found.model.terms}
 
 
@@ -135,22 +144,23 @@ def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
     log, = hidden_in(['reference_scale'], 1.0, 5, 'mixed', REFERENCES[0], given=given)
     found = diagnosis_of([log], np.random.default_rng(1))
     (finding,) = found.findings
-    assert {finding.effect, *finding.ambiguous_with} >= {'scale_factor_error', 'reference_scale'} and finding.separate_by, told(log, found)
+    assert ({finding.effect, *finding.ambiguous_with} >= {'scale_factor_error', 'reference_scale'}
+            and finding.separate_by), told(log, found)
 
 
 # a large effect brings no companions
 
-LARGE = {
-    'time_offset': lambda sessions: {'size': 0.02},
-    'scale_factor_error': lambda sessions: {'size': 0.05},
-    'saturation': lambda sessions: {'size': 0.5 * max(np.abs(each.rate).max() for each in sessions)},
+LARGE = {'time_offset': lambda sessions: {'size': 0.02},
+         'scale_factor_error': lambda sessions: {'size': 0.05}, 'saturation': lambda sessions: {
+             'size': 0.5 * max(np.abs(each.rate).max() for each in sessions)},
 }
 
 
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('name', LARGE)
 def test_a_large_effect_brings_no_companions(name, seed):
-    log, = hidden_in([name], 1.0, seed, 'mixed', REFERENCES[0], given=lambda sessions: {name: LARGE[name](sessions)})
+    log, = hidden_in([name], 1.0, seed, 'mixed', REFERENCES[0],
+                     given=lambda sessions: {name: LARGE[name](sessions)})
     found = diagnosis_of([log], np.random.default_rng(seed))
     assert judged_diagnosis(log, found).right, told(log, found)
     assert held(log.truth.gyro.causes, found.findings, 4.0).get(name, True), told(log, found)
@@ -160,8 +170,10 @@ def test_a_large_effect_brings_no_companions(name, seed):
 
 def test_a_log_without_channels_says_what_it_cannot_show():
     log, = hidden_in(['cubic_nonlinearity'], 5.0, 0, 'mixed', REFERENCES[0])
-    found = diagnose([replace(log_of(log), temperature=None, supply=None, specific_force=None)], np.random.default_rng(0))
-    needed = {name for name, cause in CAUSES.items() if cause.needs & {'temperature', 'supply', 'specific_force'}}
+    found = diagnose([replace(log_of(log), temperature=None, supply=None, specific_force=None)],
+                     np.random.default_rng(0))
+    needed = {name for name, cause in CAUSES.items()
+              if cause.needs & {'temperature', 'supply', 'specific_force'}}
     assert needed <= set(found.cannot_show) and 'cubic_nonlinearity' not in found.cannot_show
     assert judged_diagnosis(log, found).right, told(log, found)
 
@@ -170,9 +182,12 @@ def test_a_log_of_a_gyro_at_rest_needs_no_reference():
     log, = hidden_in(['warm_up'], 5.0, 0, 'white', REFERENCES[0])
     truth = log.truth
     rest = truth.prediction - (1.0 + truth.scale_factor_error) * truth.rate + truth.noise
-    found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)], np.random.default_rng(0))
-    assert judged_diagnosis(log, found).in_set and not judged_diagnosis(log, found).extra, told(log, found)
-    assert {'cubic_nonlinearity', 'time_offset', 'reference_once_per_rev'} <= set(found.cannot_show)
+    found = diagnose([replace(log_of(log), output=rest, reference_rate=None, moving=0.0 * rest)],
+                     np.random.default_rng(0))
+    assert judged_diagnosis(log, found).in_set and not judged_diagnosis(log, found).extra, told(
+        log, found)
+    assert {'cubic_nonlinearity', 'time_offset',
+            'reference_once_per_rev'} <= set(found.cannot_show)
 
 
 # several logs of one gyro
@@ -182,7 +197,9 @@ def recorded(names, steps, seed, given=None, multiple=8.0):
     generator = np.random.default_rng(seed)
     time = np.arange(0.0, SHORT['duration'], 1.0 / SHORT['sample_rate'])
     motion = 1.5 * np.sin(0.7 * time) * (np.sin(0.05 * time) > 0.0)
-    sessions = [described(generator, time, motion, 25.0 + 10.0 * (time > step) - 15.0 * (time > step + 100.0)) for step in steps]
+    sessions = [described(generator, time, motion,
+                          25.0 + 10.0 * (time > step) - 15.0 * (time > step + 100.0))
+                for step in steps]
     gyro = draw_gyro(names, multiple, generator, sessions, NoiseFigures(1e-4), given=given)
     return [record(gyro, each, generator, run=run) for run, each in enumerate(sessions)]
 
@@ -191,23 +208,28 @@ STEPS = (300.0, 150.0, 420.0)
 
 
 def test_a_step_that_happens_with_a_change_of_temperature_is_a_step_where_the_other_logs_say_so():
-    logs = recorded(['bias_step'], STEPS, 1, {'bias_step': {'run': 0, 'step_time': STEPS[0] + 5.0}})
+    logs = recorded(['bias_step'], STEPS, 1,
+                    {'bias_step': {'run': 0, 'step_time': STEPS[0] + 5.0}})
     found = diagnosis_of(logs, np.random.default_rng(0))
     assert judged_diagnosis(logs[0], found).right, told(logs[0], found)
     named = {name for each in found.findings for name in (each.effect, *each.ambiguous_with)}
-    assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(logs[0], found)
+    assert not {name for name in named if CAUSES[name].along.startswith('temperature')}, told(
+        logs[0], found)
 
 
 def test_a_temperature_effect_that_repeats_is_named():
     logs = recorded(['bias_temperature'], STEPS, 2)
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert names_of(found) == ['bias_temperature'] and not found.findings[0].ambiguous_with, told(logs[0], found)
+    assert names_of(found) == ['bias_temperature'] and not found.findings[0].ambiguous_with, told(
+        logs[0], found)
 
 
 def test_an_effect_of_the_motion_is_found_in_several_logs_together():
-    logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3, **SHORT)
+    logs = hide(['cubic_nonlinearity'], 5.0, np.random.default_rng(3), noise='mixed', runs=3,
+                **SHORT)
     found = diagnosis_of(logs, np.random.default_rng(0))
-    assert judged_diagnosis(logs[0], found).right and all(judged_diagnosis(logs[0], found).held.values()), told(logs[0], found)
+    assert (judged_diagnosis(logs[0], found).right
+            and all(judged_diagnosis(logs[0], found).held.values())), told(logs[0], found)
 
 
 # against a model
@@ -216,10 +238,12 @@ def test_an_effect_of_the_motion_is_found_in_several_logs_together():
 def test_a_model_of_other_noise_is_told_so(factor):
     log, = hidden_in([], 0.0, 4, 'white', REFERENCES[0])
     model = model_of(log)
-    other = replace(model, noise=replace(model.noise, angle_random_walk=factor * model.noise.angle_random_walk))
+    other = replace(model, noise=replace(model.noise,
+                                         angle_random_walk=factor * model.noise.angle_random_walk))
     found = diagnose([log_of(log)], np.random.default_rng(0), other)
     assert names_of(found) == ['angle_random_walk'], told(log, found)
-    assert found.findings[0].parameters['angle_random_walk'].estimate == pytest.approx(model.noise.angle_random_walk, rel=0.03)
+    assert found.findings[0].parameters['angle_random_walk'].estimate == pytest.approx(
+        model.noise.angle_random_walk, rel=0.03)
 
 
 def test_a_model_that_knows_the_effect_leaves_nothing():
@@ -231,8 +255,8 @@ def test_a_model_that_knows_the_effect_leaves_nothing():
 
 # the extended model at work
 
-EXTENSIONS = [['cubic_nonlinearity'], ['thermal_lag', 'scale_factor_temperature'], ['heading_sensitivity'], ['vibration_rectification'],
-              ['time_offset']]
+EXTENSIONS = [['cubic_nonlinearity'], ['thermal_lag', 'scale_factor_temperature'],
+              ['heading_sensitivity'], ['vibration_rectification'], ['time_offset']]
 
 
 def again(hidden, seed):
@@ -256,15 +280,19 @@ def test_the_extended_model_serves_another_log_of_the_gyro(seed, names, tmp_path
     def given(sessions):
         # as small as it is detectable, no motion tells a delay from a lag
         return {'time_offset': {'size': 0.01}} if 'time_offset' in names else {}
-    first, = hide(names, 10.0, np.random.default_rng(seed), noise='white', reference='both', given=given, **SHORT)
+    first, = hide(names, 10.0, np.random.default_rng(seed), noise='white', reference='both',
+                  given=given, **SHORT)
     found, second = diagnosis_of([first], np.random.default_rng(0)), again(first, seed)
     (tmp_path / 'model.yaml').write_text(model_text(found.model))
     model = read_model(tmp_path / 'model.yaml')
-    assert set(names) <= {term.effect.name for term in model.terms} <= set(CATALOGUE), told(first, found)
+    assert set(names) <= {term.effect.name
+                          for term in model.terms} <= set(CATALOGUE), told(first, found)
     noise = np.var(second.truth.noise)
-    for before, after in zip(left_over(found.before, log_of(second)), left_over(model, log_of(second))):
+    for before, after in zip(left_over(found.before, log_of(second)),
+                             left_over(model, log_of(second))):
         # the noise that is compensated, too, has the scale factor of the gyro
-        assert after - noise < 0.1 * (before - noise) + 0.06 * noise and after < before, (before, after, noise, told(first, found))
+        assert after - noise < 0.1 * (before - noise) + 0.06 * noise and after < before, (
+            before, after, noise, told(first, found))
 
 
 def test_noise_is_found_against_a_model_only():

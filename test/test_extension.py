@@ -27,7 +27,8 @@ from gyro_calibration.simulation import simulate
 NOISE = Noise(1.5e-4)
 LINEAR = (Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)))
 #: A model as somebody calibrated it, some time ago.
-MODEL = GyroModel(LINEAR, np.diag([1e-10, 1e-8]), (-1.5, 1.5), (10.0, 30.0), noise=NOISE, gyro={'name': 'yaw'},
+MODEL = GyroModel(LINEAR, np.diag([1e-10, 1e-8]), (-1.5, 1.5), (10.0, 30.0), noise=NOISE,
+                  gyro={'name': 'yaw'},
                   origin={'files': [{'name': 'old.csv'}], 'date': '2025-01-01'})
 DRIVE = turns([(20, 0), (9, 40), (10, 0), (6, -60), (15, 20), (20, -10)] * 5, ramp=1.0)
 RATE = 20.0
@@ -42,7 +43,8 @@ def term(name, *values):
 
 def drive(*more, gyro=MODEL, noise=NOISE, seed=1):
     """Return a drive of a gyro with more effects than its model."""
-    return simulate(replace(gyro, terms=(*gyro.terms, *more), noise=noise), DRIVE, RATE, np.random.default_rng(seed), TEMPERATURE)
+    return simulate(replace(gyro, terms=(*gyro.terms, *more), noise=noise), DRIVE, RATE,
+                    np.random.default_rng(seed), TEMPERATURE)
 
 
 def diagnosed(log, model=None):
@@ -62,46 +64,58 @@ def value(model, name, place=0):
 
 def on_top(own, found, *shapes, supply=None):
     """Return a model with an effect, and a finding of more of it from another origin or time."""
-    model = replace(MODEL, terms=(*LINEAR, own), covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted)]))
+    model = replace(MODEL, terms=(*LINEAR, own),
+                    covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted)]))
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)
     return model, Outcome(work(field([laid]), [Named(effect(found, *shapes), (1e-4,))]), (laid,))
 
 
 VOLTS = 12.0 + np.sin(0.05 * TIME)
-BESIDE = {
-    'bias_temperature': (term('bias_temperature', 25.0, 1e-4), 'bias_temperature', 34.0),
-    'bias_temperature_quadratic': (term('bias_temperature_quadratic', 25.0, 1e-6), 'bias_temperature_quadratic', 34.0),
-    'scale_factor_temperature': (term('scale_factor_temperature', 25.0, 1e-4), 'scale_factor_temperature', 34.0),
-    'supply_sensitivity': (term('supply_sensitivity', 12.0, 1e-4), 'supply_sensitivity', 5.0),
-    'cubic_nonlinearity': (term('cubic_nonlinearity', 1e-3), 'cubic_nonlinearity'),
+BESIDE = {'bias_temperature': (term('bias_temperature', 25.0, 1e-4), 'bias_temperature', 34.0),
+          'bias_temperature_quadratic': (term('bias_temperature_quadratic', 25.0, 1e-6),
+                                         'bias_temperature_quadratic', 34.0),
+          'scale_factor_temperature': (term('scale_factor_temperature', 25.0, 1e-4),
+                                       'scale_factor_temperature', 34.0),
+          'supply_sensitivity': (term('supply_sensitivity', 12.0, 1e-4), 'supply_sensitivity',
+                                 5.0),
+          'cubic_nonlinearity': (term('cubic_nonlinearity', 1e-3), 'cubic_nonlinearity'),
 }
 
 
-@pytest.mark.parametrize('own, found, shapes', [(own, found, shapes) for own, found, *shapes in BESIDE.values()], ids=BESIDE)
+@pytest.mark.parametrize('own, found, shapes',
+                         [(own, found, shapes) for own, found, *shapes in BESIDE.values()],
+                         ids=BESIDE)
 def test_the_extended_model_says_what_model_and_finding_say_together(own, found, shapes):
     model, outcome = on_top(own, found, *shapes, supply=VOLTS)
     new, (laid,) = extended(model, outcome, 1e-5), outcome.replays
     channels, rate = laid.channels, laid.channels.rate
     together = rate + laid.added + outcome.explained[0] + outcome.biases[0]
-    assert not left_out(model, outcome) and new.output_in(channels.moving(rate, rate)) == pytest.approx(together, abs=1e-12)
+    assert (not left_out(model, outcome)
+            and new.output_in(channels.moving(rate, rate)) == pytest.approx(together, abs=1e-12))
     # how well the error is known is what the model, the bias and the finding say of it
     columns = np.array([rate, *(outcome.named[0].candidate.columns(laid))])
-    own_rows, rows = (np.array([row + 0.0 * rate for each in terms for row in each.sensitivity(channels)])
+    own_rows, rows = (np.array([row + 0.0 * rate for each in terms
+                                for row in each.sensitivity(channels)])
                       for terms in (model.terms, new.terms))
     variance = np.einsum('in,ij,jn->n', columns, outcome.covariance, columns) + 1e-10
     variance += np.einsum('in,ij,jn->n', own_rows, model.covariance, own_rows)
-    assert np.einsum('in,ij,jn->n', rows, new.covariance, rows) == pytest.approx(variance, rel=1e-6)
+    assert np.einsum('in,ij,jn->n', rows, new.covariance,
+                     rows) == pytest.approx(variance, rel=1e-6)
 
 
-@pytest.mark.parametrize('name, own, found', [('time_offset', 0.02, 0.03), ('time_offset', 0.02, -0.05), ('clock_rate', 2e-5, 3e-5)])
+@pytest.mark.parametrize('name, own, found',
+                         [('time_offset', 0.02, 0.03), ('time_offset', 0.02, -0.05),
+                          ('clock_rate', 2e-5, 3e-5)])
 def test_delays_and_paces_of_clocks_add_up(name, own, found):
     model, outcome = on_top(term(name, own), name, found)
-    assert not left_out(model, outcome) and value(extended(model, outcome, 1e-5), name) == pytest.approx(own + found)
+    assert (not left_out(model, outcome)
+            and value(extended(model, outcome, 1e-5), name) == pytest.approx(own + found))
 
 
-@pytest.mark.parametrize('name, own, shape', [('thermal_lag', (120.0, 1e-4), 300.0), ('warm_up', (30.0, 1e-3), 90.0),
-                                              ('bandwidth', (0.02,), 0.05), ('time_offset', (0.9,), 0.2)])
+@pytest.mark.parametrize('name, own, shape',
+                         [('thermal_lag', (120.0, 1e-4), 300.0), ('warm_up', (30.0, 1e-3), 90.0),
+                          ('bandwidth', (0.02,), 0.05), ('time_offset', (0.9,), 0.2)])
 def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, own, shape):
     model, outcome = on_top(term(name, *own), name, shape)
     (out,) = left_out(model, outcome)
@@ -110,13 +124,15 @@ def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, 
 
 
 def test_a_second_tone_is_not_said_to_be_in_the_model():
-    slow, fast = term('interference_tone', 1.7, 1e-3, 0.0), term('interference_tone', 3.1, 1e-3, 0.0)
+    slow, fast = term('interference_tone', 1.7, 1e-3, 0.0), term('interference_tone', 3.1, 1e-3,
+                                                                 0.0)
     model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)
     log = drive(slow, fast)
     found = diagnosed(log, model)
     assert names(found) == ['interference_tone'] and not is_inside(found.findings[0], found)
     assert found.model.terms == model.terms and 'It is in the extended model' not in report(found)
-    assert any('interference tone is not in the extended model' in remark and 'diagnose again' in remark for remark in found.remarks)
+    assert any('interference tone is not in the extended model' in remark
+               and 'diagnose again' in remark for remark in found.remarks)
 
 
 # a model that is right
@@ -124,15 +140,18 @@ def test_a_second_tone_is_not_said_to_be_in_the_model():
 def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
     model = replace(MODEL, noise=Noise(1.5e-4, 1e-6, 1e-8))
     found = diagnosed(drive(), model)
-    assert found.verdict == 'adequate' and found.model is model and 'left as it is' in headline(found)[1]
+    assert (found.verdict == 'adequate' and found.model is model
+            and 'left as it is' in headline(found)[1])
 
 
 def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
     log = drive()
     kept = np.delete(np.arange(len(log)), [1000, 2000, 2001, 3000])
-    fewer = Log(**{name: getattr(log, name)[kept] for name in ('time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
+    fewer = Log(**{name: getattr(log, name)[kept] for name in (
+        'time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
     found = diagnosed(fewer, MODEL)
-    assert names(found) == ['dropped_samples'] and found.model is MODEL and 'left as it is' in headline(found)[1]
+    assert (names(found) == ['dropped_samples'] and found.model is MODEL
+            and 'left as it is' in headline(found)[1])
 
 
 def test_noise_that_a_short_log_cannot_show_stays_in_the_model():
@@ -145,7 +164,8 @@ def test_a_noise_that_is_found_is_put_right_and_nothing_else_is():
     model = replace(MODEL, noise=Noise(1e-4, 1e-6, 1e-8))
     found = diagnosed(drive(), model)
     assert names(found) == ['angle_random_walk'] and 'is offered' in headline(found)[1]
-    assert found.model.noise == replace(model.noise, angle_random_walk=found.noise.angle_random_walk)
+    assert found.model.noise == replace(model.noise,
+                                        angle_random_walk=found.noise.angle_random_walk)
     assert (found.model.terms, found.model.rate_range) == (model.terms, model.rate_range)
 
 
@@ -157,8 +177,10 @@ BEHIND = SelfCalibration(0.02, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)))
 def test_a_self_calibration_goes_into_bias_and_scale_factor_error():
     behind = replace(MODEL, self_calibration=BEHIND)
     output = np.linspace(-1.5, 1.5, 7)
-    assert compensate(calibrated(behind), output).rate == pytest.approx(compensate(behind, output).rate, abs=1e-15)
-    assert calibrated(behind).self_calibration is None and np.diag(calibrated(behind).covariance) == pytest.approx([2e-10, 2e-8], rel=0.05)
+    assert compensate(calibrated(behind),
+                      output).rate == pytest.approx(compensate(behind, output).rate, abs=1e-15)
+    assert (calibrated(behind).self_calibration is None
+            and np.diag(calibrated(behind).covariance) == pytest.approx([2e-10, 2e-8], rel=0.05))
 
 
 def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
@@ -174,10 +196,13 @@ def test_what_a_self_calibration_knows_is_no_finding_and_is_not_applied_twice():
 
 def test_a_table_that_the_model_explains_leaves_it_as_it_is_to_the_letter(run, tmp_path):
     behind, rate = replace(MODEL, self_calibration=BEHIND), np.tile(np.linspace(-1.5, 1.5, 21), 8)
-    output = calibrated(behind).output(rate, 25.0) + 5e-4 * np.random.default_rng(7).standard_normal(len(rate))
-    write_log(tmp_path / 'table.csv', Log(output=output, reference_rate=rate, temperature=np.full(len(rate), 25.0)))
+    output = (calibrated(behind).output(rate, 25.0)
+              + 5e-4 * np.random.default_rng(7).standard_normal(len(rate)))
+    write_log(tmp_path / 'table.csv',
+              Log(output=output, reference_rate=rate, temperature=np.full(len(rate), 25.0)))
     write_model(tmp_path / 'model.yaml', behind)
-    code, text, errors = run('diagnose', tmp_path / 'table.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'found')
+    code, text, errors = run('diagnose', tmp_path / 'table.csv', '--model',
+                             tmp_path / 'model.yaml', '--out', tmp_path / 'found')
     assert code == 0 and 'left as it is' in ' '.join(text.split()), errors
     assert (tmp_path / 'found/model.yaml').read_text() == (tmp_path / 'model.yaml').read_text()
 
@@ -194,22 +219,24 @@ def test_a_log_without_temperature_leaves_the_range_of_the_model():
 def test_ranges_are_widened_to_those_of_the_log():
     found = diagnosed(drive(term('warm_up', 60.0, 4e-3)), replace(MODEL, rate_range=(-0.1, 0.1)))
     assert found.model.temperature_range == pytest.approx((10.0, 45.0))
-    assert found.model.rate_range == pytest.approx((-60.0 * DEGREE * 1.01, 40.0 * DEGREE * 1.01), abs=0.01)
+    assert found.model.rate_range == pytest.approx((-60.0 * DEGREE * 1.01, 40.0 * DEGREE * 1.01),
+                                                   abs=0.01)
 
 
 def at_rest(swing):
     """Return a log of a gyro that does not turn, or hardly does beside its noise."""
     rate = swing * np.sin(0.3 * TIME)
     output = 1e-3 + rate + 7e-4 * np.random.default_rng(4).standard_normal(len(TIME))
-    return Log(time=TIME, output=output, temperature=TEMPERATURE, reference_rate=rate if swing else None,
-               moving=np.sign(swing) + 0.0 * TIME)
+    return Log(time=TIME, output=output, temperature=TEMPERATURE,
+               reference_rate=rate if swing else None, moving=np.sign(swing) + 0.0 * TIME)
 
 
 @pytest.mark.parametrize('swing', [0.0, 2e-4], ids=['at rest', 'hardly in motion'])
 def test_a_log_without_motion_says_nothing_of_rates(swing):
     found = diagnosed(at_rest(swing))
     assert found.model.rate_range == (-np.inf, np.inf)
-    assert value(found.model, 'scale_factor_error') == 0.0 and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4)
+    assert (value(found.model, 'scale_factor_error') == 0.0
+            and value(found.model, 'bias') == pytest.approx(1e-3, abs=1e-4))
     assert any('is in no model' in remark for remark in found.remarks) == (swing > 0.0)
 
 
@@ -222,18 +249,22 @@ def test_an_output_of_the_other_sense_is_the_only_finding_and_the_model_stays_as
     assert '--invert' in found.findings[0].remedy
 
 
-@pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)], ids=['no model', 'a model'])
+@pytest.mark.parametrize('model', [None, GyroModel(LINEAR[:1], noise=NOISE)],
+                         ids=['no model', 'a model'])
 def test_a_factor_that_may_be_of_the_gyro_stays_in_the_model(model):
     log = drive(gyro=GyroModel((LINEAR[0], term('scale_factor_error', 0.024))))
     found = diagnosed(log, model)
-    assert names(found) == ['unit_error'] and value(found.model, 'scale_factor_error') == pytest.approx(0.024, abs=5e-4)
-    assert 'output_multiplied_by' not in found.model.origin and any('was not multiplied' in remark for remark in found.remarks)
+    assert (names(found) == ['unit_error']
+            and value(found.model, 'scale_factor_error') == pytest.approx(0.024, abs=5e-4))
+    assert ('output_multiplied_by' not in found.model.origin
+            and any('was not multiplied' in remark for remark in found.remarks))
 
 
 @pytest.mark.parametrize('name, size', [('saturation', 0.9), ('quantization', 2.5e-4)])
 def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
     found = diagnosed(drive(term(name, size)), MODEL)
-    assert names(found) == [name] and value(found.model, name) == pytest.approx(size, rel=0.02) and is_inside(found.findings[0], found)
+    assert (names(found) == [name] and value(found.model, name) == pytest.approx(size, rel=0.02)
+            and is_inside(found.findings[0], found))
     assert found.model.covariance.shape == (3, 3) and found.model.terms[:2] == MODEL.terms
     assert diagnosed(drive(term(name, size), seed=5), found.model).verdict == 'adequate'
 
@@ -241,7 +272,8 @@ def test_a_limit_and_steps_that_are_found_are_in_the_model(name, size):
 def test_steps_that_go_into_the_model_are_not_in_its_noise_as_well():
     steps = term('quantization', 1e-3)
     found = diagnosed(drive(steps))
-    assert names(found) == ['quantization'] and found.model.noise.angle_random_walk == pytest.approx(1.5e-4, rel=0.03)
+    assert (names(found) == ['quantization']
+            and found.model.noise.angle_random_walk == pytest.approx(1.5e-4, rel=0.03))
     assert diagnosed(drive(steps, seed=5), found.model).verdict == 'adequate'
 
 
@@ -249,13 +281,18 @@ def test_steps_that_go_into_the_model_are_not_in_its_noise_as_well():
 
 def test_an_extended_model_comes_from_its_log_and_names_what_came_before(run, tmp_path):
     log, model = tmp_path / 'new.csv', tmp_path / 'model.yaml'
-    write_log(log, log_of(hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', duration=400.0, sample_rate=20.0)[0]))
-    write_model(model, GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,))), origin=MODEL.origin))
+    write_log(log, log_of(hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white',
+                               duration=400.0, sample_rate=20.0)[0]))
+    write_model(model, GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,))),
+                                 origin=MODEL.origin))
     for number in (1, 2):
         code, _, errors = run('diagnose', log, '--model', model, '--out', tmp_path / 'found')
         assert code == 0, errors
         origin = read_model(tmp_path / 'found/model.yaml').origin
-        assert [file['name'] for file in origin['files']] == ['new.csv'] and origin['date'] > '2025-01-02'
+        assert ([file['name'] for file in origin['files']] == ['new.csv']
+                and origin['date'] > '2025-01-02')
         assert len(origin['before']) == number and origin['before'][-1] == MODEL.origin
         known = read_model(tmp_path / 'found/model.yaml')
-        write_model(model, replace(known, terms=(term('bias', 0.5), term('scale_factor_error', 0.0)), covariance=None))
+        write_model(model,
+                    replace(known, terms=(term('bias', 0.5), term('scale_factor_error', 0.0)),
+                            covariance=None))

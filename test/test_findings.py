@@ -25,7 +25,8 @@ NUMBER = re.compile(r'−?\d+(?:\.\d+)?(?:e[+-]\d+)?')
 def table(title):
     """Return the rows of a table of the document, by the recording that is in their first cell."""
     part = TEXT.split(f'\n## {title}\n')[1].split('\n## ')[0]
-    rows = [[cell.strip() for cell in line.strip('|').split('|')] for line in part.splitlines() if line.startswith('| `')]
+    rows = [[cell.strip() for cell in line.strip('|').split('|')]
+            for line in part.splitlines() if line.startswith('| `')]
     found = {}
     for name, *cells in rows:
         found.setdefault(name.strip('`'), []).append(cells)
@@ -33,7 +34,8 @@ def table(title):
 
 
 CAUSES, LEFT, GAINS = table('Causes'), table('What is left'), table('Gains')
-RECORDINGS = [shlex.split(command)[shlex.split(command).index('--out') + 1] for command in COMMANDS if command.startswith('diagnose')]
+RECORDINGS = [shlex.split(command)[shlex.split(command).index('--out') + 1]
+              for command in COMMANDS if command.startswith('diagnose')]
 
 
 def numbers(text):
@@ -66,9 +68,12 @@ def diagnosed(data, run, tmp_path, monkeypatch):
     def diagnosed(recording):
         monkeypatch.chdir(tmp_path)
         (tmp_path / 'data').symlink_to(data)
-        (tmp_path / 'none.yaml').write_text(re.search(r'```yaml\n(.*?)```', TEXT, re.DOTALL).group(1))
-        place = next(place for place, each in enumerate(COMMANDS) if each.endswith(f'--out {recording}'))
-        needed = [each for each in COMMANDS[:place] if each.split('--out ')[1] in COMMANDS[place].split()]
+        (tmp_path / 'none.yaml').write_text(re.search(r'```yaml\n(.*?)```', TEXT,
+                                                      re.DOTALL).group(1))
+        place = next(place
+                     for place, each in enumerate(COMMANDS) if each.endswith(f'--out {recording}'))
+        needed = [each for each in COMMANDS[:place]
+                  if each.split('--out ')[1] in COMMANDS[place].split()]
         for command in (*needed, COMMANDS[place]):
             code, _, error = run(*shlex.split(command))
             assert code == 0, error
@@ -85,18 +90,22 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     found = diagnosed(recording)
     # several of a kind stay in their order
     causes = sorted(found['findings'], key=lambda each: each['effect'])
-    written = sorted(((cause.strip('`'), *cells) for cause, *cells in CAUSES.get(recording, [])), key=lambda each: each[0])
+    written = sorted(((cause.strip('`'), *cells) for cause, *cells in CAUSES.get(recording, [])),
+                     key=lambda each: each[0])
     assert [each['effect'] for each in causes] == [name for name, *_ in written]
     for (name, size, instead), cause in zip(written, causes):
         assert agree(size, shown(cause)), (name, size, shown(cause))
         assert re.findall(r'`(\w+)`', instead) == cause['ambiguous_with']
-    left, parts = {each['along']: 100.0 * each['share_of_variance'] for each in found['unexplained']}, dict(LEFT.get(recording, []))
+    left, parts = {each['along']: 100.0 * each['share_of_variance']
+                   for each in found['unexplained']}, dict(LEFT.get(recording, []))
     assert set(left) == set(parts)
     for along, part in parts.items():
         (size,), _ = numbers(part)
-        assert left[along] < size if part.startswith('less') else left[along] == pytest.approx(size, rel=0.1), along
+        assert (left[along] < size if part.startswith('less')
+                else left[along] == pytest.approx(size, rel=0.1)), along
     gain = found['gain']
-    errors = {} if gain is None else {what: gain[f'{what}_rms'] for what in ('rate', 'heading') if gain[f'{what}_rms']}
+    errors = {} if gain is None else {what: gain[f'{what}_rms']
+                                      for what in ('rate', 'heading') if gain[f'{what}_rms']}
     assert set(errors) == {what for what, *_ in GAINS.get(recording, [])}
     for what, before, after, won in GAINS.get(recording, []):
         _, *interval = numbers(won)[0]
@@ -104,5 +113,7 @@ def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
         width = interval[1] - interval[0] if interval else 0.0
         for text, moment in ((before, 'before'), (after, 'after')):
             (size,), form = numbers(text)
-            (now,), unit = numbers(amount(errors[what][moment], {'rate': 'rad/s', 'heading': 'rad'}[what]))
-            assert unit == form and abs(now - size) <= max(0.25 * width, 0.03 * size), (what, moment, now)
+            (now,), unit = numbers(amount(errors[what][moment],
+                                          {'rate': 'rad/s', 'heading': 'rad'}[what]))
+            assert unit == form and abs(now - size) <= max(0.25 * width,
+                                                           0.03 * size), (what, moment, now)

@@ -32,13 +32,17 @@ def blocks(log, length=60.0):
 # beside a model
 
 @pytest.mark.parametrize('bias, scale', [(0.02, 0.0), (0.0, 0.03), (0.02, 0.03)])
-def test_what_a_right_bias_and_scale_factor_win_is_measured_from_the_model_as_it_was_given(bias, scale):
+def test_what_a_right_bias_and_scale_factor_win_is_measured_from_the_model_as_it_was_given(
+        bias, scale):
     log = drive(np.random.default_rng(1), bias=bias, scale=scale)
-    model = GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,))), noise=Noise(WHITE / np.sqrt(RATE)))
+    model = GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,))),
+                      noise=Noise(WHITE / np.sqrt(RATE)))
     found = diagnose([log], np.random.default_rng(2), model)
-    assert {each.effect for each in found.findings} == {name for name, size in (('bias', bias), ('scale_factor_error', scale)) if size}
+    assert {each.effect for each in found.findings} == {
+        name for name, size in (('bias', bias), ('scale_factor_error', scale)) if size}
     out = blocks(log)
-    assert found.gain.rate.before == pytest.approx(np.sqrt(np.mean((log.output - log.reference_rate)[out] ** 2)), rel=1e-3)
+    assert found.gain.rate.before == pytest.approx(
+        np.sqrt(np.mean((log.output - log.reference_rate)[out] ** 2)), rel=1e-3)
     assert found.gain.rate.after == pytest.approx(WHITE, rel=0.1)
     curve = next(each for each in found.curves if each.along == 'rate')
     assert np.abs(curve.before - bias - scale * curve.at).max() < 0.1 * max(bias, scale)
@@ -47,17 +51,20 @@ def test_what_a_right_bias_and_scale_factor_win_is_measured_from_the_model_as_it
 
 def test_a_value_beside_a_model_is_what_comes_on_top_of_it():
     log = drive(np.random.default_rng(3), bias=0.022, scale=0.03)
-    model = GyroModel((Term(BIAS, (0.02,)), Term(SCALE_FACTOR_ERROR, (0.0,))), noise=Noise(WHITE / np.sqrt(RATE)))
+    model = GyroModel((Term(BIAS, (0.02,)), Term(SCALE_FACTOR_ERROR, (0.0,))),
+                      noise=Noise(WHITE / np.sqrt(RATE)))
     found = diagnose([log], np.random.default_rng(4), model)
     bias = next(each for each in found.findings if each.effect == 'bias').parameters['bias']
-    assert bias.estimate == pytest.approx(0.002, rel=0.05) and 'on top' in found.findings[0].evidence
+    assert bias.estimate == pytest.approx(0.002,
+                                          rel=0.05) and 'on top' in found.findings[0].evidence
     assert found.model.terms[0].values[0] == pytest.approx(0.02 + bias.estimate)
 
 
 # little to hold out
 
 PARTLY = {'nothing that is held out': [lambda time: (time < 40.0) | (time >= 295.0)],
-          'one log within what is held out': [lambda time: time >= 0.0, lambda time: (time >= 51.0) & (time < 96.0)]}
+          'one log within what is held out': [lambda time: time >= 0.0,
+                                              lambda time: (time >= 51.0) & (time < 96.0)]}
 
 
 @pytest.mark.parametrize('known', PARTLY.values(), ids=PARTLY)
@@ -78,7 +85,8 @@ def test_one_part_has_no_interval_and_is_not_called_worse():
 # how sure
 
 @pytest.mark.parametrize('parts', [2, 3, 5, 8])
-@pytest.mark.parametrize('shared', [0.0, 0.7, 1.0], ids=['all is won', 'some is won', 'nothing is won'])
+@pytest.mark.parametrize('shared', [0.0, 0.7, 1.0],
+                         ids=['all is won', 'some is won', 'nothing is won'])
 def test_intervals_of_what_is_won_hold_the_truth_for_few_parts(parts, shared):
     generator, runs = np.random.default_rng(8), 2000
     inside = 0

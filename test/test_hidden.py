@@ -45,9 +45,11 @@ def generator():
 @pytest.mark.parametrize('path', sorted(FOLDER.glob('*.py')), ids=lambda path: path.name)
 def test_nothing_of_the_package_is_imported(path):
     nodes = list(ast.walk(ast.parse(path.read_text())))
-    roots = {alias.name.split('.')[0] for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    roots = {alias.name.split('.')[0] for node in nodes if isinstance(node, ast.Import)
+             for alias in node.names}
     roots |= {node.module.split('.')[0] for node in nodes if isinstance(node, ast.ImportFrom)}
-    assert roots <= {'__future__', 'collections', 'dataclasses', 'gzip', 'hidden', 'io', 'math', 'numpy', 'pathlib', 'scipy'}
+    assert roots <= {'__future__', 'collections', 'dataclasses', 'gzip', 'hidden', 'io', 'math',
+                     'numpy', 'pathlib', 'scipy'}
 
 
 def allan_variance(rate, interval, size):
@@ -60,7 +62,8 @@ def allan_variance(rate, interval, size):
 @pytest.mark.parametrize('figures, expected, tolerance', [
     (NoiseFigures(1e-3), lambda tau: 1e-6 / tau, 0.08),
     (NoiseFigures(1e-9, rate_random_walk=1e-3), lambda tau: 1e-6 * tau / 3.0, 0.1),
-    (NoiseFigures(1e-9, 1e-3), lambda tau: 2.0 * math.log(2.0) / math.pi * 1e-6, 0.1)], ids=['white', 'walk', 'flicker'])
+    (NoiseFigures(1e-9, 1e-3), lambda tau: 2.0 * math.log(2.0) / math.pi * 1e-6, 0.1)],
+                         ids=['white', 'walk', 'flicker'])
 def test_the_noise_has_the_allan_variance_of_ieee_952(generator, figures, expected, tolerance):
     interval = 0.1
     records = [np.sum(make(figures, 20_000, interval, generator), axis=0) for _ in range(40)]
@@ -102,7 +105,8 @@ def test_a_detectable_effect_is_found_with_the_promised_scatter_and_power(genera
     metric = Metric([each], figures)
     column = errors(FORMS[name], 1.0, cause.shapes, [each])
     hidden, scale = cause.size * column[0] + 0.01 + 0.02 * each.rate, 1e-9 + abs(cause.size)
-    noises = [hidden + np.sum(make(figures, len(each.time), each.interval, generator), axis=0) for _ in range(150)]
+    noises = [hidden + np.sum(make(figures, len(each.time), each.interval, generator), axis=0)
+              for _ in range(150)]
     gram = metric.gram([column, *([noise] for noise in noises)])
     estimates = gram[0, 1:] / gram[0, 0]
     assert np.std(estimates) / scale == pytest.approx(cause.standard_deviation / scale, rel=0.25)
@@ -115,31 +119,39 @@ def test_a_change_of_noise_is_as_far_as_the_information_says(generator):
     figures = NoiseFigures(1e-4)
     changed = NoiseFigures(1e-4 * (1.0 + 1e-3))
     # an estimate of N from n samples scatters by N / sqrt(2 n)
-    assert divergence(changed, figures, 20_000, 0.02) == pytest.approx(1e-3 * math.sqrt(2.0 * 20_000), rel=0.01)
+    assert divergence(changed, figures, 20_000,
+                      0.02) == pytest.approx(1e-3 * math.sqrt(2.0 * 20_000), rel=0.01)
 
 
 @pytest.mark.parametrize('name', ALL)
 def test_every_effect_can_be_hidden(generator, name):
     log, = hide([name], 2.0, generator, noise='white', **COARSE)
     cause, truth = log.truth[name], log.truth
-    assert all(np.isfinite(column).all() and len(column) == len(truth.rate) for column in log.columns.values())
-    assert (np.diff(log.columns['time_s']) > 0.0).all() and math.isfinite(cause.size) and all(map(math.isfinite, cause.shapes.values()))
+    assert all(np.isfinite(column).all() and len(column) == len(truth.rate)
+               for column in log.columns.values())
+    assert ((np.diff(log.columns['time_s']) > 0.0).all() and math.isfinite(cause.size)
+            and all(map(math.isfinite, cause.shapes.values())))
     if name not in (*COUNTED, *STEPPED, 'unit_error') and ALL[name].stage != 'noise':
         # a dead zone and a saturation grow by whole samples
-        assert cause.multiple == pytest.approx(2.0, rel=0.5 if name in ('dead_zone', 'saturation') else 0.05)
+        assert cause.multiple == pytest.approx(2.0, rel=0.5 if name in ('dead_zone', 'saturation')
+                                               else 0.05)
     residual = (log.columns['gyro_rad_s'] - truth.prediction)[truth.good]
     unit, step = abs(truth.gyro.value('unit_error') or 1.0), truth.gyro.value('quantization')
     assert np.std(residual) <= 1.5 * unit * np.std(truth.noise) + step
 
 
-@pytest.mark.parametrize('name', [name for name in ON_THE_SUM if ALL[name].linear and name not in ('bias', 'scale_factor_error')])
+@pytest.mark.parametrize('name', [name for name in ON_THE_SUM if ALL[name].linear
+                                  and name not in ('bias', 'scale_factor_error')])
 def test_the_size_is_in_the_output_as_the_catalogue_says(generator, name):
     log, = hide([name], 3.0, generator, noise='white', **COARSE)
     cause, truth, each = log.truth[name], log.truth, log.session
     plain = truth.bias + truth.scale_factor_error * each.rate
-    assert truth.added - plain == pytest.approx(errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
-    assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added + truth.noise, abs=1e-12)
-    assert Metric([each], truth.gyro.figures).norm([truth.added]) == pytest.approx(3.0 * DETECTABLE, rel=1e-3)
+    assert truth.added - plain == pytest.approx(
+        errors(ALL[name], cause.size, cause.shapes, [each])[0], abs=1e-12)
+    assert log.columns['gyro_rad_s'] == pytest.approx(truth.rate + truth.added + truth.noise,
+                                                      abs=1e-12)
+    assert Metric([each], truth.gyro.figures).norm([truth.added]) == pytest.approx(
+        3.0 * DETECTABLE, rel=1e-3)
 
 
 def test_the_heading_is_the_integral_of_the_rate_and_rest_is_rest(generator):
@@ -154,8 +166,10 @@ def test_a_gyro_that_is_late_or_slow_sees_the_rate_of_before(generator):
     late, = hide(['time_offset'], 2000.0, generator, noise='white', **COARSE)
     truth = late.truth
     seen = (truth.prediction - truth.bias) / (1.0 + truth.scale_factor_error)
-    assert seen == pytest.approx(late.session.motion.rate(late.session.time - truth['time_offset'].size), abs=1e-9)
-    slow, = hide(['bandwidth'], 2000.0, generator, noise='white', figures=NoiseFigures(1e-4), **COARSE)
+    assert seen == pytest.approx(
+        late.session.motion.rate(late.session.time - truth['time_offset'].size), abs=1e-9)
+    slow, = hide(['bandwidth'], 2000.0, generator, noise='white', figures=NoiseFigures(1e-4),
+                 **COARSE)
     truth, tau = slow.truth, slow.truth['bandwidth'].size
     seen = (truth.prediction - truth.bias) / (1.0 + truth.scale_factor_error)
     lagged = np.gradient(seen, slow.session.interval) * tau + seen
@@ -183,7 +197,8 @@ def test_shapes_of_the_output_are_what_they_are_called(generator):
 
 def test_faults_of_samples_are_as_many_as_it_says(generator):
     wild, = hide(['outliers'], 4.0, generator, noise='white', **COARSE)
-    far = np.abs(wild.columns['gyro_rad_s'] - wild.truth.prediction) > 6.0 * np.std(wild.truth.noise)
+    far = np.abs(wild.columns['gyro_rad_s'] - wild.truth.prediction) > 6.0 * np.std(
+        wild.truth.noise)
     assert far.sum() == wild.truth['outliers'].size == 12.0 and (far == ~wild.truth.good).all()
     stuck, = hide(['stuck_samples'], 4.0, generator, noise='white', **COARSE)
     repeated = np.diff(stuck.columns['gyro_rad_s']) == 0.0
@@ -194,8 +209,10 @@ def test_faults_of_samples_are_as_many_as_it_says(generator):
 
 def test_a_size_in_si_is_hidden_as_it_is_given(generator):
     def given(sessions):
-        return {'time_offset': {'size': 0.02}, 'saturation': {'size': 0.5 * abs(sessions[0].rate).max()}}
-    log, = hide(['time_offset', 'saturation'], 1.0, generator, noise='white', given=given, reference='both', **COARSE)
+        return {'time_offset': {'size': 0.02},
+                'saturation': {'size': 0.5 * abs(sessions[0].rate).max()}}
+    log, = hide(['time_offset', 'saturation'], 1.0, generator, noise='white', given=given,
+                reference='both', **COARSE)
     assert log.truth['time_offset'].size == 0.02 and log.truth['time_offset'].multiple > 3.0
     assert np.abs(log.columns['gyro_rad_s']).max() == 0.5 * np.abs(log.session.rate).max()
     assert {'reference_rate_rad_s', 'reference_heading_rad'} <= set(log.columns)
@@ -214,11 +231,13 @@ def test_a_wrong_reference_leaves_the_gyro_alone_and_errs_in_rate_as_in_heading(
     gyro = draw_gyro([name], 50.0, generator, [each], NoiseFigures(1e-4))
     of_rate = record(gyro, each, generator)
     of_heading = record(gyro, each, generator, reference='heading')
-    assert of_rate.truth.added == pytest.approx(of_rate.truth.bias + gyro.scale_factor_error * each.rate, abs=1e-12)
+    assert of_rate.truth.added == pytest.approx(of_rate.truth.bias
+                                                + gyro.scale_factor_error * each.rate, abs=1e-12)
     wrong_rate = of_rate.columns['reference_rate_rad_s'] - each.rate
     wrong_heading = of_heading.columns['reference_heading_rad'] - each.heading
     change = np.cumsum(0.5 * (wrong_rate[1:] + wrong_rate[:-1])) * each.interval
-    assert wrong_heading[1:] - wrong_heading[0] == pytest.approx(change, abs=0.01 * np.ptp(wrong_heading))
+    assert wrong_heading[1:] - wrong_heading[0] == pytest.approx(change,
+                                                                 abs=0.01 * np.ptp(wrong_heading))
 
 
 def test_an_encoder_has_steps(generator):
@@ -231,7 +250,8 @@ def test_an_encoder_has_steps(generator):
 def test_noise_is_changed_against_what_a_model_expects(generator):
     log, = hide(['rate_random_walk'], 5.0, generator, noise='walk', **COARSE)
     expected = log.truth.expected['rate_random_walk']
-    assert log.truth.gyro.figures.rate_random_walk == log.truth['rate_random_walk'].size > expected > 0.0
+    assert (log.truth.gyro.figures.rate_random_walk == log.truth['rate_random_walk'].size
+            > expected > 0.0)
 
 
 def left_over(hidden_name, other, log, sessions, twins):
@@ -241,7 +261,8 @@ def left_over(hidden_name, other, log, sessions, twins):
     hidden = errors(ALL[hidden_name], cause.size, cause.shapes, sessions)
     shapes = (twins.given(sessions) if twins.given else {}).get(other, {})
     if ALL[other].linear:
-        phases = [{'phase': 0.0}, {'phase': 0.5 * math.pi}] if other in ('heading_sensitivity', 'reference_once_per_rev') else [{}]
+        phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]
+                  if other in ('heading_sensitivity', 'reference_once_per_rev') else [{}])
         columns = [errors(ALL[other], 1.0, {**shapes, **phase}, sessions) for phase in phases]
         gram = metric.gram([hidden, *columns], known)
         scale = np.sqrt(np.diag(gram))
@@ -250,7 +271,9 @@ def left_over(hidden_name, other, log, sessions, twins):
         return scale[0] * math.sqrt(max(0.0, 1.0 - share))
     guess = {'sine_response': math.sqrt(6.0 * abs(cause.size))}.get(other, abs(cause.size))
     sizes = guess * np.geomspace(0.5, 2.0, 61)
-    return min(metric.norm([a - b for a, b in zip(hidden, errors(ALL[other], size, shapes, sessions))], known) for size in sizes)
+    return min(metric.norm(
+        [a - b for a, b in zip(hidden, errors(ALL[other], size, shapes, sessions))], known)
+               for size in sizes)
 
 
 @pytest.mark.parametrize('pair', TWINS, ids='-'.join)
@@ -269,13 +292,16 @@ def test_twins_are_alike_and_then_parted(generator, pair, first):
 
 
 def test_what_is_outside_the_catalogue_is_mostly_not_explained_by_it(generator):
-    causes = [hide([name], 3.0, generator, noise='white', **COARSE)[0].truth[name] for name in OUTSIDE]
-    assert np.mean([cause.likeness < 0.3 for cause in causes]) > 0.6, [(cause.name, cause.likeness) for cause in causes]
+    causes = [hide([name], 3.0, generator, noise='white', **COARSE)[0].truth[name]
+              for name in OUTSIDE]
+    assert np.mean([cause.likeness < 0.3 for cause in causes]) > 0.6, [(cause.name, cause.likeness)
+                                                                       for cause in causes]
     assert all(cause.likeness <= cause.likeness_of_three + 0.02 for cause in causes)
 
 
 def test_an_oracle_wins_all_but_the_noise(generator):
-    log, = hide(['scale_factor_asymmetry', 'thermal_hysteresis'], 30.0, generator, noise='white', **COARSE)
+    log, = hide(['scale_factor_asymmetry', 'thermal_hysteresis'], 30.0, generator, noise='white',
+                **COARSE)
     gain = oracle_gain(log)
     assert gain.rate_after == pytest.approx(np.std(log.truth.noise), rel=0.01)
     assert gain.rate > 0.01 and gain.heading > 0.3
@@ -284,22 +310,26 @@ def test_an_oracle_wins_all_but_the_noise(generator):
 def test_a_gyro_is_recorded_again_under_conditions_that_others_plan(generator):
     log, = hide(['bias_temperature'], 10.0, generator, **COARSE)
     time = np.arange(0.0, 200.0, 0.05)
-    again = record(log.truth.gyro, described(generator, time, np.sin(0.3 * time), 25.0 + 0.05 * time), generator, run=1)
+    again = record(log.truth.gyro,
+                   described(generator, time, np.sin(0.3 * time), 25.0 + 0.05 * time), generator,
+                   run=1)
     truth = again.truth
     assert truth.rate == pytest.approx(np.sin(0.3 * time), abs=0.1)
-    slope = np.polyfit(again.session.temperature, truth.added - truth.scale_factor_error * truth.rate, 1)[0]
+    slope = np.polyfit(again.session.temperature,
+                       truth.added - truth.scale_factor_error * truth.rate, 1)[0]
     assert slope == pytest.approx(log.truth['bias_temperature'].size, rel=1e-6)
 
 
 def test_runs_share_the_gyro_and_not_the_bias_or_the_motion(generator):
-    first, second = hide(['bias_step', 'rate_ramp'], 3.0, generator, runs=2, noise='mixed', **COARSE)
+    first, second = hide(['bias_step', 'rate_ramp'], 3.0, generator, runs=2, noise='mixed',
+                         **COARSE)
     assert first.truth.gyro is second.truth.gyro and first.truth.bias != second.truth.bias
     assert not np.allclose(first.truth.rate, second.truth.rate)
 
 
 def test_a_seed_makes_the_same_log_again_and_another_seed_another(tmp_path):
-    texts = [hide(['warm_up'], 2.0, np.random.default_rng(seed), noise='mixed', **COARSE)[0].write(tmp_path / f'{place}.csv').read_text()
-             for place, seed in enumerate((1, 1, 2))]
+    texts = [hide(['warm_up'], 2.0, np.random.default_rng(seed), noise='mixed', **COARSE)[0].write(
+        tmp_path / f'{place}.csv').read_text() for place, seed in enumerate((1, 1, 2))]
     assert texts[0] == texts[1] != texts[2]
     table = np.loadtxt(tmp_path / '0.csv', delimiter=',', skiprows=1)
     assert texts[0].startswith('time_s,gyro_rad_s,temperature_degc') and table.shape == (6000, 7)

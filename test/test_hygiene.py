@@ -38,8 +38,10 @@ def generator():
 def swing(generator, count=6000, noise=WHITE, scale=1.01, offset=2e-3):
     """Return a log of a gyro that swings and rests, 100 samples a second."""
     time = np.arange(count) * INTERVAL
-    rate = np.sin(0.9 * time + generator.uniform(0.0, 6.0)) * np.clip(3.0 * np.sin(0.11 * time), 0.0, 1.0)
-    return Log(output=scale * rate + offset + simulate_noise(noise, count, INTERVAL, generator), time=time, reference_rate=rate)
+    rate = np.sin(0.9 * time + generator.uniform(0.0, 6.0)) * np.clip(3.0 * np.sin(0.11 * time),
+                                                                      0.0, 1.0)
+    return Log(output=scale * rate + offset + simulate_noise(noise, count, INTERVAL, generator),
+               time=time, reference_rate=rate)
 
 
 def stepping(generator, noise, count=6000):
@@ -59,7 +61,8 @@ def value(finding):
 
 
 def log_of(hidden):
-    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1] for name, values in hidden.columns.items()})
+    return Log(**{COLUMNS[name][0]: values * COLUMNS[name][1]
+                  for name, values in hidden.columns.items()})
 
 
 def printed(values, decimals):
@@ -77,7 +80,8 @@ def coarse(log, step):
 
 def in_digits(log, digits):
     """Return a log as printed with so many significant digits, as by streams."""
-    return replace(log, output=np.array([float(f'{each:.{digits}g}') for each in (log.output / DEGREE).tolist()]) * DEGREE)
+    return replace(log, output=np.array([float(f'{each:.{digits}g}')
+                                         for each in (log.output / DEGREE).tolist()]) * DEGREE)
 
 
 def in_single(log):
@@ -94,13 +98,13 @@ def late(log, generator):
     return replace(log, time=log.time + generator.exponential(0.1 * INTERVAL, len(log)))
 
 
-CLEAN = {
-    'white': lambda generator: swing(generator),
-    'walk and flicker': lambda generator: swing(generator, noise=Noise(1e-4, 3e-5, 1e-5)),
-    'in print': lambda generator: in_print(swing(generator)),
-    'fine codes': lambda generator: coarse(swing(generator), 0.1 * SIGMA),
-    'at rest': lambda generator: replace(swing(generator, scale=0.0), reference_rate=None, moving=np.zeros(6000)),
-    'late stamps': lambda generator: late(swing(generator), generator),
+CLEAN = {'white': lambda generator: swing(generator),
+         'walk and flicker': lambda generator: swing(generator, noise=Noise(1e-4, 3e-5, 1e-5)),
+         'in print': lambda generator: in_print(swing(generator)),
+         'fine codes': lambda generator: coarse(swing(generator), 0.1 * SIGMA),
+         'at rest': lambda generator: replace(swing(generator, scale=0.0), reference_rate=None,
+                                              moving=np.zeros(6000)),
+         'late stamps': lambda generator: late(swing(generator), generator),
 }
 
 
@@ -112,15 +116,19 @@ def test_a_clean_log_has_no_findings(kind, generator):
     assert len(alarms) <= 1, alarms
 
 
-@pytest.mark.parametrize('noise, reference', [('mixed', 'rate'), ('flicker', 'heading'), ('walk', 'heading')])
+@pytest.mark.parametrize('noise, reference',
+                         [('mixed', 'rate'), ('flicker', 'heading'), ('walk', 'heading')])
 def test_a_clean_log_of_the_generator_has_no_findings(noise, reference, generator):
-    logs = [log_of(hide([], 1.0, generator, noise=noise, reference=reference, duration=120.0)[0]) for _ in range(8)]
+    logs = [log_of(hide([], 1.0, generator, noise=noise, reference=reference, duration=120.0)[0])
+            for _ in range(8)]
     assert sum(len(found(log)) for log in logs) <= 1
 
 
-@pytest.mark.parametrize('name', ['bandwidth', 'time_offset', 'cubic_nonlinearity', 'interference_tone', 'reference_slip', 'bias_step'])
+@pytest.mark.parametrize('name', ['bandwidth', 'time_offset', 'cubic_nonlinearity',
+                                  'interference_tone', 'reference_slip', 'bias_step'])
 def test_a_large_effect_of_the_gyro_brings_no_fault_of_the_record(name, generator):
-    logs = [log_of(hide([name], 50.0, generator, reference=reference, duration=120.0)[0]) for reference in ('rate', 'heading')]
+    logs = [log_of(hide([name], 50.0, generator, reference=reference, duration=120.0)[0])
+            for reference in ('rate', 'heading')]
     assert sum(len(found(log)) for log in logs) <= 1
 
 
@@ -130,7 +138,8 @@ FAULTS = ['outliers', 'stuck_samples', 'dropped_samples', 'quantization', 'refer
 @pytest.mark.parametrize('multiple', [1.2, 5.0])
 @pytest.mark.parametrize('name', FAULTS)
 def test_a_hidden_fault_is_found_alone(name, multiple, generator):
-    hidden = [hide([name], multiple, generator, reference=reference, duration=200.0)[0] for reference in ('rate', 'heading') * 3]
+    hidden = [hide([name], multiple, generator, reference=reference, duration=200.0)[0]
+              for reference in ('rate', 'heading') * 3]
     assert sum(list(found(log_of(each))) == [name] for each in hidden) >= 5
 
 
@@ -147,7 +156,8 @@ def test_wild_samples_are_told_from_others(generator):
     hygiene = inspect(log)
     assert [finding.effect for finding in hygiene.findings] == ['outliers']
     # two that are neighbours may hide each other
-    assert np.count_nonzero(~hygiene.trusted[wild]) >= 6 and np.count_nonzero(~hygiene.trusted) <= 9
+    assert (np.count_nonzero(~hygiene.trusted[wild]) >= 6
+            and np.count_nonzero(~hygiene.trusted) <= 9)
 
 
 @pytest.mark.parametrize('rough', ['steps', 'jolts', 'heavy tails'])
@@ -160,8 +170,10 @@ def test_a_rough_motion_or_rough_noise_is_seldom_wild(rough, generator):
 def roughened(rough, generator):
     log = swing(generator)
     steps = np.repeat(np.cumsum(generator.random(600) < 0.1) % 2, 10) * 0.5
-    jolts = np.convolve((generator.random(6000) < 0.01) * generator.normal(0.0, 1.0, 6000), [0.3, 1.0, 0.4], 'same')
-    more = {'steps': steps, 'jolts': jolts, 'heavy tails': generator.laplace(0.0, SIGMA, 6000)}[rough]
+    jolts = np.convolve((generator.random(6000) < 0.01) * generator.normal(0.0, 1.0, 6000),
+                        [0.3, 1.0, 0.4], 'same')
+    more = {'steps': steps, 'jolts': jolts,
+            'heavy tails': generator.laplace(0.0, SIGMA, 6000)}[rough]
     # The reference is two samples late, so that it does not explain the motion at once.
     seen = log.reference_rate if rough == 'heavy tails' else np.roll(log.reference_rate + more, 2)
     return replace(log, output=log.output + more, reference_rate=seen)
@@ -177,7 +189,8 @@ def test_a_single_repeat_of_exact_values_is_seen_and_left_out(generator):
     log = swing(generator)
     log.output[1000:1003] = log.output[999]
     hygiene = inspect(log)
-    assert [finding.effect for finding in hygiene.findings] == ['stuck_samples'] and value(hygiene.findings[0]) == 3.0
+    assert ([finding.effect for finding in hygiene.findings] == ['stuck_samples']
+            and value(hygiene.findings[0]) == 3.0)
     assert not hygiene.trusted[1000:1003].any() and hygiene.trusted[999] and hygiene.trusted[1003]
 
 
@@ -195,30 +208,37 @@ def test_a_coarse_gyro_that_sticks_while_it_turns_is_seen(generator):
 
 def test_codes_as_wide_as_the_noise_are_stuck_as_seldom_as_said(generator):
     """200 logs at rest in the middle of a code at 2 % each; 26 alarms if each repeat counted."""
-    logs = [compare(np.round(generator.standard_normal(2000) / 1.05) * 1.05, None, None) for _ in range(200)]
-    assert sum(stuck_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool), 0.02) is not None for log in logs) <= 10
+    logs = [compare(np.round(generator.standard_normal(2000) / 1.05) * 1.05, None, None)
+            for _ in range(200)]
+    assert sum(stuck_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool),
+                             0.02) is not None for log in logs) <= 10
 
 
 @pytest.mark.parametrize('noise', [1e-4, 1e-5])
 @pytest.mark.parametrize('digits', [5, 6])
 def test_repeats_of_what_is_printed_with_so_many_digits_are_honest(digits, noise, generator):
     """Turns have coarser steps than rests."""
-    alarms = [name for _ in range(10) for name in found(in_digits(stepping(generator, Noise(noise)), digits))]
+    alarms = [name for _ in range(10)
+              for name in found(in_digits(stepping(generator, Noise(noise)), digits))]
     assert len(alarms) <= 1, alarms
 
 
 def test_repeats_of_floats_of_32_bits_are_honest(generator):
     logs = [in_single(stepping(generator, Noise(1e-6), 60_000)) for _ in range(10)]
-    assert any((np.diff(log.output) == 0.0).any() for log in logs) and sum(bool(found(log)) for log in logs) <= 1
+    assert (any((np.diff(log.output) == 0.0).any() for log in logs)
+            and sum(bool(found(log)) for log in logs) <= 1)
 
 
 @pytest.mark.parametrize('ways', [1, 2])
 @pytest.mark.parametrize('within', [1.0, 3.0, 10.0, 50.0])
 def test_a_dead_band_is_no_fault_of_the_record(within, ways, generator):
     logs = [swing(generator) for _ in range(5)]
-    logs = logs if ways == 2 else [replace(log, output=np.abs(log.output), reference_rate=np.abs(log.reference_rate)) for log in logs]
+    logs = logs if ways == 2 else [replace(log, output=np.abs(log.output),
+                                           reference_rate=np.abs(log.reference_rate))
+                                   for log in logs]
     records = [inspect(zeroed(log, within * SIGMA)) for log in logs]
-    assert sum(bool(record.findings) for record in records) <= 1 and all(record.trusted.mean() > 0.99 for record in records)
+    assert (sum(bool(record.findings) for record in records) <= 1
+            and all(record.trusted.mean() > 0.99 for record in records))
 
 
 def test_zeros_in_a_turn_are_stuck_samples_beside_a_dead_band(generator):
@@ -231,39 +251,47 @@ def test_zeros_in_a_turn_are_stuck_samples_beside_a_dead_band(generator):
 
 
 def test_a_dead_band_of_the_driver_is_found_as_a_dead_zone():
-    log = log_of(hide([], 1.0, np.random.default_rng(3), noise='white', duration=600.0, sample_rate=25.0)[0])
+    log = log_of(hide([], 1.0, np.random.default_rng(3), noise='white', duration=600.0,
+                      sample_rate=25.0)[0])
     turned = replace(log, output=log.output - np.median(log.output - log.reference_rate))
-    zones = [each for each in diagnose([zeroed(turned, 0.02)], np.random.default_rng(3)).findings if each.effect == 'dead_zone']
+    zones = [each for each in diagnose([zeroed(turned, 0.02)], np.random.default_rng(3)).findings
+             if each.effect == 'dead_zone']
     assert value(zones[0]) == pytest.approx(0.02, rel=0.05)
 
 
 def test_a_moving_average_of_coarse_codes_is_not_stuck(generator):
     """Mean of seven, as in trackers: a sample equal to the one seven before repeats it."""
     log = swing(generator)
-    mean = np.convolve(coarse(log, 0.2 * SIGMA).output, np.full(7, 1.0 / 7.0), 'valid') * (1.0 + 0.02 * np.sin(31.0 * log.time[3:-3]))
-    assert not found(Log(printed(mean, 4), time=log.time[3:-3], reference_rate=log.reference_rate[3:-3]))
+    mean = np.convolve(coarse(log, 0.2 * SIGMA).output, np.full(7, 1.0 / 7.0),
+                       'valid') * (1.0 + 0.02 * np.sin(31.0 * log.time[3:-3]))
+    assert not found(Log(printed(mean, 4), time=log.time[3:-3],
+                         reference_rate=log.reference_rate[3:-3]))
 
 
 @pytest.mark.parametrize('low, high', [(-0.8, 0.8), (-math.inf, 0.7), (-0.9, math.inf)])
 def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     log = swing(generator)
     hygiene = inspect(replace(log, output=np.clip(log.output, low, high)))
-    assert [finding.effect for finding in hygiene.findings] == ['saturation'] and hygiene.limit == min(-low, high)
+    assert ([finding.effect for finding in hygiene.findings] == ['saturation']
+            and hygiene.limit == min(-low, high))
     beyond = (log.output > high) | (log.output < low)
-    assert not hygiene.trusted[beyond].any() and hygiene.trusted[np.abs(log.reference_rate) < 0.6].all()
+    assert (not hygiene.trusted[beyond].any()
+            and hygiene.trusted[np.abs(log.reference_rate) < 0.6].all())
 
 
 def test_a_limit_that_is_a_code_further_on_one_side_has_the_size_of_the_smaller(generator):
     """As integers of 16 bits have it."""
     log = swing(generator)
-    size = found(replace(log, output=np.clip(log.output, -0.801, 0.8)))['saturation'].parameters['saturation']
+    size = found(replace(log, output=np.clip(log.output, -0.801,
+                                             0.8)))['saturation'].parameters['saturation']
     assert size.estimate == 0.8 and size.interval == (0.8, 0.8)
 
 
 def test_a_constant_rate_of_coarse_codes_is_no_limit(generator):
     log = swing(generator)
     rate = np.sign(np.sin(0.3 * log.time)) * 0.5
-    output = np.round((rate + SIGMA * generator.standard_normal(6000)) / (10.0 * SIGMA)) * 10.0 * SIGMA
+    output = (
+        np.round((rate + SIGMA * generator.standard_normal(6000)) / (10.0 * SIGMA)) * 10.0 * SIGMA)
     assert 'saturation' not in found(replace(log, output=output, reference_rate=rate))
 
 
@@ -271,35 +299,41 @@ def test_what_the_model_knows_is_no_finding(generator):
     from gyro_calibration.effects import CATALOGUE
     log = swing(generator)
     output = np.clip(np.round(log.output / SIGMA) * SIGMA, -600 * SIGMA, 600 * SIGMA)
-    terms = (Term(CATALOGUE['quantization'], (SIGMA,)), Term(CATALOGUE['saturation'], (600 * SIGMA,)))
+    terms = (Term(CATALOGUE['quantization'], (SIGMA,)),
+             Term(CATALOGUE['saturation'], (600 * SIGMA,)))
     assert not found(replace(log, output=output), GyroModel(terms))
     assert list(found(replace(log, output=output))) == ['quantization', 'saturation']
 
 
-@pytest.mark.parametrize('name', [name for name, factor in FACTORS.items() if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
+@pytest.mark.parametrize('name', [name for name, factor in FACTORS.items()
+                                  if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
 def test_a_wrong_unit_is_named_and_mended(name, generator):
     log = swing(generator, scale=1.0)
     hygiene = inspect(replace(log, output=log.output * FACTORS[name]))
     assert [finding.effect for finding in hygiene.findings] == ['unit_error']
-    assert f'and {name} is' in hygiene.findings[0].evidence and hygiene.factor * FACTORS[name] == pytest.approx(1.0)
+    assert (f'and {name} is' in hygiene.findings[0].evidence
+            and hygiene.factor * FACTORS[name] == pytest.approx(1.0))
 
 
 @pytest.mark.parametrize('factor, deviation, name', [
-    (0.017, 1e-4, 'pi/180'), (59.0, 0.1, '180/pi'), (-1.03, 1e-3, '-1'), (2.05, 1e-3, '2048/1000'), (2.1, 1e-3, '2'),
-    (1.0239, 1e-4, '1024/1000'), (1.0235, 1e-5, None), (1.0239, 5e-3, None), (1.03, 1e-4, None), (0.98, 1e-4, None), (3.0, 1e-3, None)])
+    (0.017, 1e-4, 'pi/180'), (59.0, 0.1, '180/pi'), (-1.03, 1e-3, '-1'), (2.05, 1e-3, '2048/1000'),
+    (2.1, 1e-3, '2'), (1.0239, 1e-4, '1024/1000'), (1.0235, 1e-5, None), (1.0239, 5e-3, None),
+    (1.03, 1e-4, None), (0.98, 1e-4, None), (3.0, 1e-3, None)])
 def test_a_factor_is_a_unit_only_where_it_is_known_to_be_one(factor, deviation, name):
     assert unit_of_scale(factor, deviation) == name
 
 
-@pytest.mark.parametrize('offset, deviation, name', [
-    (0.01, 1e-4, 'one sample'), (-0.0051, 1e-4, 'half a sample'), (0.0075, 1e-4, None), (0.01, 2e-3, None), (0.02, 1e-4, None)])
+@pytest.mark.parametrize('offset, deviation, name',
+                         [(0.01, 1e-4, 'one sample'), (-0.0051, 1e-4, 'half a sample'),
+                          (0.0075, 1e-4, None), (0.01, 2e-3, None), (0.02, 1e-4, None)])
 def test_an_offset_is_a_sample_only_where_it_is_known_to_be_one(offset, deviation, name):
     assert unit_of_offset(offset, deviation, INTERVAL) == name
 
 
 def test_a_scale_factor_error_that_the_model_has_is_no_unit(generator):
     log = swing(generator, scale=1.024)
-    assert list(found(log)) == ['unit_error'] and found(log)['unit_error'].ambiguous_with == ('scale_factor_error',)
+    assert (list(found(log)) == ['unit_error']
+            and found(log)['unit_error'].ambiguous_with == ('scale_factor_error',))
     assert not found(log, GyroModel((Term(SCALE_FACTOR_ERROR, (0.024,)),)))
 
 
@@ -308,15 +342,18 @@ def test_lost_samples_are_counted_through_jitter(jitter, generator):
     log = swing(generator)
     kept = generator.random(6000) > 0.002
     kept[[0, -1]] = True
-    shift = {'none': 0.0, '1 ms': np.round(log.time + 4e-4, 3) - log.time, 'late': generator.exponential(3e-4, 6000)}[jitter]
-    thinned = Log(output=log.output[kept], time=(log.time + shift)[kept], reference_rate=log.reference_rate[kept])
+    shift = {'none': 0.0, '1 ms': np.round(log.time + 4e-4, 3) - log.time,
+             'late': generator.exponential(3e-4, 6000)}[jitter]
+    thinned = Log(output=log.output[kept], time=(log.time + shift)[kept],
+                  reference_rate=log.reference_rate[kept])
     assert value(found(thinned)['dropped_samples']) == np.count_nonzero(~kept)
 
 
 def test_the_pace_of_the_clock_and_its_jitter_are_remarks(generator):
     log = swing(generator)
     warped = inspect(replace(log, time=log.time * (1.0 + 1e-5 * log.time)))
-    assert not warped.findings and 'interval of the samples changes by +800 ppm' in ' '.join(warped.remarks)
+    assert (not warped.findings
+            and 'interval of the samples changes by +800 ppm' in ' '.join(warped.remarks))
     assert not inspect(log).remarks
 
 
@@ -324,7 +361,8 @@ def test_the_pace_of_the_clock_and_its_jitter_are_remarks(generator):
 def test_the_step_of_an_encoder_is_found_in_print_and_out_of_it(step, generator):
     heading = np.cumsum(swing(generator).reference_rate) * INTERVAL
     read = np.round(heading / step) * step
-    assert encoder_step(read) == pytest.approx(step, rel=1e-9) and encoder_step(printed(read, 3)) == pytest.approx(step, rel=1e-3)
+    assert (encoder_step(read) == pytest.approx(step, rel=1e-9)
+            and encoder_step(printed(read, 3)) == pytest.approx(step, rel=1e-3))
 
 
 def test_a_calculated_motion_has_no_encoder():
@@ -339,7 +377,8 @@ def test_a_held_reference_tells_its_interval(every, generator):
     log = swing(generator)
     held = log.reference_rate[np.arange(6000) // every * every]
     interval = update_interval(log.time, held, 0.0)
-    assert interval is None if every == 1 else interval == pytest.approx(every * INTERVAL, rel=1e-6)
+    assert interval is None if every == 1 else interval == pytest.approx(every * INTERVAL,
+                                                                         rel=1e-6)
     assert bool(inspect(replace(log, reference_rate=held)).remarks) == (every > 1)
 
 
@@ -355,27 +394,40 @@ def test_one_value_that_comes_often_makes_no_steps(share, generator):
     for _ in range(20):
         often, values = generator.random(6000) < share, generator.standard_normal(6000)
         assert codes_of(np.where(often, 0.0, values)).step == 0.0
-        assert codes_of(np.where(often, 0.0, np.round(values / 0.1) * 0.1)).step == pytest.approx(0.1, rel=1e-9)
+        assert codes_of(np.where(often, 0.0, np.round(values / 0.1) * 0.1)).step == pytest.approx(
+            0.1, rel=1e-9)
 
 
 GOOD = swing(np.random.default_rng(1))
 NAN = np.where(np.arange(6000) < 5950, np.nan, 1.0)
 OTHER_UNITS = GyroModel((Term(SCALE_FACTOR_ERROR, (1.0 / DEGREE - 1.0,)),))
 REFUSED = {
-    'counts alone': (replace(GOOD, output=None, counts=GOOD.output), None, 'no gyro output in rad/s; with'),
-    'no reference': (replace(GOOD, reference_rate=None), None, 'no reference, and the gyro is not at rest'),
-    'few': (Log(GOOD.output[:90], time=GOOD.time[:90], reference_rate=GOOD.reference_rate[:90]), None, '90 of 90 samples'),
-    'short': (Log(GOOD.output[:900], time=GOOD.time[:900], reference_rate=GOOD.reference_rate[:900]), None, 'lasts 9.0 s'),
-    'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None, 'in 100 % of the samples: it is dead'),
+    'counts alone': (replace(GOOD, output=None, counts=GOOD.output), None,
+                     'no gyro output in rad/s; with'),
+    'no reference': (replace(GOOD, reference_rate=None), None,
+                     'no reference, and the gyro is not at rest'),
+    'few': (Log(GOOD.output[:90], time=GOOD.time[:90], reference_rate=GOOD.reference_rate[:90]),
+            None, '90 of 90 samples'),
+    'short': (Log(GOOD.output[:900], time=GOOD.time[:900],
+                  reference_rate=GOOD.reference_rate[:900]), None, 'lasts 9.0 s'),
+    'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None,
+                 'in 100 % of the samples: it is dead'),
     'same': (replace(GOOD, reference_rate=GOOD.output), None, '1 times the reference plus'),
-    'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3), None, '1.3 times the reference plus 5.73 deg/s'),
-    'summed up': (Log(GOOD.output, time=GOOD.time, reference_heading=np.cumsum(GOOD.output) * INTERVAL), None, '1 times the reference'),
-    'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None, 'the gyro has a value in 50 of 6000'),
-    'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None, 'the reference has a value in 50 of 6000'),
+    'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3), None,
+               '1.3 times the reference plus 5.73 deg/s'),
+    'summed up': (Log(GOOD.output, time=GOOD.time,
+                      reference_heading=np.cumsum(GOOD.output) * INTERVAL),
+                  None, '1 times the reference'),
+    'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None,
+                  'the gyro has a value in 50 of 6000'),
+    'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None,
+                       'the reference has a value in 50 of 6000'),
     'few rows': (Log(GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None, '5 rows'),
     'model in deg/s': (GOOD, OTHER_UNITS, 'of other units'),
-    'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)), 'of other units, or of another gyro'),
-    'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None),
+    'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)),
+                                     'of other units, or of another gyro'),
+    'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate,
+                             reference_rate=None),
                      GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk'),
 }
 
@@ -384,32 +436,36 @@ REFUSED = {
 def test_what_allows_no_diagnosis_is_refused_in_one_sentence(log, model, reason):
     with pytest.raises(DataRefused) as refused:
         refuse(log, model)
-    assert reason in str(refused.value) and '\n' not in str(refused.value) and re.search('[:;]', str(refused.value))
+    assert (reason in str(refused.value) and '\n' not in str(refused.value)
+            and re.search('[:;]', str(refused.value)))
 
 
 def test_what_allows_one_passes_the_door():
-    own = GyroModel((Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))), rate_range=(-1.0, 1.0), noise=WHITE)
+    own = GyroModel((Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,))),
+                    rate_range=(-1.0, 1.0), noise=WHITE)
     half = np.where(np.arange(6000) % 1000 < 300, np.nan, 1.0)
     refuse(GOOD)
     refuse(GOOD, own)
-    refuse(replace(GOOD, output=GOOD.output * half, reference_rate=GOOD.reference_rate * half[::-1]), own)
+    refuse(replace(GOOD, output=GOOD.output * half,
+                   reference_rate=GOOD.reference_rate * half[::-1]), own)
     refuse(replace(GOOD, output=GOOD.output / DEGREE), own)
     refuse(Log(GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
 
 
 def test_a_gyro_at_rest_needs_no_reference():
     still = replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate, reference_rate=None)
-    for log in (still, replace(GOOD, reference_rate=None, moving=np.zeros(6000)), replace(still, reference_rate=np.zeros(6000))):
+    for log in (still, replace(GOOD, reference_rate=None, moving=np.zeros(6000)),
+                replace(still, reference_rate=np.zeros(6000))):
         refuse(log)
         assert rests(log)
     assert not rests(GOOD)
 
 
 RECORDINGS = {
-    'mems_encoder_turntable/yaw_slow.csv.gz': ['unit_error', 'dropped_samples', 'reference_quantization'],
+    'mems_encoder_turntable/yaw_slow.csv.gz': ['unit_error', 'dropped_samples',
+                                               'reference_quantization'],
     'mems_encoder_turntable/pitch_slow.csv.gz': ['dropped_samples', 'reference_quantization'],
-    'mems_static/mpu6050_host_clock.csv.gz': [],
-    'mems_motion_capture/fast.csv.gz': [],
+    'mems_static/mpu6050_host_clock.csv.gz': [], 'mems_motion_capture/fast.csv.gz': [],
     'fog_rate_table/table.csv': [],
 }
 

@@ -20,10 +20,12 @@ def smoothed():
     """Return a hand's motion at 250 Hz, 4 ms late, with smoothed noise of gyro and reference."""
     generator = np.random.default_rng(5)
     time = np.arange(30_000) / 250.0
-    turns = [(frequency, generator.normal(), generator.uniform(0.0, 6.0)) for frequency in (0.13, 0.31, 0.7, 1.1, 1.9, 3.1, 5.3)]
+    turns = [(frequency, generator.normal(), generator.uniform(0.0, 6.0))
+             for frequency in (0.13, 0.31, 0.7, 1.1, 1.9, 3.1, 5.3)]
 
     def rate(when):
-        return sum(size * np.sin(2.0 * np.pi * frequency * when + phase) for frequency, size, phase in turns)
+        return sum(size * np.sin(2.0 * np.pi * frequency * when + phase)
+                   for frequency, size, phase in turns)
 
     def averaged(values):
         return np.convolve(values, np.full(7, 1.0 / 7.0), 'same')
@@ -31,7 +33,8 @@ def smoothed():
     noise = 0.03 * generator.standard_normal(len(time))
     output = rate(time - LATE) + averaged(averaged(0.002 * generator.standard_normal(len(time))))
     reference = rate(time) + averaged(averaged(averaged(averaged(noise))))
-    return Log(time=time, output=output + 1e-6 * generator.standard_normal(len(time)), reference_rate=reference)
+    return Log(time=time, output=output + 1e-6 * generator.standard_normal(len(time)),
+               reference_rate=reference)
 
 
 @pytest.fixture(scope='module')
@@ -71,7 +74,8 @@ def test_stamps_in_bursts_lose_no_sample():
 
 def test_a_delay_is_named_as_one_beside_a_noisy_and_gaping_reference(gaping):
     found = diagnose([gaping], np.random.default_rng(1)).findings[0]
-    assert found.effect == 'time_offset' and found.parameters['time_offset'].estimate == pytest.approx(LATE, rel=0.03)
+    assert (found.effect == 'time_offset'
+            and found.parameters['time_offset'].estimate == pytest.approx(LATE, rel=0.03))
 
 
 TIME = np.arange(12_000) / 100.0
@@ -80,32 +84,38 @@ NOISE = 1e-3 * np.random.default_rng(4).standard_normal(len(TIME))
 
 def stepped(every):
     """Return a rate commanded in steps, each held: rests and stretches of 10 s, with turns."""
-    wanted = np.where(TIME % 20.0 < 10.0, np.where(TIME % 40.0 < 20.0, 0.0, 0.3), 0.3 + 0.5 * np.sin(0.7 * TIME))
+    wanted = np.where(TIME % 20.0 < 10.0, np.where(TIME % 40.0 < 20.0, 0.0, 0.3),
+                      0.3 + 0.5 * np.sin(0.7 * TIME))
     return wanted[np.arange(len(TIME)) // every * every]
 
 
 def test_a_held_reference_that_stands_is_not_bent_towards_what_comes_next():
     """Rests of 10 s were a ramp to the first value after them."""
     held = stepped(5)
-    each = replay(Log(output=held + NOISE, time=TIME, reference_rate=held), np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
+    each = replay(Log(output=held + NOISE, time=TIME, reference_rate=held),
+                  np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
     standing = (TIME % 20.0 > 0.5) & (TIME % 20.0 < 9.5)
     assert np.abs(each.reference - held)[standing].max() < 1e-12
     turning = (TIME % 20.0 > 10.5) & (TIME % 20.0 < 19.5)
     wanted = 0.3 + 0.5 * np.sin(0.7 * TIME)
-    assert np.abs(each.reference - wanted)[turning].max() < 1e-3 < np.abs(held - wanted)[turning].max()
+    assert np.abs(each.reference
+                  - wanted)[turning].max() < 1e-3 < np.abs(held - wanted)[turning].max()
 
 
 def test_a_held_heading_that_stands_has_no_rate():
     heading = np.where(TIME < 60.0, 0.0, 0.5 * (TIME - 60.0))[np.arange(len(TIME)) // 5 * 5]
-    each = replay(Log(output=NOISE, time=TIME, reference_heading=heading), np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
+    each = replay(Log(output=NOISE, time=TIME, reference_heading=heading),
+                  np.ones(len(TIME), bool), np.random.default_rng(0), update=0.05)
     assert np.abs(each.reference[TIME < 59.5]).max() < 1e-9
 
 
 @pytest.mark.parametrize('every', [2, 3, 5, 15])
 @pytest.mark.parametrize('quantity', ['reference_rate', 'reference_heading'])
 def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(quantity, every):
-    values = {'reference_rate': 0.5 * np.sin(0.7 * TIME), 'reference_heading': -0.5 / 0.7 * np.cos(0.7 * TIME)}[quantity]
-    given = np.where((np.arange(len(TIME)) % every == 0) & ~((TIME > 50.0) & (TIME < 52.0)), values, np.nan)
+    values = {'reference_rate': 0.5 * np.sin(0.7 * TIME),
+              'reference_heading': -0.5 / 0.7 * np.cos(0.7 * TIME)}[quantity]
+    given = np.where((np.arange(len(TIME)) % every == 0) & ~((TIME > 50.0) & (TIME < 52.0)),
+                     values, np.nan)
     log = Log(output=0.5 * np.sin(0.7 * TIME) + NOISE, time=TIME, **{quantity: given})
     refuse(log)
     each = laid_out(log)
@@ -116,14 +126,16 @@ def test_a_reference_that_is_slower_than_the_gyro_is_compared_with_all_samples(q
 def test_a_pattern_of_a_slow_reference_that_is_not_quite_even_is_no_loss():
     """30 values a second beside 100 samples: after 3, 3 and 4 of them."""
     shown = np.isin(np.arange(len(TIME)), np.arange(0, len(TIME), 10.0 / 3.0).astype(int))
-    each = laid_out(Log(output=0.5 * np.sin(TIME) + NOISE, time=TIME, reference_rate=np.where(shown, 0.5 * np.sin(TIME), np.nan)))
+    each = laid_out(Log(output=0.5 * np.sin(TIME) + NOISE, time=TIME,
+                        reference_rate=np.where(shown, 0.5 * np.sin(TIME), np.nan)))
     assert np.count_nonzero(~each.kept) < 5
 
 
 def test_beside_a_gap_of_a_heading_no_rate_is_compared_that_the_gap_bends():
     heading = -0.5 / 2.0 * np.cos(2.0 * TIME)
     lost = (TIME > 50.0) & (TIME < 51.5)
-    each = laid_out(Log(output=0.5 * np.sin(2.0 * TIME) + NOISE, time=TIME, reference_heading=np.where(lost, np.nan, heading)))
+    each = laid_out(Log(output=0.5 * np.sin(2.0 * TIME) + NOISE, time=TIME,
+                        reference_heading=np.where(lost, np.nan, heading)))
     assert np.abs(each.reference - 0.5 * np.sin(2.0 * TIME))[each.kept].max() < 3e-3
     assert np.count_nonzero(~each.kept & ~lost) == 8
 
@@ -133,6 +145,7 @@ def test_a_log_without_temperature_is_simulated_at_the_temperature_of_the_model(
     model = GyroModel(terms, reference_temperature=40.0)
     rate = np.sin(TIME)
     output = model.output(rate, 40.0) + NOISE
-    each = replay(Log(output=output, time=TIME, reference_rate=rate), np.ones(len(TIME), bool), np.random.default_rng(0), model=model)
+    each = replay(Log(output=output, time=TIME, reference_rate=rate), np.ones(len(TIME), bool),
+                  np.random.default_rng(0), model=model)
     assert abs(float(np.mean(each.channels.output - each.reference))) < 1e-4
     assert 'temperature' not in each.has

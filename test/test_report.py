@@ -35,8 +35,8 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
 
 CHROMIUM = Path('/usr/bin/chromium')
-HOSTILE = ('</title></script><script>document.title = "taken"</script><img src="http://example.org/x.png" onerror="alert(1)">'
-           '&"\'\x1b[2J\udcff.csv')
+HOSTILE = ('</title></script><script>document.title = "taken"</script><img '
+           'src="http://example.org/x.png" onerror="alert(1)">&"\'\x1b[2J\udcff.csv')
 
 
 # diagnoses made by hand
@@ -45,7 +45,8 @@ def curve(along, unit, at, error, mended, deviation=0.01 * DEGREE):
     """Return a curve whose error is wholly before, and partly mended after."""
     generator = np.random.default_rng(len(along))
     before = error + deviation * generator.standard_normal(len(at))
-    return Curve(along, unit, at, before, before - mended * error, np.full(len(at), deviation), 0.1 * DEGREE + 0.0 * at)
+    return Curve(along, unit, at, before, before - mended * error, np.full(len(at), deviation),
+                 0.1 * DEGREE + 0.0 * at)
 
 
 TEMPERATURE = np.linspace(18.0, 41.0, 24)
@@ -56,55 +57,70 @@ TIME = np.linspace(0.0, 1500.0, 40)
 
 def temperature_finding(ambiguous=('rate_ramp',)):
     size = Estimate(0.021 * DEGREE, (0.0203 * DEGREE, 0.0217 * DEGREE), 'rad/s/K')
-    return Finding('bias_temperature', CATALOGUE['bias_temperature'].cause, {'bias_temperature': size}, 1e-9, 0.0009 * DEGREE, ambiguous,
+    return Finding('bias_temperature', CATALOGUE['bias_temperature'].cause,
+                   {'bias_temperature': size}, 1e-9, 0.0009 * DEGREE, ambiguous,
                    'heat and cool the gyro within one log' if ambiguous else '',
                    'From 18 to 41 °C the residual rises by 0.48 deg/s.', 'temperature')
 
 
 def adequate():
-    return Diagnosis((), (), Noise(1e-4, 2e-5, 1e-6), Noise(1e-4, 2e-5, 1e-6), None, GyroModel(), GyroModel(),
-                     logs=('still.csv',), curves=[curve('temperature', 'degC', TEMPERATURE, 0.0 * TEMPERATURE, 0.0)])
+    return Diagnosis((), (), Noise(1e-4, 2e-5, 1e-6), Noise(1e-4, 2e-5, 1e-6), None, GyroModel(),
+                     GyroModel(), logs=('still.csv',),
+                     curves=[curve('temperature', 'degC', TEMPERATURE, 0.0 * TEMPERATURE, 0.0)])
 
 
 def extended():
     """Return a diagnosis with one cause that remains in a set, and everything there is to draw."""
-    model = GyroModel((Term(CATALOGUE['bias'], (0.1 * DEGREE,)), Term(CATALOGUE['bias_temperature'], (25.0, 0.021 * DEGREE))),
-                      np.diag([1e-9, 1e-12]), (-1.745, 1.745), (18.0, 41.0), noise=Noise(1e-4, 2e-5, 1e-6), gyro={'name': 'yaw gyro'})
+    model = GyroModel((Term(CATALOGUE['bias'], (0.1 * DEGREE,)),
+                       Term(CATALOGUE['bias_temperature'], (25.0, 0.021 * DEGREE))),
+                      np.diag([1e-9, 1e-12]), (-1.745, 1.745), (18.0, 41.0),
+                      noise=Noise(1e-4, 2e-5, 1e-6), gyro={'name': 'yaw gyro'})
     thermal = (TEMPERATURE - 25.0) * 0.021 * DEGREE
-    curves = [curve('temperature', 'degC', TEMPERATURE, thermal, 0.98), curve('rate', 'rad/s', RATE, 0.0 * RATE, 0.0),
-              curve('time', 's', TIME, 1e-4 * TIME * DEGREE, 0.97), curve('heading', 'rad', HEADING, 0.0 * HEADING, 0.0)]
-    gain = Gain('every second block of 150 s', Change(0.31 * DEGREE, 0.12 * DEGREE, (0.17 * DEGREE, 0.21 * DEGREE)),
+    curves = [curve('temperature', 'degC', TEMPERATURE, thermal, 0.98),
+              curve('rate', 'rad/s', RATE, 0.0 * RATE, 0.0),
+              curve('time', 's', TIME, 1e-4 * TIME * DEGREE, 0.97),
+              curve('heading', 'rad', HEADING, 0.0 * HEADING, 0.0)]
+    gain = Gain('every second block of 150 s',
+                Change(0.31 * DEGREE, 0.12 * DEGREE, (0.17 * DEGREE, 0.21 * DEGREE)),
                 Change(8.2 * DEGREE, 1.1 * DEGREE, (6.6 * DEGREE, 7.7 * DEGREE)))
     no_force = 'the log holds no specific force'
-    cannot_show = {'supply_sensitivity': 'the log holds no supply voltage', 'acceleration_sensitivity': no_force,
-                   'vibration_rectification': no_force}
-    return Diagnosis((temperature_finding(),), (), Noise(1.3e-4, 2e-5, 0.0), Noise(1e-4, 2e-5, 1e-6), gain,
-                     replace(model, terms=model.terms[:1]), model, cannot_show, curves, heading_curve(45000), noise_curve(),
-                     ('12 lost samples were left out.', 'the reference is an encoder'), logs=('turntable.csv.gz',), trace=trace())
+    cannot_show = {'supply_sensitivity': 'the log holds no supply voltage',
+                   'acceleration_sensitivity': no_force, 'vibration_rectification': no_force}
+    return Diagnosis((temperature_finding(),), (), Noise(1.3e-4, 2e-5, 0.0),
+                     Noise(1e-4, 2e-5, 1e-6), gain, replace(model, terms=model.terms[:1]), model,
+                     cannot_show, curves, heading_curve(45000), noise_curve(),
+                     ('12 lost samples were left out.', 'the reference is an encoder'),
+                     logs=('turntable.csv.gz',), trace=trace())
 
 
 def heading_curve(count):
     time = np.linspace(0.0, 900.0, count)
-    walk = np.cumsum(np.random.default_rng(3).standard_normal(count)) * 0.4 / np.sqrt(count) * DEGREE
+    walk = (
+        np.cumsum(np.random.default_rng(3).standard_normal(count)) * 0.4 / np.sqrt(count) * DEGREE)
     return HeadingCurve(time, walk + 9.0 * DEGREE * (time / 900.0) ** 2, walk)
 
 
 def noise_curve():
     times = np.geomspace(0.02, 300.0, 50)
     fitted = np.sqrt(1.3e-4 ** 2 / times + (0.664 * 2e-5) ** 2)
-    return NoiseCurve(times, fitted * (1.0 + 0.05 * np.sin(np.arange(50.0))), fitted, np.sqrt(1e-8 / times + 1e-12 * times / 3.0))
+    return NoiseCurve(times, fitted * (1.0 + 0.05 * np.sin(np.arange(50.0))), fitted,
+                      np.sqrt(1e-8 / times + 1e-12 * times / 3.0))
 
 
 def trace():
     time = np.linspace(412.0, 424.0, 600)
-    rate = 60.0 * DEGREE * np.sin(1.2 * time) + 0.1 * DEGREE * np.random.default_rng(4).standard_normal(600)
-    return Trace(time, rate, 60.0 * DEGREE * np.sin(1.2 * time) - 0.4 * DEGREE, 60.0 * DEGREE * np.sin(1.2 * time))
+    rate = (60.0 * DEGREE * np.sin(1.2 * time)
+            + 0.1 * DEGREE * np.random.default_rng(4).standard_normal(600))
+    return Trace(time, rate, 60.0 * DEGREE * np.sin(1.2 * time) - 0.4 * DEGREE,
+                 60.0 * DEGREE * np.sin(1.2 * time))
 
 
 def unexplained():
     """Return a diagnosis where something along the heading has no name."""
-    return replace(adequate(), unexplained=(Unexplained('heading', 0.12, 1e-7), Unexplained('rate', 0.03, 2e-4)),
-                   curves=[curve('heading', 'rad', HEADING, 0.08 * DEGREE * np.sin(3.0 * HEADING), 0.0)])
+    return replace(adequate(), unexplained=(Unexplained('heading', 0.12, 1e-7),
+                                            Unexplained('rate', 0.03, 2e-4)),
+                   curves=[curve('heading', 'rad', HEADING, 0.08 * DEGREE * np.sin(3.0 * HEADING),
+                                 0.0)])
 
 
 def no_gain():
@@ -117,27 +133,35 @@ def several():
     cubic = Estimate(-2.1e-3, (-2.4e-3, -1.8e-3), 's²/rad²')
     warm = {'warm_up': Estimate(0.3 * DEGREE, (0.2 * DEGREE, 0.4 * DEGREE), 'rad/s'),
             'time_constant': Estimate(240.0, (180.0, 330.0), 's')}
-    found = (temperature_finding(()),
-             Finding('time_offset', 'The stamps of the output come late.', {'time_offset': offset}, 0.0, 1e-4, ('bandwidth',),
-                     'reverse the motion faster than once in two seconds', 'The output lags the encoder.'),
-             Finding('cubic_nonlinearity', CATALOGUE['cubic_nonlinearity'].cause, {'cubic_nonlinearity': cubic}, 3e-4, 5e-4, along='rate'),
+    found = (temperature_finding(()), Finding('time_offset', 'The stamps of the output come late.',
+                                              {'time_offset': offset}, 0.0, 1e-4, ('bandwidth',),
+                                              'reverse the motion faster than once in two seconds',
+                                              'The output lags the encoder.'),
+             Finding('cubic_nonlinearity', CATALOGUE['cubic_nonlinearity'].cause,
+                     {'cubic_nonlinearity': cubic}, 3e-4, 5e-4, along='rate'),
              Finding('warm_up', 'The bias settles after power-on.', warm, 2e-5),
-             Finding('dropped_samples', 'Samples are missing.', {'dropped_samples': Estimate(123.0, (123.0, 123.0), '1')}, 1e-12,
+             Finding('dropped_samples', 'Samples are missing.',
+                     {'dropped_samples': Estimate(123.0, (123.0, 123.0), '1')}, 1e-12,
                      evidence='123 samples are missing in 40 gaps.'))
     frequency = np.geomspace(0.01, 50.0, 40)
     amplitude = 1e-4 / np.sqrt(frequency)
-    spectrum = Curve('frequency', 'Hz', frequency, np.where(np.arange(40) == 30, 2e-3, 2.0 * amplitude), 2.0 * amplitude, amplitude)
+    spectrum = Curve('frequency', 'Hz', frequency,
+                     np.where(np.arange(40) == 30, 2e-3, 2.0 * amplitude), 2.0 * amplitude,
+                     amplitude)
     return replace(extended(), findings=found, curves=[*extended().curves, spectrum],
                    unexplained=(Unexplained('frequency', 0.004, 0.002),), logs=('a.csv', 'b.csv'))
 
 
 def hostile():
-    found = replace(temperature_finding((HOSTILE,)), effect=HOSTILE, cause=HOSTILE, separate_by=HOSTILE, evidence=HOSTILE, along=HOSTILE,
+    found = replace(temperature_finding((HOSTILE,)), effect=HOSTILE, cause=HOSTILE,
+                    separate_by=HOSTILE, evidence=HOSTILE, along=HOSTILE,
                     parameters={HOSTILE: Estimate(1.0, (0.5, 1.5), HOSTILE)})
     whole = extended()
-    model = replace(whole.model, gyro={'name': HOSTILE}, origin={'file': HOSTILE.replace('\udcff', '')})
+    model = replace(whole.model, gyro={'name': HOSTILE},
+                    origin={'file': HOSTILE.replace('\udcff', '')})
     gain = replace(whole.gain, held_out=HOSTILE)
-    return replace(whole, findings=(found,), unexplained=(Unexplained(HOSTILE, 0.1, 0.01),), logs=(HOSTILE,), gain=gain,
+    return replace(whole, findings=(found,), unexplained=(Unexplained(HOSTILE, 0.1, 0.01),),
+                   logs=(HOSTILE,), gain=gain,
                    remarks=(HOSTILE, '$title $body'), cannot_show={HOSTILE: HOSTILE}, model=model,
                    curves=[replace(whole.curves[0], along=HOSTILE, unit=HOSTILE)])
 
@@ -146,14 +170,18 @@ def holes():
     """Return a diagnosis whose numbers are lacking in places."""
     whole, missing = extended(), np.full(24, np.nan)
     found = replace(temperature_finding(), p_value=np.nan, minimum_detectable=None,
-                    parameters={'bias_temperature': Estimate(1e-4, (-np.inf, np.inf), 'rad/s/K'), 'k': Estimate(0.0, (0.0, 0.0), 's')})
+                    parameters={'bias_temperature': Estimate(1e-4, (-np.inf, np.inf), 'rad/s/K'),
+                                'k': Estimate(0.0, (0.0, 0.0), 's')})
     some = np.where(np.arange(24) % 5 == 0, np.nan, whole.curves[0].before)
-    curves = [replace(whole.curves[0], before=some, deviation=missing), replace(whole.curves[0], before=missing, after=missing),
+    curves = [replace(whole.curves[0], before=some, deviation=missing),
+              replace(whole.curves[0], before=missing, after=missing),
               Curve('time', 's', np.array([]), np.array([]), np.array([]), np.array([]))]
-    return replace(whole, findings=(found,), curves=curves, heading=HeadingCurve(np.array([0.0]), np.array([0.0]), np.array([0.0])))
+    return replace(whole, findings=(found,), curves=curves,
+                   heading=HeadingCurve(np.array([0.0]), np.array([0.0]), np.array([0.0])))
 
 
-MADE = {each.__name__: each for each in (adequate, extended, unexplained, no_gain, several, hostile, holes)}
+MADE = {each.__name__: each
+        for each in (adequate, extended, unexplained, no_gain, several, hostile, holes)}
 
 
 @pytest.fixture(params=MADE, scope='module')
@@ -210,7 +238,8 @@ def test_the_page_refers_to_nothing_outside(made):
 
 
 def test_the_page_allows_itself_no_network(made):
-    policy, = [attributes['content'] for tag, attributes in Page(report(made)).elements if attributes.get('http-equiv')]
+    policy, = [attributes['content']
+               for tag, attributes in Page(report(made)).elements if attributes.get('http-equiv')]
     assert policy.startswith("default-src 'none';")
 
 
@@ -231,8 +260,10 @@ def test_no_number_is_written_as_a_computer_says_it(made):
 def test_every_chart_has_words_and_a_table_of_its_values(made):
     page = Page(report(made))
     tags = [tag for tag, _ in page.elements]
-    charts = [attributes for tag, attributes in page.elements if tag == 'svg' and attributes.get('role') == 'img']
-    assert tags.count('desc') == tags.count('figure') == len(charts) and all(each['aria-labelledby'] for each in charts)
+    charts = [attributes for tag, attributes in page.elements if tag == 'svg'
+              and attributes.get('role') == 'img']
+    assert (tags.count('desc') == tags.count('figure') == len(charts)
+            and all(each['aria-labelledby'] for each in charts))
     assert [tag for tag in tags if tag == 'caption'] == ['caption'] * len(charts)
 
 
@@ -265,14 +296,18 @@ def test_among_several_causes_a_set_is_in_brackets():
 
 
 def test_a_diagnosis_of_another_kind_says_how_it_was_computed_and_leaves_out_what_it_did_not_measure():
-    text = Page(report(replace(adequate(), method='the dwells of a table were fitted', noise=Noise(), simulated=Noise()))).text
-    assert 'The dwells of a table were fitted.' in text and 'replayed' not in text and 'angle random walk' not in text.split('The model')[0]
+    text = Page(report(replace(adequate(), method='the dwells of a table were fitted',
+                               noise=Noise(), simulated=Noise()))).text
+    assert ('The dwells of a table were fitted.' in text and 'replayed' not in text
+            and 'angle random walk' not in text.split('The model')[0])
 
 
 def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
     whole = extended()
-    text = report(replace(whole, model=whole.before, gain=None, findings=(), unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
-    assert 'data-name="after"' in report(whole) and 'data-name="after"' not in text and 'as extended' not in text
+    text = report(replace(whole, model=whole.before, gain=None, findings=(),
+                          unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
+    assert ('data-name="after"' in report(whole) and 'data-name="after"' not in text
+            and 'as extended' not in text)
 
 
 def test_sizes_are_in_the_units_of_people():
@@ -288,23 +323,27 @@ def test_sizes_are_in_the_units_of_people():
     (np.pi / 180.0, (0.0, np.pi / 90.0), '(rad/s)/(m/s²)', '1.0 (0.0 to 2.0) (deg/s)/(m/s²)'),
     (1.0, (0.9, 1.1), 's/rad', '0.0175 (0.0157 to 0.0192) s/deg'),
     (0.1, (0.1, 0.1), 'V', '0.1 V'), (0.5, (-np.inf, np.inf), 'Hz', '0.5 (−∞ to ∞) Hz')])
-def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, interval, unit, words):
+def test_an_estimate_is_written_with_the_digits_that_its_interval_leaves(value, interval, unit,
+                                                                         words):
     assert str(quantity(Estimate(value, interval, unit))) == words
 
 
 def test_noise_is_in_the_units_of_data_sheets():
     for unit, of_people in (('rad/√s', 'deg/√h'), ('rad/s/√s', 'deg/h/√h')):
-        assert for_people(unit) == (of_people, pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
+        assert for_people(unit) == (
+            of_people, pytest.approx(180.0 / np.pi * (60.0 if unit == 'rad/√s' else 60.0 ** 3)))
 
 
-@pytest.mark.parametrize('probability, words', [
-    (0.0, 'less than 1 in a million'), (1 / 250, '1 in 250'), (0.3, '30 %'), (np.nan, 'not known')])
+@pytest.mark.parametrize('probability, words',
+                         [(0.0, 'less than 1 in a million'), (1 / 250, '1 in 250'), (0.3, '30 %'),
+                          (np.nan, 'not known')])
 def test_a_chance_is_said_in_words(probability, words):
     assert chance(probability) == words
 
 
-@pytest.mark.parametrize('interval, words', [
-    ((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'too few or too uneven'), ((-0.02, -0.01), 'worse'), (None, 'no interval')])
+@pytest.mark.parametrize('interval, words',
+                         [((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'too few or too uneven'),
+                          ((-0.02, -0.01), 'worse'), (None, 'no interval')])
 def test_a_gain_is_called_what_it_is(interval, words):
     whole = extended()
     gain = replace(whole.gain, heading=replace(whole.gain.heading, interval=interval))
@@ -325,14 +364,19 @@ class Browser:
     def __init__(self, folder):
         there, self._out = os.pipe()
         self._in, back = os.pipe()
-        command = ['bash', '-c', f'exec "$@" 3<&{there} 4>&{back}', 'bash', str(CHROMIUM), '--headless', '--remote-debugging-pipe',
-                   '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--no-first-run', f'--user-data-dir={folder}', 'about:blank']
-        self._process = subprocess.Popen(command, pass_fds=(there, back), stderr=subprocess.DEVNULL, start_new_session=True)
+        command = ['bash', '-c', f'exec "$@" 3<&{there} 4>&{back}', 'bash', str(CHROMIUM),
+                   '--headless', '--remote-debugging-pipe',
+                   '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--no-first-run',
+                   f'--user-data-dir={folder}', 'about:blank']
+        self._process = subprocess.Popen(command, pass_fds=(there, back),
+                                         stderr=subprocess.DEVNULL, start_new_session=True)
         os.close(there)
         os.close(back)
         self._rest, self._number, self.events, self._session = b'', 0, [], None
-        page = next(each for each in self('Target.getTargets')['targetInfos'] if each['type'] == 'page')
-        self._session = self('Target.attachToTarget', targetId=page['targetId'], flatten=True)['sessionId']
+        page = next(each
+                    for each in self('Target.getTargets')['targetInfos'] if each['type'] == 'page')
+        self._session = self('Target.attachToTarget', targetId=page['targetId'],
+                             flatten=True)['sessionId']
         for domain in ('Page', 'Network', 'Runtime', 'Log'):
             self(f'{domain}.enable')
 
@@ -340,7 +384,8 @@ class Browser:
         """Ask for something and return the answer."""
         self._number += 1
         session = {'sessionId': self._session} if self._session else {}
-        os.write(self._out, json.dumps({'id': self._number, 'method': method, 'params': parameters, **session}).encode() + b'\0')
+        os.write(self._out, json.dumps({'id': self._number, 'method': method, 'params': parameters,
+                                        **session}).encode() + b'\0')
         while (message := self._next()).get('id') != self._number:
             self.events.append(message)
         assert 'error' not in message, message
@@ -349,15 +394,18 @@ class Browser:
     def _next(self, timeout=20.0):
         deadline = time.monotonic() + timeout
         while b'\0' not in self._rest:
-            assert select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))[0], 'the browser does not answer'
+            assert select.select([self._in], [], [], max(
+                0.0, deadline - time.monotonic()))[0], 'the browser does not answer'
             self._rest += os.read(self._in, 1 << 20)
         message, self._rest = self._rest.split(b'\0', 1)
         return json.loads(message)
 
     def show(self, path, width, height, dark=False):
         """Load a page on a screen of this size."""
-        self('Emulation.setDeviceMetricsOverride', width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
-        self('Emulation.setEmulatedMedia', features=[{'name': 'prefers-color-scheme', 'value': 'dark' if dark else 'light'}])
+        self('Emulation.setDeviceMetricsOverride', width=width, height=height, deviceScaleFactor=1,
+             mobile=width < 600)
+        self('Emulation.setEmulatedMedia',
+             features=[{'name': 'prefers-color-scheme', 'value': 'dark' if dark else 'light'}])
         self.events.clear()
         self('Page.navigate', url=path.as_uri())
         while not any(event.get('method') == 'Page.loadEventFired' for event in self.events):
@@ -371,8 +419,10 @@ class Browser:
 
     def point(self, selector, part):
         """Move the pointer over an element, to a part of its width."""
-        x, y = self.tell(f'(() => {{ const picture = document.querySelector("{selector}"); picture.scrollIntoView({{block: "center"}}); '
-                         f'const box = picture.getBoundingClientRect(); return [box.x + {part} * box.width, box.y + box.height / 2]; }})()')
+        x, y = self.tell(f'(() => {{ const picture = document.querySelector("{selector}"); '
+                         'picture.scrollIntoView({block: "center"}); const box = '
+                         f'picture.getBoundingClientRect(); return [box.x + {part} * box.width, '
+                         'box.y + box.height / 2]; })()')
         self('Input.dispatchMouseEvent', type='mouseMoved', x=x, y=y)
 
     def picture(self, path):
@@ -380,7 +430,8 @@ class Browser:
         height = self.tell('document.documentElement.scrollHeight')
         width = self.tell('innerWidth')
         clip = {'x': 0, 'y': 0, 'width': width, 'height': height, 'scale': 1}
-        path.write_bytes(base64.b64decode(self('Page.captureScreenshot', captureBeyondViewport=True, clip=clip)['data']))
+        path.write_bytes(base64.b64decode(self('Page.captureScreenshot',
+                                               captureBeyondViewport=True, clip=clip)['data']))
 
     def close(self):
         """End it, also where it does not answer; without its pipe it ends by itself."""
@@ -421,8 +472,9 @@ def path(made, tmp_path_factory):
 
 
 #: Elements that reach beyond the right edge of the screen, except inside scrolling boxes.
-BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest(".scroll, svg") && '
-          'each.getBoundingClientRect().right > innerWidth + 0.5).map(each => each.outerHTML.slice(0, 80))')
+BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest(".scroll, svg") '
+          '&& each.getBoundingClientRect().right > innerWidth + 0.5).map(each => '
+          'each.outerHTML.slice(0, 80))')
 
 
 def test_the_page_fits_the_screen(browser, path, screen):
@@ -436,7 +488,8 @@ def test_the_page_opens_without_complaint_and_without_network(browser, path, scr
     browser.show(path, *screen)
     kinds = ('Runtime.exceptionThrown', 'Log.entryAdded', 'Runtime.consoleAPICalled')
     complaints = [event for event in browser.events if event.get('method') in kinds]
-    asked = [event['params']['request']['url'] for event in browser.events if event.get('method') == 'Network.requestWillBeSent']
+    asked = [event['params']['request']['url']
+             for event in browser.events if event.get('method') == 'Network.requestWillBeSent']
     assert not complaints
     assert asked == [path.as_uri()]
     assert browser.tell('document.title').startswith('Diagnosis of ')
@@ -453,7 +506,8 @@ def whole_path(tmp_path_factory):
 def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path, screen):
     browser.show(whole_path, *screen)
     count = browser.tell('document.querySelectorAll("figure.chart").length')
-    browser.tell('document.querySelectorAll("figure.chart").forEach((each, place) => each.id = "chart" + place)')
+    browser.tell('document.querySelectorAll("figure.chart").forEach((each, place) => each.id = '
+                 '"chart" + place)')
     assert count == 9
     for place in range(count):
         browser.point(f'#chart{place} > svg', 0.6)
@@ -461,7 +515,8 @@ def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path, scre
         rows = browser.tell(f'[...document.querySelectorAll("#chart{place} tbody tr")].map(row => '
                             '[...row.cells].map(cell => cell.textContent))')
         assert any(all(cell in shown for cell in row) for row in rows), shown
-        assert browser.tell(f'getComputedStyle(document.querySelector("#chart{place} .cursor")).visibility') == 'visible'
+        assert browser.tell(f'getComputedStyle(document.querySelector("#chart{place} '
+                            '.cursor")).visibility') == 'visible'
 
 
 def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
@@ -471,19 +526,24 @@ def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
                  'each.textContent.startsWith("Residual along temperature")).id = "thermal"')
     for part in (46.0 / 360.0, 195.0 / 360.0, 344.0 / 360.0):  # left end, middle, right end
         browser.point('#thermal > svg', part)
-        temperatures.append(float(browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
-    assert temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51 and temperatures[2] == 41.0
+        temperatures.append(float(
+            browser.tell('document.querySelector("#thermal .readout").textContent').split()[1]))
+    assert (temperatures[0] == 18.0 and abs(temperatures[1] - 29.5) < 0.51
+            and temperatures[2] == 41.0)
 
 
 def test_a_finger_reads_values_too(browser, whole_path):
     browser.show(whole_path, *SCREENS['phone'])
     browser('Emulation.setTouchEmulationEnabled', enabled=True)
-    place = browser.tell('(() => { const picture = document.querySelector("figure.chart > svg"); picture.scrollIntoView({block: "center"});'
-                         'const box = picture.getBoundingClientRect(); return {x: box.x + box.width / 2, y: box.y + box.height / 2}; })()')
+    place = browser.tell('(() => { const picture = document.querySelector("figure.chart > svg"); '
+                         'picture.scrollIntoView({block: "center"});const box = '
+                         'picture.getBoundingClientRect(); return {x: box.x + box.width / 2, y: '
+                         'box.y + box.height / 2}; })()')
     browser('Input.dispatchTouchEvent', type='touchStart', touchPoints=[place])
     browser('Input.dispatchTouchEvent', type='touchEnd', touchPoints=[])
     browser('Emulation.setTouchEmulationEnabled', enabled=False)
-    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith('time 41')
+    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith(
+        'time 41')
 
 
 def test_without_its_script_the_page_says_the_same_but_does_not_ask_to_point(browser, whole_path):
@@ -492,7 +552,8 @@ def test_without_its_script_the_page_says_the_same_but_does_not_ask_to_point(bro
         browser.show(whole_path, *SCREENS['phone'])
     finally:
         browser('Emulation.setScriptExecutionDisabled', value=False)
-    assert browser.tell('document.querySelector("h1").innerText').startswith('Simulation and measurement differ')
+    assert browser.tell('document.querySelector("h1").innerText').startswith(
+        'Simulation and measurement differ')
     assert browser.tell('document.querySelectorAll("figure.chart tbody tr").length') > 100
     assert browser.tell('getComputedStyle(document.querySelector(".hint")).display') == 'none'
 
@@ -501,9 +562,12 @@ def test_arrow_keys_read_values_too(browser, whole_path):
     browser.show(whole_path, *SCREENS['desk'])
     browser.tell('document.querySelector("figure.chart > svg").focus()')
     for _ in range(2):
-        browser('Input.dispatchKeyEvent', type='keyDown', key='ArrowRight', code='ArrowRight', windowsVirtualKeyCode=39)
-    first = browser.tell('[...document.querySelectorAll("figure.chart tbody tr")][1].cells[0].textContent')
-    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith(f'time {first} s')
+        browser('Input.dispatchKeyEvent', type='keyDown', key='ArrowRight', code='ArrowRight',
+                windowsVirtualKeyCode=39)
+    first = browser.tell('[...document.querySelectorAll("figure.chart tbody '
+                         'tr")][1].cells[0].textContent')
+    assert browser.tell('document.querySelector("figure.chart .readout").textContent').startswith(
+        f'time {first} s')
 
 
 #: Least contrast of any text and any stroke with its background (WCAG 2, 1.4.3 and 1.4.11).

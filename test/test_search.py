@@ -7,7 +7,8 @@ import pytest
 from diagnosed import diagnosis_of, held
 from hidden import hide
 
-from gyro_calibration.diagnosis.candidates import Candidate, candidates, columns_of, effect, fitted_shapes, with_shape
+from gyro_calibration.diagnosis.candidates import (Candidate, candidates, columns_of, effect,
+                                                   fitted_shapes, with_shape)
 from gyro_calibration.diagnosis.field import Named, field, work
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import replay
@@ -61,7 +62,8 @@ def test_a_set_is_told_beside_a_cause_of_many_values(both):
 def test_the_least_size_that_is_found_counts_the_frequencies(both):
     found = both['interference_tone']
     low, high = found.parameters['interference_tone'].interval
-    assert found.minimum_detectable * 3.92 / (high - low) > math.sqrt(2.0 * (math.log(len(TIME)) + 5.0)) + 1.645
+    assert (found.minimum_detectable * 3.92 / (high - low)
+            > math.sqrt(2.0 * (math.log(len(TIME)) + 5.0)) + 1.645)
 
 
 @pytest.mark.parametrize('cause, added, places', [
@@ -76,9 +78,11 @@ def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, place
 # shapes
 
 @pytest.mark.parametrize('value', [-1e12, 1e12])
-@pytest.mark.parametrize('name', [name for name, each in CATALOGUE.items() if any(shape.default is None for shape in each.shapes)])
+@pytest.mark.parametrize('name', [name for name, each in CATALOGUE.items()
+                                  if any(shape.default is None for shape in each.shapes)])
 def test_a_shape_that_is_fitted_stays_within_what_a_model_may_hold(name, value):
-    candidate = effect(name, *(1.0 if shape.default is None else shape.default for shape in CATALOGUE[name].shapes))
+    candidate = effect(name, *(1.0 if shape.default is None else shape.default
+                               for shape in CATALOGUE[name].shapes))
     for place in fitted_shapes(candidate):
         low, high = CATALOGUE[name].shapes[place].bounds
         assert low <= with_shape(candidate, place, value).shapes[place] <= high
@@ -86,7 +90,8 @@ def test_a_shape_that_is_fitted_stays_within_what_a_model_may_hold(name, value):
 
 def test_a_shape_at_its_bound_has_a_deviation():
     rate = np.sin(0.7 * TIME) * np.sin(0.11 * TIME)
-    whole = field([laid(Log(output=rate + NOISE * np.random.default_rng(0).standard_normal(len(rate)), time=TIME, reference_rate=rate))])
+    whole = field([laid(Log(output=rate + NOISE * np.random.default_rng(
+        0).standard_normal(len(rate)), time=TIME, reference_rate=rate))])
     assert (0, -1) in work(whole, [Named(effect('time_offset', 1.0), (1.0,))]).owner
 
 
@@ -95,20 +100,24 @@ def test_what_a_tone_changes_by_with_its_frequency_is_its_derivative_in_a_long_l
     each = laid(resting(time=time))
     done = work(field([each]), [Named(effect('interference_tone', frequency, run=0), (1.0, 0.0))])
     column = done.columns[done.owner.index((0, -1))] * done.field.deviation
-    phase = Candidate('', (), lambda replayed: (2.0 * np.pi * replayed.channels.time * np.cos(2.0 * np.pi * frequency * time),))
+    phase = Candidate('', (), lambda replayed: (
+        2.0 * np.pi * replayed.channels.time * np.cos(2.0 * np.pi * frequency * time),))
     assert column == pytest.approx(columns_of(phase, [each])[0], abs=0.02 * np.abs(column).max())
 
 
 @pytest.mark.parametrize('name, shape', [('dead_zone', 'dead_zone'), ('bias_step', 'step_time')])
 def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
-    log, = hide([name], 5.0, np.random.default_rng(3), noise='white', duration=600.0, sample_rate=25.0)
+    log, = hide([name], 5.0, np.random.default_rng(3), noise='white', duration=600.0,
+                sample_rate=25.0)
     found = diagnosis_of([log], np.random.default_rng(0))
     finding = next(each for each in found.findings if each.effect == name)
     cause, size = log.truth[name], finding.parameters[shape]
-    truth, deviation = cause.shapes.get(shape, cause.size), (size.interval[1] - size.interval[0]) / 3.92
+    truth, deviation = (cause.shapes.get(shape, cause.size),
+                        (size.interval[1] - size.interval[0]) / 3.92)
     assert 0.0 < abs(size.estimate - truth) + deviation < 5.0 * deviation, size
     assert held([cause], [finding], 4.0) == {name: True}
-    place = [(term.effect.name, value) for term in found.model.terms for value in term.fitted].index((name, 0))
+    place = [(term.effect.name, value) for term in found.model.terms
+             for value in term.fitted].index((name, 0))
     assert math.sqrt(found.model.covariance[place, place]) == pytest.approx(deviation, rel=0.01)
 
 
@@ -120,13 +129,16 @@ def test_a_tone_above_what_is_searched_has_its_own_frequency_and_size():
     assert each.every == 2
     _, named = found_in([each])
     assert [known.candidate.cause for known in named] == ['interference_tone']
-    assert named[0].candidate.shapes[0] == pytest.approx(30.0, abs=1e-3) and math.hypot(*named[0].values) == pytest.approx(1e-3, rel=0.05)
+    assert (named[0].candidate.shapes[0] == pytest.approx(30.0, abs=1e-3)
+            and math.hypot(*named[0].values) == pytest.approx(1e-3, rel=0.05))
 
 
 def test_a_tone_in_one_of_four_logs_is_as_strong_as_it_is_there():
     time = TIME[:2000]
-    _, named = found_in([laid(resting(tone(1e-3 * (run == 2), 3.3, time), time, run)) for run in range(4)])
-    assert [(known.candidate.cause, known.candidate.run) for known in named] == [('interference_tone', 2)]
+    _, named = found_in([laid(resting(tone(1e-3 * (run == 2), 3.3, time), time, run))
+                         for run in range(4)])
+    assert [(known.candidate.cause, known.candidate.run)
+            for known in named] == [('interference_tone', 2)]
     assert math.hypot(*named[0].values) == pytest.approx(1e-3, rel=0.15)
 
 
@@ -135,7 +147,8 @@ def test_a_tone_in_each_log_has_a_phase_in_each():
     logs = [resting(tone(1e-3, 3.3, time, 0.3 + 2.0 * run), time, run) for run in range(3)]
     findings = diagnose(logs, np.random.default_rng(0)).findings
     assert [each.effect for each in findings] == 3 * ['interference_tone']
-    assert sorted(each.parameters['phase'].estimate % (2.0 * math.pi) for each in findings) == pytest.approx([0.3, 2.3, 4.3], abs=0.5)
+    assert sorted(each.parameters['phase'].estimate % (2.0 * math.pi)
+                  for each in findings) == pytest.approx([0.3, 2.3, 4.3], abs=0.5)
 
 
 # where is looked
@@ -147,7 +160,8 @@ def test_a_step_is_found_where_the_kept_samples_begin_late():
     search, named = found_in([laid(resting(6e-4 * (TIME >= 261.0)), LATE)])
     assert [known.candidate.cause for known in named] == ['bias_step']
     assert named[0].candidate.shapes[0] == pytest.approx(261.0, abs=2.0)
-    moments = [each.shapes[0] for each in search.candidates if each.cause in ('bias_step', '~time')]
+    moments = [each.shapes[0]
+               for each in search.candidates if each.cause in ('bias_step', '~time')]
     assert moments and 200.0 < min(moments) < max(moments) < 300.0
 
 
@@ -161,17 +175,21 @@ def test_a_step_is_found_between_the_places_that_are_tried_in_many_logs():
 
 def test_steps_are_looked_for_in_each_of_many_logs():
     each = laid(resting(time=TIME[:2000]))
-    assert {known.run for known in candidates(70 * [each]) if known.cause == 'bias_step'} == set(range(70))
+    assert {known.run
+            for known in candidates(70 * [each]) if known.cause == 'bias_step'} == set(range(70))
 
 
 def test_what_a_log_cannot_show_is_not_searched_for():
     rate = 0.5 - 0.5 * np.cos(0.1 * TIME) * np.sin(0.013 * TIME)
     output = 1.01 * rate + NOISE * np.random.default_rng(0).standard_normal(len(TIME))
-    log = Log(output=output, time=TIME, reference_rate=rate, temperature=25.0 + 0.05 * np.sin(0.03 * TIME))
+    log = Log(output=output, time=TIME, reference_rate=rate,
+              temperature=25.0 + 0.05 * np.sin(0.03 * TIME))
     shown = diagnose([log], np.random.default_rng(0)).cannot_show
-    assert {'bias_temperature', 'scale_factor_temperature', 'thermal_lag'} <= {name for name in shown if 'hardly' in shown[name]}
+    assert {'bias_temperature', 'scale_factor_temperature',
+            'thermal_lag'} <= {name for name in shown if 'hardly' in shown[name]}
     assert 'bias' in shown['scale_factor_asymmetry'] and 'quadratic_nonlinearity' not in shown
     replays = [laid(log)]
     searched_for = {each.cause for each in (*candidates(replays), *probes(replays))}
-    assert not [name for name in searched_for if 'temperature' in name or shown.get(name, '').endswith('changes')]
+    assert not [name for name in searched_for if 'temperature' in name
+                or shown.get(name, '').endswith('changes')]
     assert 'rate_ramp' in {each.cause for each in candidates(replays) if is_named(each)}

@@ -25,5 +25,6 @@ from hidden.outside import OUTSIDE
 from hidden.size import DETECTABLE
 from hidden.twins import TWINS, part, twin
 
-__all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog', 'NoiseFigures', 'OracleGain', 'Session',
-           'Truth', 'described', 'draw_gyro', 'hide', 'oracle_gain', 'part', 'record', 'session', 'twin']
+__all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog',
+           'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'described', 'draw_gyro', 'hide',
+           'oracle_gain', 'part', 'record', 'session', 'twin']

@@ -27,7 +27,8 @@ REFERENCE_SUPPLY = 5.0
 Shapes = dict[str, float]
 
 #: What is a finding only beside a model that says otherwise.
-AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk', 'bias_instability', 'rate_random_walk')
+AGAINST_A_MODEL = ('bias', 'scale_factor_error', 'reference_scale', 'angle_random_walk',
+                   'bias_instability', 'rate_random_walk')
 #: Counted effects, and the number that is just detectable: more than occur by chance.
 COUNTED = {'outliers': 3.0, 'stuck_samples': 3.0, 'dropped_samples': 3.0}
 #: Steps that are sized by the variance that they add, which a test of the variance would just see.
@@ -74,7 +75,8 @@ def _log_uniform(generator: np.random.Generator, low: float, high: float) -> flo
     return math.exp(generator.uniform(math.log(low), math.log(high)))
 
 
-def _column(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[Session, np.ndarray, float, Shapes], np.ndarray]:
+def _column(formula: Callable[[Session, np.ndarray, Shapes], np.ndarray]) -> Callable[[
+        Session, np.ndarray, float, Shapes], np.ndarray]:
     return lambda session, w, size, shapes: size * formula(session, w, shapes)
 
 
@@ -82,7 +84,8 @@ def _phase(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     return {'phase': generator.uniform(-math.pi, math.pi)}
 
 
-def _time_constant(low: float, high: float) -> Callable[[list[Session], np.random.Generator], Shapes]:
+def _time_constant(low: float, high: float) -> Callable[[list[Session], np.random.Generator],
+                                                        Shapes]:
     def draw(sessions: list[Session], generator: np.random.Generator) -> Shapes:
         duration = sessions[0].time[-1]
         return {'time_constant': _log_uniform(generator, low * duration, high * duration)}
@@ -90,7 +93,8 @@ def _time_constant(low: float, high: float) -> Callable[[list[Session], np.rando
 
 
 def _frequency(sessions: list[Session], generator: np.random.Generator) -> Shapes:
-    return {'frequency': _log_uniform(generator, 0.2, 0.45 / sessions[0].interval), **_phase(sessions, generator)}
+    return {'frequency': _log_uniform(generator, 0.2, 0.45 / sessions[0].interval),
+            **_phase(sessions, generator)}
 
 
 def _step_time(sessions: list[Session], generator: np.random.Generator) -> Shapes:
@@ -128,7 +132,8 @@ def _saturation(session: Session, w: np.ndarray, limit: float, shapes: Shapes) -
     return np.clip(w, -limit, limit) - w
 
 
-def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0, bandwidth: float = 0.0) -> np.ndarray:
+def seen(session: Session, time_offset: float = 0.0, clock_rate: float = 0.0,
+         bandwidth: float = 0.0) -> np.ndarray:
     """Return the rate as a delayed and slow gyro with a clock of its own sees it."""
     if not bandwidth:
         return session.motion.rate((1.0 + clock_rate) * session.time - time_offset)
@@ -150,17 +155,20 @@ def _slips(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     candidates = np.flatnonzero(acceleration > np.quantile(acceleration, 0.97))
     times = np.sort(session.time[generator.choice(candidates, generator.integers(1, 4))])
     kept = times[np.concatenate([[True], np.diff(times) > 1.0])]
-    return {'run': run, 'width': generator.uniform(0.05, 0.2), **{f'slip_time_{number}': float(at) for number, at in enumerate(kept)}}
+    return {'run': run, 'width': generator.uniform(0.05, 0.2),
+            **{f'slip_time_{number}': float(at) for number, at in enumerate(kept)}}
 
 
 def _slip(session: Session, shapes: Shapes) -> np.ndarray:
     """Return the rate of slips by 1 rad each, smooth in time, rad/s."""
-    return np.sum([norm.pdf(session.time, at, shapes['width']) for at in _slip_times(shapes)], axis=0)
+    return np.sum([norm.pdf(session.time, at, shapes['width']) for at in _slip_times(shapes)],
+                  axis=0)
 
 
 def slipped(session: Session, shapes: Shapes) -> np.ndarray:
     """Return the integral of the rate of slips by 1 rad each, rad."""
-    return np.sum([norm.cdf(session.time, at, shapes['width']) for at in _slip_times(shapes)], axis=0)
+    return np.sum([norm.cdf(session.time, at, shapes['width']) for at in _slip_times(shapes)],
+                  axis=0)
 
 
 def _slip_times(shapes: Shapes) -> list[float]:
@@ -181,41 +189,60 @@ FORMS: Mapping[str, Form] = {
     'scale_factor_asymmetry': Form(_column(lambda session, w, shapes: np.abs(w)), '1'),
     'quadratic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 2), 's/rad'),
     'cubic_nonlinearity': Form(_column(lambda session, w, shapes: w ** 3), 's²/rad²'),
-    'sine_response': Form(_sine, 's', linear=False, signed=False, most=lambda sessions: 1.5 / top_rate(sessions)),
-    'bias_temperature': Form(_column(lambda session, w, shapes: session.temperature - REFERENCE_TEMPERATURE), 'rad/s/K'),
+    'sine_response': Form(_sine, 's', linear=False, signed=False,
+                          most=lambda sessions: 1.5 / top_rate(sessions)),
+    'bias_temperature': Form(_column(lambda session, w, shapes: session.temperature
+                                     - REFERENCE_TEMPERATURE), 'rad/s/K'),
     'bias_temperature_quadratic': Form(
-        _column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) ** 2), 'rad/s/K²'),
-    'scale_factor_temperature': Form(_column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
-    'bias_temperature_rate': Form(_column(lambda session, w, shapes: temperature_rate(session)), 'rad/s/(K/s)'),
-    'thermal_lag': Form(
-        _column(lambda session, w, shapes: lag(session.temperature, session.interval, shapes['time_constant']) - session.temperature),
-        'rad/s/K', _time_constant(0.03, 0.3)),
+        _column(lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) ** 2),
+        'rad/s/K²'),
+    'scale_factor_temperature': Form(_column(
+        lambda session, w, shapes: (session.temperature - REFERENCE_TEMPERATURE) * w), '1/K'),
+    'bias_temperature_rate': Form(_column(lambda session, w, shapes: temperature_rate(session)),
+                                  'rad/s/(K/s)'),
+    'thermal_lag': Form(_column(lambda session, w, shapes: lag(
+        session.temperature, session.interval, shapes['time_constant']) - session.temperature),
+                        'rad/s/K', _time_constant(0.03, 0.3)),
     'thermal_hysteresis': Form(_column(lambda session, w, shapes: branch(session)), 'rad/s'),
     'warm_up': Form(
-        _column(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])), 'rad/s', _time_constant(0.03, 0.35)),
+        _column(lambda session, w, shapes: np.exp(-session.time / shapes['time_constant'])),
+        'rad/s', _time_constant(0.03, 0.35)),
     'rate_ramp': Form(_column(lambda session, w, shapes: session.time), 'rad/s²'),
     'bias_step': Form(
-        _column(lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float)), 'rad/s', _step_time, once=True),
-    'heading_sensitivity': Form(_column(lambda session, w, shapes: np.sin(session.heading + shapes['phase'])), 'rad/s', _phase),
-    'acceleration_sensitivity': Form(_column(lambda session, w, shapes: session.specific_force), '(rad/s)/(m/s²)'),
-    'vibration_rectification': Form(_column(lambda session, w, shapes: vibration_power(session)), '(rad/s)/(m/s²)²'),
-    'supply_sensitivity': Form(_column(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
-    'interference_tone': Form(
-        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * shapes['frequency'] * session.time + shapes['phase'])),
-        'rad/s', _frequency, signed=False),
-    'bandwidth': Form(_signal('bandwidth'), 's', stage='signal', linear=False, signed=False, most=lambda sessions: 1.0),
-    'time_offset': Form(_signal('time_offset'), 's', stage='signal', linear=False, most=lambda sessions: 0.5),
-    'clock_rate': Form(_signal('clock_rate'), '1', stage='signal', linear=False, most=lambda sessions: 0.01),
-    'dead_zone': Form(_dead_zone, 'rad/s', linear=False, signed=False, most=lambda sessions: 0.3 * top_rate(sessions)),
-    'saturation': Form(_saturation, 'rad/s', stage='output', linear=False, signed=False, most=top_rate),
+        _column(lambda session, w, shapes: (session.time >= shapes['step_time']).astype(float)),
+        'rad/s', _step_time, once=True),
+    'heading_sensitivity': Form(_column(
+        lambda session, w, shapes: np.sin(session.heading + shapes['phase'])), 'rad/s', _phase),
+    'acceleration_sensitivity': Form(_column(lambda session, w, shapes: session.specific_force),
+                                     '(rad/s)/(m/s²)'),
+    'vibration_rectification': Form(_column(lambda session, w, shapes: vibration_power(session)),
+                                    '(rad/s)/(m/s²)²'),
+    'supply_sensitivity': Form(
+        _column(lambda session, w, shapes: session.supply - REFERENCE_SUPPLY), 'rad/s/V'),
+    'interference_tone': Form(_column(lambda session, w, shapes: np.sin(
+        2.0 * math.pi * shapes['frequency'] * session.time + shapes['phase'])),
+                              'rad/s', _frequency, signed=False),
+    'bandwidth': Form(_signal('bandwidth'), 's', stage='signal', linear=False, signed=False,
+                      most=lambda sessions: 1.0),
+    'time_offset': Form(_signal('time_offset'), 's', stage='signal', linear=False,
+                        most=lambda sessions: 0.5),
+    'clock_rate': Form(_signal('clock_rate'), '1', stage='signal', linear=False,
+                       most=lambda sessions: 0.01),
+    'dead_zone': Form(_dead_zone, 'rad/s', linear=False, signed=False,
+                      most=lambda sessions: 0.3 * top_rate(sessions)),
+    'saturation': Form(_saturation, 'rad/s', stage='output', linear=False, signed=False,
+                       most=top_rate),
     'quantization': Form(_samples, 'rad/s', stage='output', signed=False),
     'outliers': Form(_samples, '1', stage='samples', signed=False),
     'stuck_samples': Form(_samples, '1', stage='samples', signed=False),
     'dropped_samples': Form(_samples, '1', stage='samples', signed=False),
     'reference_once_per_rev': Form(
-        lambda session, w, size, shapes: -size * _eccentric(session, shapes), '1', _phase, stage='reference', signed=False),
-    'reference_scale': Form(lambda session, w, size, shapes: -size * session.rate, '1', stage='reference'),
-    'reference_slip': Form(lambda session, w, size, shapes: -size * _slip(session, shapes), 'rad', _slips, stage='reference', once=True),
+        lambda session, w, size, shapes: -size * _eccentric(session, shapes), '1', _phase,
+        stage='reference', signed=False),
+    'reference_scale': Form(lambda session, w, size, shapes: -size * session.rate, '1',
+                            stage='reference'),
+    'reference_slip': Form(lambda session, w, size, shapes: -size * _slip(session, shapes), 'rad',
+                           _slips, stage='reference', once=True),
     'reference_quantization': Form(_samples, 'rad', stage='reference', signed=False),
     'unit_error': Form(_samples, '1', stage='unit', signed=False),
     'angle_random_walk': Form(_samples, 'rad/√s', stage='noise'),
@@ -226,10 +253,11 @@ FORMS: Mapping[str, Form] = {
 
 def errors(form: Form, size: float, shapes: Shapes, sessions: list[Session]) -> list[np.ndarray]:
     """Return the addition of an effect to output less reference of each recording, rad/s."""
-    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run else np.zeros(len(each.time))
-            for run, each in enumerate(sessions)]
+    return [form.error(each, each.rate, size, shapes) if not form.once or shapes['run'] == run
+            else np.zeros(len(each.time)) for run, each in enumerate(sessions)]
 
 
 #: What a wrong unit multiplies the output by; and delays, in samples.
-UNIT_FACTORS = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-1': -1.0, '2': 2.0, '1024/1000': 1.024, '4096/1000': 4.096}
+UNIT_FACTORS = {'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-1': -1.0, '2': 2.0,
+                '1024/1000': 1.024, '4096/1000': 4.096}
 UNIT_DELAYS = {'one sample': 1.0, 'half a sample': 0.5}

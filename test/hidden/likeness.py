@@ -38,7 +38,8 @@ class Likeness:
                 self._groups.append((name, list(range(len(columns), len(columns) + len(group)))))
                 columns += [thinned(each, THIN) for each in group]
         joined = np.column_stack([np.concatenate(each) for each in columns])
-        self._solved = np.column_stack([np.concatenate(self._metric.solve(each)) for each in columns])
+        self._solved = np.column_stack([np.concatenate(self._metric.solve(each))
+                                        for each in columns])
         gram = joined.T @ self._solved
         scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         self._solved, self._gram = self._solved / scale, gram / np.outer(scale, scale)
@@ -50,7 +51,8 @@ class Likeness:
         start = self._explained(along, self._always)
         best: dict[str, float] = {}
         for name, group in self._groups:
-            share = (self._explained(along, self._always + group) - start) / max(total - start, 1e-300)
+            share = (self._explained(along, self._always + group) - start) / max(total - start,
+                                                                                 1e-300)
             best[name] = max(best.get(name, 0.0), min(1.0, share))
         best.pop(without, None)
         return best
@@ -60,7 +62,8 @@ class Likeness:
         total, along = self._measure(hidden)
         start, chosen = self._explained(along, self._always), self._always
         for _ in range(count):
-            chosen = max((chosen + group for _, group in self._groups), key=lambda places: self._explained(along, places))
+            chosen = max((chosen + group for _, group in self._groups),
+                         key=lambda places: self._explained(along, places))
         return (self._explained(along, chosen) - start) / max(total - start, 1e-300)
 
     def _measure(self, hidden: Columns) -> tuple[float, np.ndarray]:
@@ -77,7 +80,8 @@ def _candidates(name: str, sessions: list[Session]) -> Iterator[list[Columns]]:
     """Go through the columns that an effect may have, those that go together side by side."""
     for shapes in _shapes(name, sessions):
         for size in _sizes(name, sessions):
-            phases = [{'phase': 0.0}, {'phase': 0.5 * math.pi}] if name in ('heading_sensitivity', 'reference_once_per_rev') else [{}]
+            phases = ([{'phase': 0.0}, {'phase': 0.5 * math.pi}]
+                      if name in ('heading_sensitivity', 'reference_once_per_rev') else [{}])
             yield [errors(FORMS[name], size, {**shapes, **phase}, sessions) for phase in phases]
 
 
@@ -86,7 +90,8 @@ def _shapes(name: str, sessions: list[Session]) -> Iterator[Shapes]:
     if name in ('thermal_lag', 'warm_up'):
         yield from ({'time_constant': duration * share} for share in np.geomspace(0.01, 2.0, 10))
     elif name == 'bias_step':
-        yield from ({'run': run, 'step_time': duration * share} for run in range(len(sessions)) for share in np.linspace(0.05, 0.95, 37))
+        yield from ({'run': run, 'step_time': duration * share} for run in range(len(sessions))
+                    for share in np.linspace(0.05, 0.95, 37))
     else:
         yield {}
 
@@ -94,6 +99,7 @@ def _shapes(name: str, sessions: list[Session]) -> Iterator[Shapes]:
 def _sizes(name: str, sessions: list[Session]) -> Sequence[float]:
     """Return the sizes at which a column of the effect is taken: one if linear, else several."""
     top = top_rate(sessions)
-    return {'sine_response': [0.1 / top, 0.5 / top, 1.0 / top], 'dead_zone': list(top * np.geomspace(1e-3, 0.2, 8)),
-            'saturation': list(top * np.linspace(0.6, 0.98, 8)), 'time_offset': [1e-4], 'bandwidth': [1e-4, 0.05],
-            'clock_rate': [1e-6]}.get(name, [1.0])
+    return {'sine_response': [0.1 / top, 0.5 / top, 1.0 / top],
+            'dead_zone': list(top * np.geomspace(1e-3, 0.2, 8)),
+            'saturation': list(top * np.linspace(0.6, 0.98, 8)), 'time_offset': [1e-4],
+            'bandwidth': [1e-4, 0.05], 'clock_rate': [1e-6]}.get(name, [1.0])

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hidden.effects import COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN, Form, Shapes, errors, seen, slipped, top_rate
+from hidden.effects import (COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN,
+                            Form, Shapes, errors, seen, slipped, top_rate)
 from hidden.likeness import Likeness
 from hidden.motion import Session, session
 from hidden.noise import NoiseFigures, draw_figures, make
@@ -104,7 +105,8 @@ class Gyro:
 
     def bias_of(self, run: int, generator: np.random.Generator) -> float:
         """Return the bias of one recording, rad/s; a new one for an unplanned recording."""
-        return self.biases[run] if run < len(self.biases) else float(generator.normal(np.mean(self.biases), self.bias_spread))
+        return (self.biases[run] if run < len(self.biases)
+                else float(generator.normal(np.mean(self.biases), self.bias_spread)))
 
     def value(self, name: str) -> float:
         """Return the size of a hidden effect, 0 where it is not hidden."""
@@ -173,8 +175,10 @@ class HiddenLog:
         return Path(path)
 
 
-def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, *, noise: str = 'mixed',
-         reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0, runs: int = 1, encoder_step: float = 0.0,
+def hide(names: Sequence[str], multiple: float | Mapping[str, float],
+         generator: np.random.Generator, *, noise: str = 'mixed',
+         reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0,
+         runs: int = 1, encoder_step: float = 0.0,
          figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None,
          given: Given | None = None, against_a_model: bool = False) -> list[HiddenLog]:
     """
@@ -202,16 +206,18 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float], generator:
     one log a recording
 
     """
-    sessions = [session(generator, duration, sample_rate, **(conditions or {})) for _ in range(runs)]
+    sessions = [session(generator, duration, sample_rate, **(conditions or {}))
+                for _ in range(runs)]
     expected = figures or draw_figures(noise, generator)
-    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step,
-                      given(sessions) if given else {}, ('bias', 'scale') if against_a_model else ())
-    return [record(gyro, each, generator, expected=expected, reference=reference, encoder_step=encoder_step, run=run)
-            for run, each in enumerate(sessions)]
+    gyro = draw_gyro(names, multiple, generator, sessions, expected, encoder_step, given(sessions)
+                     if given else {}, ('bias', 'scale') if against_a_model else ())
+    return [record(gyro, each, generator, expected=expected, reference=reference,
+                   encoder_step=encoder_step, run=run) for run, each in enumerate(sessions)]
 
 
-def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float], generator: np.random.Generator, sessions: list[Session],
-              expected: NoiseFigures, encoder_step: float = 0.0, given: Mapping[str, Shapes] | None = None,
+def draw_gyro(names: Sequence[str], multiple: float | Mapping[str, float],
+              generator: np.random.Generator, sessions: list[Session], expected: NoiseFigures,
+              encoder_step: float = 0.0, given: Mapping[str, Shapes] | None = None,
               known: tuple[str, ...] = ()) -> Gyro:
     """Draw a gyro whose hidden effects have these multiples of the minimum detectable effect."""
     multiples = dict.fromkeys(names, multiple) if not isinstance(multiple, Mapping) else multiple
@@ -245,25 +251,31 @@ class _Sizing:
         """Return an effect's addition to each recording, to the output after bias and scale."""
         if ALL[name].stage != 'output':
             return errors(ALL[name], size, shapes, self.sessions)
-        outputs = [(1.0 + self.gyro.scale_factor_error) * each.rate + bias for each, bias in zip(self.sessions, self.gyro.biases)]
-        return [ALL[name].error(each, output, size, shapes) for each, output in zip(self.sessions, outputs)]
+        outputs = [(1.0 + self.gyro.scale_factor_error) * each.rate + bias
+                   for each, bias in zip(self.sessions, self.gyro.biases)]
+        return [ALL[name].error(each, output, size, shapes)
+                for each, output in zip(self.sessions, outputs)]
 
     def norm(self, name: str, size: float, shapes: Shapes) -> float:
         """Return how many standard deviations an effect is."""
-        of_the_same = {'bias': ('bias',), 'scale_factor_error': ('scale',), 'reference_scale': ('scale',)}.get(name, ())
+        of_the_same = {'bias': ('bias',), 'scale_factor_error': ('scale',),
+                       'reference_scale': ('scale',)}.get(name, ())
         return self.metric.norm(self.errors(name, size, shapes), (*self.known, *of_the_same))
 
 
-def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing, given: Shapes) -> Cause:
+def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing,
+                given: Shapes) -> Cause:
     form, sessions = ALL[name], sizing.sessions
     if name in COUNTED or name in STEPPED or name == 'unit_error':
         return _draw_uncommon(name, multiple, generator, sizing)
     if name in OUTSIDE:
         return _draw_outside(name, multiple, generator, sizing)
-    shapes = {key: value for key, value in given.items() if key not in ('size', 'sign')} or form.shapes(sessions, generator)
+    shapes = ({key: value for key, value in given.items() if key not in ('size', 'sign')}
+              or form.shapes(sessions, generator))
     sign = given.get('sign', float(generator.choice([-1.0, 1.0])) if form.signed else 1.0)
     if 'size' in given:
-        return Cause(name, given['size'], shapes, form.unit, math.nan, sizing.norm(name, given['size'], shapes) / DETECTABLE)
+        return Cause(name, given['size'], shapes, form.unit, math.nan,
+                     sizing.norm(name, given['size'], shapes) / DETECTABLE)
     if form.linear:
         least = DETECTABLE / sizing.norm(name, 1.0, shapes)
         return Cause(name, sign * multiple * least, shapes, form.unit, least, multiple)
@@ -278,7 +290,8 @@ def _draw_cause(name: str, multiple: float, generator: np.random.Generator, sizi
     return Cause(name, sign * size, shapes, form.unit, least, norm(size) / DETECTABLE)
 
 
-def _draw_outside(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing) -> Cause:
+def _draw_outside(name: str, multiple: float, generator: np.random.Generator,
+                  sizing: _Sizing) -> Cause:
     """Draw shapes until no catalogued effect explains much of it, or keep the least explained."""
     form, likeness = OUTSIDE[name], Likeness(sizing.sessions, sizing.gyro.figures)
     drawn = []
@@ -291,17 +304,20 @@ def _draw_outside(name: str, multiple: float, generator: np.random.Generator, si
     share, _, shapes, column = min(drawn, key=lambda each: each[:2])
     least = DETECTABLE / sizing.norm(name, 1.0, shapes)
     size = float(generator.choice([-1.0, 1.0])) * multiple * least
-    return Cause(name, size, shapes, form.unit, least, multiple, likeness=share, likeness_of_three=likeness.together(column))
+    return Cause(name, size, shapes, form.unit, least, multiple, likeness=share,
+                 likeness_of_three=likeness.together(column))
 
 
 def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
     """Solve for the distance of the limit below the largest output; a higher limit shows less."""
-    top = (1.0 + sizing.gyro.scale_factor_error) * top_rate(sizing.sessions) + max(map(abs, sizing.gyro.biases))
+    top = (1.0 + sizing.gyro.scale_factor_error) * top_rate(sizing.sessions) + max(
+        map(abs, sizing.gyro.biases))
     def norm(below: float) -> float:
         return sizing.norm('saturation', top - below, {})
     below = solve_size(norm, DETECTABLE, 1e-3 * top, 0.9 * top)
     further = solve_size(norm, DETECTABLE * multiple, below, 0.9 * top)
-    return Cause('saturation', top - further, {}, FORMS['saturation'].unit, top - below, norm(further) / DETECTABLE)
+    return Cause('saturation', top - further, {}, FORMS['saturation'].unit, top - below,
+                 norm(further) / DETECTABLE)
 
 
 def _apart(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
@@ -312,32 +328,39 @@ def _apart(causes: list[Cause], sizing: _Sizing) -> tuple[Cause, ...]:
     columns = [sizing.errors(cause.name, cause.size, cause.shapes) for cause in shown]
     gram = sizing.metric.gram(columns, sizing.known)
     scale = np.sqrt(np.diag(gram))
-    left = 1.0 / np.sqrt(np.diag(np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12, hermitian=True)))
-    apart = {cause.name: float(length * share) / DETECTABLE for cause, length, share in zip(shown, scale, left)}
+    left = 1.0 / np.sqrt(np.diag(np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-12,
+                                                hermitian=True)))
+    apart = {cause.name: float(length * share) / DETECTABLE
+             for cause, length, share in zip(shown, scale, left)}
     return tuple(replace(cause, apart=apart.get(cause.name, math.nan)) for cause in causes)
 
 
-def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator, sizing: _Sizing) -> Cause:
+def _draw_uncommon(name: str, multiple: float, generator: np.random.Generator,
+                   sizing: _Sizing) -> Cause:
     """Draw what has no column: counted faults, steps, and wrong units."""
     form, interval = FORMS[name], sizing.sessions[0].interval
     if name in COUNTED:
-        return Cause(name, float(max(1, round(COUNTED[name] * multiple))), {}, form.unit, COUNTED[name], multiple)
+        return Cause(name, float(max(1, round(COUNTED[name] * multiple))), {}, form.unit,
+                     COUNTED[name], multiple)
     if name == 'unit_error':
         kind = str(generator.choice([*UNIT_FACTORS, *UNIT_DELAYS]))
         shapes = {'delay': UNIT_DELAYS.get(kind, 0.0) * interval}
         return Cause(name, UNIT_FACTORS.get(kind, 1.0), shapes, form.unit, math.nan, math.nan)
     count = sum(len(each.time) for each in sizing.sessions)
-    extra = DETECTABLE * math.sqrt(2.0 / count) * sizing.gyro.figures.sample_deviation(interval) ** 2
+    extra = (
+        DETECTABLE * math.sqrt(2.0 / count) * sizing.gyro.figures.sample_deviation(interval) ** 2)
     # a step q adds q² / 12 to the variance; differences of headings twice that / interval²
-    least = math.sqrt(12.0 * extra) if name == 'quantization' else math.sqrt(6.0 * extra) * interval
+    least = (math.sqrt(12.0 * extra) if name == 'quantization'
+             else math.sqrt(6.0 * extra) * interval)
     return Cause(name, multiple * least, {}, form.unit, least, multiple)
 
 
-def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sessions: list[Session],
-                expected: NoiseFigures) -> tuple[Cause, NoiseFigures]:
+def _draw_noise(name: str, multiple: float, generator: np.random.Generator,
+                sessions: list[Session], expected: NoiseFigures) -> tuple[Cause, NoiseFigures]:
     """Change a noise figure until the spectrum shows it; white noise up or down, others up."""
     start, sign = getattr(expected, name), 1.0
-    if name == 'angle_random_walk' and multiple * DETECTABLE / math.sqrt(2.0 * len(sessions[0].time)) < 0.5:
+    if name == 'angle_random_walk' and multiple * DETECTABLE / math.sqrt(
+            2.0 * len(sessions[0].time)) < 0.5:
         sign = float(generator.choice([-1.0, 1.0]))
 
     def changed(change: float) -> NoiseFigures:
@@ -345,15 +368,19 @@ def _draw_noise(name: str, multiple: float, generator: np.random.Generator, sess
     guess = 1e-2 * (start or expected.angle_random_walk)
     least = solve_noise(changed, expected, DETECTABLE, sessions, guess)
     change = solve_noise(changed, expected, DETECTABLE * multiple, sessions, least)
-    return Cause(name, start + sign * change, {}, FORMS[name].unit, least, multiple), changed(change)
+    return (Cause(name, start + sign * change, {}, FORMS[name].unit, least, multiple),
+            changed(change))
 
 
-def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expected: NoiseFigures | None = None, reference: str = 'rate',
+def record(gyro: Gyro, each: Session, generator: np.random.Generator, *,
+           expected: NoiseFigures | None = None, reference: str = 'rate',
            encoder_step: float = 0.0, run: int = 0) -> HiddenLog:
     """Record a gyro under a session's conditions, perhaps not those its effects were sized for."""
     bias = gyro.bias_of(run, generator)
-    delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'), 0.0)
-    w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'), gyro.value('bandwidth'))
+    delay = next((cause.shapes['delay'] for cause in gyro.causes if cause.name == 'unit_error'),
+                 0.0)
+    w = seen(each, gyro.value('time_offset') + delay, gyro.value('clock_rate'),
+             gyro.value('bandwidth'))
     prediction = w + _sum(gyro, each, w, bias, run)
     white, slow = make(gyro.figures, len(w), each.interval, generator)
     output, wanted = _finish(gyro, prediction + white + slow), _finish(gyro, prediction)
@@ -362,8 +389,9 @@ def record(gyro: Gyro, each: Session, generator: np.random.Generator, *, expecte
     columns |= _reference_columns(gyro, reference_rate, reference_heading, reference, encoder_step)
     columns, good, kept = _faults(gyro, columns, generator, each)
     rows = np.flatnonzero(kept)
-    truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error, _expected(gyro, bias, expected),
-                  each.rate[rows], each.heading[rows], (prediction - each.rate)[rows], reference_rate[rows], (white + slow)[rows],
+    truth = Truth(gyro, tuple(cause.name for cause in gyro.causes), bias, gyro.scale_factor_error,
+                  _expected(gyro, bias, expected), each.rate[rows], each.heading[rows],
+                  (prediction - each.rate)[rows], reference_rate[rows], (white + slow)[rows],
                   wanted[rows], good[rows])
     return HiddenLog(columns, truth, each)
 
@@ -397,7 +425,8 @@ def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndar
         if cause.name == 'reference_scale':
             heading = heading + cause.size * each.heading
         form = ALL[cause.name]
-        if form.stage == 'reference' and cause.name not in STEPPED and not (form.once and cause.shapes['run'] != run):
+        if form.stage == 'reference' and cause.name not in STEPPED and not (
+                form.once and cause.shapes['run'] != run):
             wrong = -form.error(each, each.rate, cause.size, cause.shapes)
             rate = rate + wrong
             if cause.name == 'reference_slip':
@@ -405,7 +434,8 @@ def _reference(gyro: Gyro, each: Session, run: int) -> tuple[np.ndarray, np.ndar
     return rate, heading
 
 
-def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: str, encoder_step: float) -> dict[str, np.ndarray]:
+def _reference_columns(gyro: Gyro, rate: np.ndarray, heading: np.ndarray, kind: str,
+                       encoder_step: float) -> dict[str, np.ndarray]:
     step = gyro.value('reference_quantization') or encoder_step
     if step:
         return {'reference_heading_rad': np.round(heading / step) * step}
@@ -438,7 +468,8 @@ def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Gen
     good, kept = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
     if gyro.has('outliers'):
         rows = generator.choice(count, int(gyro.value('outliers')), replace=False)
-        size = gyro.figures.sample_deviation(each.interval) * generator.uniform(10.0, 40.0, len(rows))
+        size = gyro.figures.sample_deviation(each.interval) * generator.uniform(10.0, 40.0,
+                                                                                len(rows))
         output[rows] += size * generator.choice([-1.0, 1.0], len(rows))
         good[rows] = False
     if gyro.has('stuck_samples'):
@@ -452,10 +483,12 @@ def _faults(gyro: Gyro, columns: dict[str, np.ndarray], generator: np.random.Gen
     return {name: column[kept] for name, column in columns.items()}, good, kept
 
 
-def _turning_rows(each: Session, count: int, generator: np.random.Generator, apart: int = 25) -> list[int]:
+def _turning_rows(each: Session, count: int, generator: np.random.Generator,
+                  apart: int = 25) -> list[int]:
     """Choose rows while it turns, not in the first or last seconds, and not close together."""
     margin = round(2.0 / each.interval)
-    rows = generator.permutation(margin + np.flatnonzero(np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max()))
+    rows = generator.permutation(margin + np.flatnonzero(
+        np.abs(each.rate[margin:-margin]) > 0.02 * np.abs(each.rate).max()))
     chosen: list[int] = []
     for row in rows:
         if len(chosen) < count and all(abs(row - other) > apart for other in chosen):
@@ -466,5 +499,6 @@ def _turning_rows(each: Session, count: int, generator: np.random.Generator, apa
 def _expected(gyro: Gyro, bias: float, expected: NoiseFigures | None) -> dict[str, float]:
     """Return what a model says that knows all but what is hidden."""
     figures = expected or gyro.figures
-    return {'bias': bias, 'scale_factor_error': gyro.scale_factor_error, 'angle_random_walk': figures.angle_random_walk,
+    return {'bias': bias, 'scale_factor_error': gyro.scale_factor_error,
+            'angle_random_walk': figures.angle_random_walk,
             'bias_instability': figures.floor, 'rate_random_walk': figures.rate_random_walk}

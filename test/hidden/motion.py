@@ -63,8 +63,9 @@ class Session:
         return self.tilt_force + self.vibration
 
 
-def session(generator: np.random.Generator, duration: float = 900.0, sample_rate: float = 50.0, motion: str = 'rich',
-            temperature: str = 'rich', supply: str = 'rich', force: str = 'rich', top_rate: float | None = None) -> Session:
+def session(generator: np.random.Generator, duration: float = 900.0, sample_rate: float = 50.0,
+            motion: str = 'rich', temperature: str = 'rich', supply: str = 'rich',
+            force: str = 'rich', top_rate: float | None = None) -> Session:
     """
     Draw a recording.
 
@@ -89,21 +90,24 @@ def session(generator: np.random.Generator, duration: float = 900.0, sample_rate
     return assemble(generator, time, turning, degc, supply, force)
 
 
-def described(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray, temperature: np.ndarray | None = None,
+def described(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray,
+              temperature: np.ndarray | None = None,
               supply: str = 'rich', force: str = 'rich') -> Session:
     """Make a recording of a given motion and temperature at evenly spaced times."""
     knots = np.interp(np.arange(time[0], time[-1] + KNOT, KNOT), time, rate)
-    degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0], 5.0)
+    degc = np.full(len(time), 25.0) if temperature is None else lag(temperature, time[1] - time[0],
+                                                                    5.0)
     return assemble(generator, time - time[0], spline(knots), degc, supply, force)
 
 
-def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion, temperature: np.ndarray, supply: str, force: str) -> Session:
+def assemble(generator: np.random.Generator, time: np.ndarray, motion: Motion,
+             temperature: np.ndarray, supply: str, force: str) -> Session:
     """Add supply, tilt and vibration to a motion and a temperature."""
     rate = motion.rate(time)
     moving = gaussian_filter1d((np.abs(rate) > 1e-9).astype(float), 0.25 / time[1]) > 1e-3
     tilt_force, vibration = FORCES[force](generator, time, rate)
-    return Session(motion, time, rate, motion.heading(time), temperature, SUPPLIES[supply](generator, time, temperature),
-                   tilt_force, vibration, moving)
+    return Session(motion, time, rate, motion.heading(time), temperature,
+                   SUPPLIES[supply](generator, time, temperature), tilt_force, vibration, moving)
 
 
 def spline(knots: np.ndarray) -> Motion:
@@ -115,7 +119,8 @@ def spline(knots: np.ndarray) -> Motion:
     heading = rate.antiderivative()
     first, last = places[3], places[-4]
     start = heading(0.0)
-    return Motion(lambda time: rate(np.clip(time, first, last)), lambda time: heading(np.clip(time, first, last)) - start)
+    return Motion(lambda time: rate(np.clip(time, first, last)),
+                  lambda time: heading(np.clip(time, first, last)) - start)
 
 
 def _rich(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
@@ -143,11 +148,13 @@ def _length(generator: np.random.Generator, low: float, high: float) -> int:
 
 def _speed(generator: np.random.Generator, top: float) -> float:
     """Draw a speed with a sign, as often slow as fast."""
-    fast = generator.uniform(0.3, 1.0) if generator.random() < 0.5 else np.exp(generator.uniform(np.log(0.01), np.log(0.5)))
+    fast = (generator.uniform(0.3, 1.0) if generator.random() < 0.5
+            else np.exp(generator.uniform(np.log(0.01), np.log(0.5))))
     return float(generator.choice([-1.0, 1.0]) * top * fast)
 
 
-def _rest(generator: np.random.Generator, top: float, low: float = 3.0, high: float = 12.0) -> np.ndarray:
+def _rest(generator: np.random.Generator, top: float, low: float = 3.0,
+          high: float = 12.0) -> np.ndarray:
     return np.zeros(_length(generator, low, high))
 
 
@@ -157,7 +164,8 @@ def _turn(generator: np.random.Generator, top: float) -> np.ndarray:
 
 def _staircase(generator: np.random.Generator, top: float) -> np.ndarray:
     """Several speeds one after another, both ways."""
-    return np.concatenate([np.full(_length(generator, 1.5, 4.0), _speed(generator, top)) for _ in range(6)])
+    return np.concatenate([np.full(_length(generator, 1.5, 4.0), _speed(generator, top))
+                           for _ in range(6)])
 
 
 def _ramp(generator: np.random.Generator, top: float) -> np.ndarray:
@@ -178,12 +186,14 @@ def _reversals(generator: np.random.Generator, top: float) -> np.ndarray:
 
 def _swing(generator: np.random.Generator, top: float) -> np.ndarray:
     time = KNOT * np.arange(_length(generator, 8.0, 20.0))
-    return generator.uniform(0.2, 1.0) * top * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
+    return generator.uniform(0.2,
+                             1.0) * top * np.sin(2.0 * np.pi * generator.uniform(0.1, 1.0) * time)
 
 
 def _wander(generator: np.random.Generator, top: float) -> np.ndarray:
     """Random motion, as by hand."""
-    shape = gaussian_filter1d(generator.standard_normal(_length(generator, 10.0, 20.0)), generator.uniform(0.3, 1.0) / KNOT)
+    shape = gaussian_filter1d(generator.standard_normal(_length(generator, 10.0, 20.0)),
+                              generator.uniform(0.3, 1.0) / KNOT)
     return generator.uniform(0.5, 1.0) * top * shape / np.abs(shape).max()
 
 
@@ -194,7 +204,8 @@ def _eighths(generator: np.random.Generator, top: float) -> np.ndarray:
     return np.tile(np.concatenate([move, np.zeros(_length(generator, 1.0, 2.5))]), 8)
 
 
-PIECES = {'rest': _rest, 'turn': _turn, 'staircase': _staircase, 'ramp': _ramp, 'slow_sweep': _slow_sweep, 'reversals': _reversals,
+PIECES = {'rest': _rest, 'turn': _turn, 'staircase': _staircase, 'ramp': _ramp,
+          'slow_sweep': _slow_sweep, 'reversals': _reversals,
           'swing': _swing, 'wander': _wander, 'eighths': _eighths}
 
 
@@ -207,9 +218,11 @@ def _two_way(generator: np.random.Generator, duration: float, top: float) -> np.
     pieces, length = [], 0
     while length < duration / KNOT:
         for sign in (1.0, -1.0):
-            pieces += [_rest(generator, top, 20.0, 40.0), np.full(_length(generator, 30.0, 60.0), sign * top)]
+            pieces += [_rest(generator, top, 20.0, 40.0),
+                       np.full(_length(generator, 30.0, 60.0), sign * top)]
         length = sum(len(piece) for piece in pieces)
-    return gaussian_filter1d(np.concatenate([*pieces[:-1], _rest(generator, top)])[:round(duration / KNOT)], 2.0)
+    return gaussian_filter1d(
+        np.concatenate([*pieces[:-1], _rest(generator, top)])[:round(duration / KNOT)], 2.0)
 
 
 def _slow(generator: np.random.Generator, duration: float, top: float) -> np.ndarray:
@@ -223,10 +236,12 @@ def _smooth(generator: np.random.Generator, duration: float, top: float) -> np.n
     return top * shape / np.abs(shape).max() * edge * edge[::-1]
 
 
-MOTIONS = {'rich': _rich, 'one_speed': _one_speed, 'two_way': _two_way, 'slow': _slow, 'smooth': _smooth}
+MOTIONS = {'rich': _rich, 'one_speed': _one_speed, 'two_way': _two_way, 'slow': _slow,
+           'smooth': _smooth}
 
 
-def _chamber(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray, degc: np.ndarray) -> np.ndarray:
+def _chamber(generator: np.random.Generator, time: np.ndarray, corners: np.ndarray,
+             degc: np.ndarray) -> np.ndarray:
     """Follow a plan of straight lines with the lag of a heat capacity."""
     return lag(np.interp(time, corners, degc), time[1] - time[0], generator.uniform(15.0, 40.0))
 
@@ -236,7 +251,8 @@ def _warm_up_and_cycles(generator: np.random.Generator, time: np.ndarray) -> np.
     half_cycles = generator.integers(3, 7)
     inner = np.sort(generator.uniform(0.1, 0.95, half_cycles)) * time[-1]
     corners = np.concatenate([[0.0], inner, [1.3 * time[-1]]])
-    swing = generator.uniform(3.0, 12.0, len(corners)) * (-1.0) ** np.arange(len(corners)) * generator.choice([-1.0, 1.0])
+    swing = generator.uniform(3.0, 12.0, len(corners)) * (-1.0) ** np.arange(
+        len(corners)) * generator.choice([-1.0, 1.0])
     warm_up = generator.uniform(0.0, 8.0) * -np.exp(-time / generator.uniform(60.0, 250.0))
     return generator.uniform(18.0, 35.0) + warm_up + _chamber(generator, time, corners, swing)
 
@@ -246,7 +262,8 @@ def _one_ramp(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
 
 
 def _cold_start(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    return generator.uniform(30.0, 40.0) - generator.uniform(8.0, 15.0) * np.exp(-time / (0.2 * time[-1]))
+    return generator.uniform(30.0, 40.0) - generator.uniform(8.0, 15.0) * np.exp(
+        -time / (0.2 * time[-1]))
 
 
 def _triangle(generator: np.random.Generator, time: np.ndarray) -> np.ndarray:
@@ -269,38 +286,47 @@ def _constant_temperature(generator: np.random.Generator, time: np.ndarray) -> n
     return np.full(len(time), generator.uniform(20.0, 30.0))
 
 
-TEMPERATURES = {'rich': _warm_up_and_cycles, 'ramp': _one_ramp, 'cold_start': _cold_start, 'triangle': _triangle,
-                'triangles': _triangles, 'smooth': _smooth_temperature, 'constant': _constant_temperature}
+TEMPERATURES = {'rich': _warm_up_and_cycles, 'ramp': _one_ramp, 'cold_start': _cold_start,
+                'triangle': _triangle, 'triangles': _triangles, 'smooth': _smooth_temperature,
+                'constant': _constant_temperature}
 
 
-def _steps_and_wander(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+def _steps_and_wander(generator: np.random.Generator, time: np.ndarray,
+                      temperature: np.ndarray) -> np.ndarray:
     """Draw a supply that is switched between levels some times, and wanders by some millivolts."""
     interval = time[1] - time[0]
     edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(12, 25)))
     levels = generator.uniform(-0.25, 0.25, len(edges) + 1)
     wander = gaussian_filter1d(generator.standard_normal(len(time)), 20.0 / interval)
-    return generator.choice([3.3, 5.0]) + lag(levels[np.searchsorted(edges, time)], interval, 0.2) + 0.01 * wander / np.std(wander)
+    return generator.choice([3.3, 5.0]) + lag(levels[np.searchsorted(edges, time)], interval,
+                                              0.2) + 0.01 * wander / np.std(wander)
 
 
-def _heating_supply(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+def _heating_supply(generator: np.random.Generator, time: np.ndarray,
+                    temperature: np.ndarray) -> np.ndarray:
     return 5.0 + 0.02 * (temperature - 25.0)
 
 
-def _constant_supply(generator: np.random.Generator, time: np.ndarray, temperature: np.ndarray) -> np.ndarray:
+def _constant_supply(generator: np.random.Generator, time: np.ndarray,
+                     temperature: np.ndarray) -> np.ndarray:
     return np.full(len(time), 5.0)
 
 
 SUPPLIES = {'rich': _steps_and_wander, 'heating': _heating_supply, 'constant': _constant_supply}
 
 
-def _rich_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rich_force(generator: np.random.Generator, time: np.ndarray,
+                rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tilt slowly between poses, and vibrate while a motor runs, at rest and in motion."""
     edges = np.sort(generator.uniform(0.0, time[-1], generator.integers(8, 15)))
     poses = generator.uniform(-0.7 * np.pi, 0.7 * np.pi, len(edges) + 1)
-    angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 8.0), time[1] - time[0], 8.0)
+    angle = lag(lag(poses[np.searchsorted(edges, time)], time[1] - time[0], 8.0),
+                time[1] - time[0], 8.0)
     starts = np.sort(generator.uniform(0.0, time[-1], generator.integers(10, 25)))
-    levels = generator.choice([0.0, 1.0], len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
-    return GRAVITY * np.cos(angle), _vibration(generator, time, levels[np.searchsorted(starts, time)])
+    levels = generator.choice([0.0, 1.0],
+                              len(starts) + 1) * generator.uniform(0.3, 2.0, len(starts) + 1)
+    return GRAVITY * np.cos(angle), _vibration(generator, time,
+                                               levels[np.searchsorted(starts, time)])
 
 
 def _vibration(generator: np.random.Generator, time: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -308,17 +334,22 @@ def _vibration(generator: np.random.Generator, time: np.ndarray, level: np.ndarr
     return generator.standard_normal(len(time)) * lag(level, time[1] - time[0], 0.2)
 
 
-def _one_pose(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _one_pose(generator: np.random.Generator, time: np.ndarray,
+              rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.full(len(time), GRAVITY), np.zeros(len(time))
 
 
-def _turning_force(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _turning_force(generator: np.random.Generator, time: np.ndarray,
+                   rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shake in proportion to the square root of the speed, so that power is as the speed."""
-    return np.full(len(time), GRAVITY), generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate))
+    return (np.full(len(time), GRAVITY),
+            generator.choice([-1.0, 1.0], len(time)) * np.sqrt(np.abs(rate)))
 
 
-def _off_axis(generator: np.random.Generator, time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _off_axis(generator: np.random.Generator, time: np.ndarray,
+              rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return GRAVITY + 0.15 * rate ** 2, np.zeros(len(time))
 
 
-FORCES = {'rich': _rich_force, 'one_pose': _one_pose, 'turning': _turning_force, 'off_axis': _off_axis}
+FORCES = {'rich': _rich_force, 'one_pose': _one_pose, 'turning': _turning_force,
+          'off_axis': _off_axis}

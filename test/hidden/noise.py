@@ -70,11 +70,14 @@ def draw_figures(kind: str, generator: np.random.Generator) -> NoiseFigures:
         raise ValueError(f'no noise {kind!r}; wanted one of {", ".join(KINDS)}')
     white = math.exp(generator.uniform(math.log(5e-6), math.log(5e-4)))
     crossing = np.exp(generator.uniform(math.log(20.0), math.log(300.0), 3))
-    figures = NoiseFigures(
-        white, white / math.sqrt(crossing[0]) / 0.664, math.sqrt(3.0) * white / crossing[1],
-        white / math.sqrt(crossing[2]) * generator.uniform(1.0, 2.5), math.exp(generator.uniform(math.log(5.0), math.log(150.0))))
-    absent = {'white': ('bias_instability', 'rate_random_walk', 'correlated'), 'walk': ('bias_instability', 'correlated'),
-              'flicker': ('rate_random_walk', 'correlated'), 'gauss_markov': ('bias_instability', 'rate_random_walk'),
+    figures = NoiseFigures(white, white / math.sqrt(crossing[0]) / 0.664,
+                           math.sqrt(3.0) * white / crossing[1],
+                           white / math.sqrt(crossing[2]) * generator.uniform(1.0, 2.5),
+                           math.exp(generator.uniform(math.log(5.0), math.log(150.0))))
+    absent = {'white': ('bias_instability', 'rate_random_walk', 'correlated'),
+              'walk': ('bias_instability', 'correlated'),
+              'flicker': ('rate_random_walk', 'correlated'),
+              'gauss_markov': ('bias_instability', 'rate_random_walk'),
               'mixed': ('bias_instability',) if generator.random() < 0.5 else ()}[kind]
     return replace(figures, **dict.fromkeys(absent, 0.0))
 
@@ -100,16 +103,19 @@ def processes(figures: NoiseFigures, count: int, interval: float) -> list[Markov
         # processes of variance v per factor e of the time constant have the spectrum v / (2 f)
         each = figures.bias_instability * math.sqrt(math.log(STEP_OF_LADDER) / math.pi)
         rungs = math.ceil(math.log(16.0 * count) / math.log(STEP_OF_LADDER))
-        found += [_stationary(each, 0.5 * interval * STEP_OF_LADDER ** rung, interval) for rung in range(rungs)]
+        found += [_stationary(each, 0.5 * interval * STEP_OF_LADDER ** rung, interval)
+                  for rung in range(rungs)]
     return found
 
 
 def _stationary(deviation: float, time_constant: float, interval: float) -> Markov:
     factor = math.exp(-interval / time_constant)
-    return Markov(factor, deviation * math.sqrt(-math.expm1(-2.0 * interval / time_constant)), deviation)
+    return Markov(factor, deviation * math.sqrt(-math.expm1(-2.0 * interval / time_constant)),
+                  deviation)
 
 
-def make(figures: NoiseFigures, count: int, interval: float, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def make(figures: NoiseFigures, count: int, interval: float,
+         generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the white part and the slow part of noise, rad/s."""
     white = figures.sample_deviation(interval) * generator.standard_normal(count)
     slow = np.zeros(count)
@@ -131,13 +137,15 @@ class Whitening:
 
     """
 
-    def __init__(self, figures: NoiseFigures, count: int, interval: float, encoder_step: float = 0.0):
+    def __init__(self, figures: NoiseFigures, count: int, interval: float,
+                 encoder_step: float = 0.0):
         self._variance = figures.sample_deviation(interval) ** 2
         slow = processes(figures, count, interval)
         self._slow, self._encoder = len(slow), encoder_step > 0.0
         self._states, self._count, self._interval = len(slow) + self._encoder, count, interval
         if self._states:
-            self._factor = cholesky_banded(self._precision(slow, encoder_step), overwrite_ab=True, check_finite=False)
+            self._factor = cholesky_banded(self._precision(slow, encoder_step), overwrite_ab=True,
+                                           check_finite=False)
 
     def _precision(self, slow: list[Markov], encoder_step: float) -> np.ndarray:
         """Return P + H' H / v, upper banded, the states of one sample side by side."""
@@ -177,7 +185,8 @@ class Whitening:
         if self._encoder:
             seen[1:, -1] -= signal[1:] / self._interval
             seen[:-1, -1] += signal[1:] / self._interval
-        states = cho_solve_banded((self._factor, False), seen.ravel(), check_finite=False).reshape(self._count, self._states)
+        states = cho_solve_banded((self._factor, False), seen.ravel(),
+                                  check_finite=False).reshape(self._count, self._states)
         explained = states[:, :self._slow].sum(axis=1)
         if self._encoder:
             explained[1:] -= np.diff(states[:, -1]) / self._interval
@@ -189,11 +198,13 @@ def spectrum(figures: NoiseFigures, count: int, interval: float) -> np.ndarray:
     angle = math.pi * np.arange(1, count) / count
     total = np.full(count - 1, figures.sample_deviation(interval) ** 2)
     for process in processes(figures, count, interval):
-        total += process.innovation ** 2 / (1.0 - 2.0 * process.factor * np.cos(angle) + process.factor ** 2)
+        total += process.innovation ** 2 / (1.0 - 2.0 * process.factor * np.cos(angle)
+                                            + process.factor ** 2)
     return total
 
 
-def divergence(figures: NoiseFigures, expected: NoiseFigures, count: int, interval: float) -> float:
+def divergence(figures: NoiseFigures, expected: NoiseFigures, count: int,
+               interval: float) -> float:
     """
     Return the distance of a noise from another, in standard deviations.
 

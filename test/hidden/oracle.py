@@ -29,7 +29,8 @@ class OracleGain:
         return 1.0 - self.heading_after / self.heading_before
 
 
-def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None), window: float = 60.0) -> OracleGain:
+def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None),
+                window: float = 60.0) -> OracleGain:
     """
     Return what the gyro's model gains by all that is hidden, known exactly.
 
@@ -44,8 +45,10 @@ def oracle_gain(log: HiddenLog, rows: slice | np.ndarray = slice(None), window: 
     output, good = log.columns['gyro_rad_s'], truth.good
     design = np.column_stack([np.ones_like(output), truth.reference])
     simple = design @ np.linalg.lstsq(design[good], output[good], rcond=None)[0]
-    before, after = (np.where(good, output - each, 0.0)[rows] for each in (simple, truth.prediction))
-    return OracleGain(_rms(before), _rms(after), *(_rms(_over_windows(time, each, window)) for each in (before, after)))
+    before, after = (np.where(good, output - each, 0.0)[rows]
+                     for each in (simple, truth.prediction))
+    return OracleGain(_rms(before), _rms(after),
+                      *(_rms(_over_windows(time, each, window)) for each in (before, after)))
 
 
 def _rms(values: np.ndarray) -> float:

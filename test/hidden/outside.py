@@ -23,12 +23,14 @@ def _temperature_wave(sessions: list[Session], generator: np.random.Generator) -
 def _pulse(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     run = int(generator.integers(len(sessions)))
     duration = float(sessions[run].time[-1])
-    return {'run': run, 'pulse_time': generator.uniform(0.15, 0.85) * duration, 'width': duration * generator.uniform(0.01, 0.03)}
+    return {'run': run, 'pulse_time': generator.uniform(0.15, 0.85) * duration,
+            'width': duration * generator.uniform(0.01, 0.03)}
 
 
 def _telegraph(sessions: list[Session], generator: np.random.Generator) -> Shapes:
     """Draw the moments at which a bias jumps to its other value and back."""
-    times = np.sort(generator.uniform(0.05, 0.95, generator.integers(12, 25)) * sessions[0].time[-1])
+    times = np.sort(generator.uniform(0.05, 0.95,
+                                      generator.integers(12, 25)) * sessions[0].time[-1])
     return {f'jump_time_{number}': float(at) for number, at in enumerate(times)}
 
 
@@ -37,7 +39,9 @@ def _two_levels(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
 
 
 def _harmonic(number: int) -> Form:
-    return Form(_column(lambda session, w, shapes: np.sin(number * session.heading + shapes['phase'])), 'rad/s', _phase)
+    return Form(
+        _column(lambda session, w, shapes: np.sin(number * session.heading + shapes['phase'])),
+        'rad/s', _phase)
 
 
 def _warm_heading(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndarray:
@@ -54,32 +58,32 @@ def _supply_parabola(session: Session, w: np.ndarray, shapes: Shapes) -> np.ndar
 
 
 OUTSIDE: Mapping[str, Form] = {
-    'second_harmonic_of_heading': _harmonic(2),
-    'third_harmonic_of_heading': _harmonic(3),
-    'gear_of_heading': _harmonic(7),
-    'wave_over_rate': Form(
-        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes['period'] + shapes['phase'])), 'rad/s',
-        lambda sessions, generator: {'period': top_rate(sessions) / generator.uniform(3.0, 6.0), **_phase(sessions, generator)}),
-    'resonance_at_a_speed': Form(
-        _column(_resonance), 'rad/s',
-        lambda sessions, generator: {'speed': top_rate(sessions) * generator.uniform(0.2, 0.8),
-                                     'width': top_rate(sessions) * generator.uniform(0.03, 0.1)}),
-    'wave_over_temperature': Form(
-        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase'])),
-        'rad/s', _temperature_wave),
+    'second_harmonic_of_heading': _harmonic(2), 'third_harmonic_of_heading': _harmonic(3),
+    'gear_of_heading': _harmonic(7), 'wave_over_rate': Form(
+        _column(lambda session, w, shapes: np.sin(2.0 * math.pi * w / shapes['period']
+                                                  + shapes['phase'])), 'rad/s',
+        lambda sessions, generator: {'period': top_rate(sessions) / generator.uniform(3.0, 6.0),
+                                     **_phase(sessions, generator)}),
+    'resonance_at_a_speed': Form(_column(_resonance), 'rad/s', lambda sessions, generator: {
+        'speed': top_rate(sessions) * generator.uniform(0.2, 0.8),
+        'width': top_rate(sessions) * generator.uniform(0.03, 0.1)}),
+    'wave_over_temperature': Form(_column(lambda session, w, shapes: np.sin(
+        2.0 * math.pi * session.temperature / shapes['period'] + shapes['phase'])),
+                                  'rad/s', _temperature_wave),
     'temperature_times_heading': Form(
-        _column(_warm_heading), 'rad/s/K',
-        lambda sessions, generator: {'middle': _middle([session.temperature for session in sessions]), **_phase(sessions, generator)}),
-    'bias_pulse': Form(
-        _column(lambda session, w, shapes: np.exp(-0.5 * ((session.time - shapes['pulse_time']) / shapes['width']) ** 2)),
-        'rad/s', _pulse, once=True),
+        _column(_warm_heading), 'rad/s/K', lambda sessions, generator: {'middle': _middle(
+            [session.temperature for session in sessions]), **_phase(sessions, generator)}),
+    'bias_pulse': Form(_column(lambda session, w, shapes: np.exp(
+        -0.5 * ((session.time - shapes['pulse_time']) / shapes['width']) ** 2)),
+                       'rad/s', _pulse, once=True),
     'telegraph': Form(_column(_two_levels), 'rad/s', _telegraph),
-    'supply_parabola': Form(
-        _column(_supply_parabola), 'rad/s/V²',
-        lambda sessions, generator: {'middle': float(np.quantile(sessions[0].supply, generator.uniform(0.35, 0.65)))}),
+    'supply_parabola': Form(_column(_supply_parabola), 'rad/s/V²', lambda sessions, generator: {
+        'middle': float(np.quantile(sessions[0].supply, generator.uniform(0.35, 0.65)))}),
     'supply_times_rate': Form(
         _column(lambda session, w, shapes: (session.supply - shapes['middle']) * w), '1/V',
         lambda sessions, generator: {'middle': _middle([session.supply for session in sessions])}),
-    'force_times_rate': Form(_column(lambda session, w, shapes: (session.tilt_force - shapes['middle']) * w), '1/(m/s²)',
-                             lambda sessions, generator: {'middle': _middle([session.tilt_force for session in sessions])}),
+    'force_times_rate': Form(
+        _column(lambda session, w, shapes: (session.tilt_force - shapes['middle']) * w),
+        '1/(m/s²)', lambda sessions, generator: {
+            'middle': _middle([session.tilt_force for session in sessions])}),
 }

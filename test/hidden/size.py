@@ -40,10 +40,13 @@ class Metric:
 
     """
 
-    def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0, thin: int = 1):
+    def __init__(self, sessions: list[Session], figures: NoiseFigures, encoder_step: float = 0.0,
+                 thin: int = 1):
         self._thin = thin
-        self._whitenings = [Whitening(figures, len(each.time) // thin, each.interval * thin, encoder_step) for each in sessions]
-        self.nuisances = {f'bias {run}': [np.full(len(each.time), float(run == number)) for number, each in enumerate(sessions)]
+        self._whitenings = [Whitening(figures, len(each.time) // thin, each.interval * thin,
+                                      encoder_step) for each in sessions]
+        self.nuisances = {f'bias {run}': [np.full(len(each.time), float(run == number))
+                                          for number, each in enumerate(sessions)]
                           for run in range(len(sessions))}
         self.nuisances['scale'] = [each.rate for each in sessions]
         self.nuisances = {name: thinned(columns, thin) for name, columns in self.nuisances.items()}
@@ -62,7 +65,8 @@ class Metric:
         if not names:
             return full
         beside = np.array([[_inner(self.nuisances[name], b) for b in solved] for name in names])
-        among = np.array([[_inner(self.nuisances[a], self._solved[b]) for b in names] for a in names])
+        among = np.array([[_inner(self.nuisances[a], self._solved[b]) for b in names]
+                          for a in names])
         scale = np.sqrt(np.diag(among))
         beside, among = beside / scale[:, None], among / np.outer(scale, scale)
         return full - beside.T @ np.linalg.pinv(among, rcond=1e-12, hermitian=True) @ beside
@@ -74,7 +78,8 @@ class Metric:
 
 def thinned(columns: Columns, factor: int) -> Columns:
     """Return means of so many samples each."""
-    return columns if factor == 1 else [column[:len(column) // factor * factor].reshape(-1, factor).mean(axis=1) for column in columns]
+    return columns if factor == 1 else [column[:len(column) // factor * factor].reshape(
+        -1, factor).mean(axis=1) for column in columns]
 
 
 def _inner(a: Columns, b: Columns) -> float:
@@ -98,7 +103,8 @@ def solve_size(norm: Callable[[float], float], wanted: float, first: float, most
     return quick if quick is not None else _by_brackets(norm, wanted, guess, most)
 
 
-def _by_powers(norm: Callable[[float], float], wanted: float, size: float, most: float) -> float | None:
+def _by_powers(norm: Callable[[float], float], wanted: float, size: float,
+               most: float) -> float | None:
     """Go along a power of the size, the first for most effects; None if the norm is not smooth."""
     value, power = norm(size), 1.0
     for _ in range(6):
@@ -110,12 +116,14 @@ def _by_powers(norm: Callable[[float], float], wanted: float, size: float, most:
         if further == size:
             return size
         farther = norm(further)
-        power = float(np.clip(math.log((farther + 1e-300) / value) / math.log(further / size), 0.5, 4.0))
+        power = float(np.clip(math.log((farther + 1e-300) / value) / math.log(further / size), 0.5,
+                              4.0))
         size, value = further, farther
     return None
 
 
-def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float, most: float) -> float:
+def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float,
+                 most: float) -> float:
     low = high = guess
     while norm(high) < wanted:
         if high >= most:
@@ -125,13 +133,15 @@ def _by_brackets(norm: Callable[[float], float], wanted: float, guess: float, mo
         low, high = 0.3 * low, low
     # a little wider, as an end may by chance be the answer
     low, high = math.log(low) - 1e-3, math.log(high) + 1e-3
-    return math.exp(brentq(lambda size: math.log(norm(math.exp(size)) / wanted + 1e-9), low, high, xtol=3e-3, rtol=1e-6))
+    return math.exp(brentq(lambda size: math.log(norm(math.exp(size)) / wanted + 1e-9), low, high,
+                           xtol=3e-3, rtol=1e-6))
 
 
-def solve_noise(changed: Callable[[float], NoiseFigures], expected: NoiseFigures, wanted: float, sessions: list[Session],
-                first: float) -> float:
+def solve_noise(changed: Callable[[float], NoiseFigures], expected: NoiseFigures, wanted: float,
+                sessions: list[Session], first: float) -> float:
     """Return the change of a noise figure that all recordings together detect at so many sigma."""
     def norm(change: float) -> float:
-        each = [divergence(changed(change), expected, len(session.time), session.interval) for session in sessions]
+        each = [divergence(changed(change), expected, len(session.time), session.interval)
+                for session in sessions]
         return math.sqrt(sum(value ** 2 for value in each))
     return solve_size(norm, wanted, first, math.inf)

@@ -48,7 +48,8 @@ def _very_slowly(sessions: list[Session]) -> Mapping[str, Shapes]:
 
 
 def _at_the_turn(sessions: list[Session]) -> Mapping[str, Shapes]:
-    return {'bias_step': {'run': 0, 'step_time': float(sessions[0].time[np.argmax(sessions[0].temperature)])}}
+    return {'bias_step': {
+        'run': 0, 'step_time': float(sessions[0].time[np.argmax(sessions[0].temperature)])}}
 
 
 def _quickly(sessions: list[Session]) -> Mapping[str, Shapes]:
@@ -68,24 +69,29 @@ TWINS: Mapping[tuple[str, str], Twins] = {
     ('bias_temperature', 'warm_up'): Twins({'temperature': 'cold_start'}, {}, _as_the_cold_start),
     ('warm_up', 'rate_ramp'): Twins({}, {}, _very_slowly, longer=4.0),
     ('heading_sensitivity', 'reference_once_per_rev'): Twins({'motion': 'one_speed'}, {}),
-    ('scale_factor_asymmetry', 'quadratic_nonlinearity'): Twins({'motion': 'two_way'}, {}, multiple=8.0, longer=2.0),
-    ('scale_factor_asymmetry', 'vibration_rectification'): Twins({'motion': 'two_way', 'force': 'turning'}, {}),
+    ('scale_factor_asymmetry', 'quadratic_nonlinearity'): Twins({'motion': 'two_way'}, {},
+                                                                multiple=8.0, longer=2.0),
+    ('scale_factor_asymmetry',
+     'vibration_rectification'): Twins({'motion': 'two_way', 'force': 'turning'}, {}),
     ('quadratic_nonlinearity', 'acceleration_sensitivity'): Twins({'force': 'off_axis'}, {}),
-    ('cubic_nonlinearity', 'sine_response'): Twins(
-        {'motion': 'slow'}, {'top_rate': 3.0}, _as_a_sine, figures=NoiseFigures(2e-5)),
-    ('time_offset', 'bandwidth'): Twins(
-        {'motion': 'smooth', 'top_rate': 2.0}, {'top_rate': 3.0}, _late, multiple=20.0, figures=NoiseFigures(5e-4)),
-    ('bias_temperature_rate', 'thermal_lag'): Twins({'temperature': 'smooth'}, {'temperature': 'triangles'}, _quickly),
+    ('cubic_nonlinearity', 'sine_response'): Twins({'motion': 'slow'}, {'top_rate': 3.0},
+                                                   _as_a_sine, figures=NoiseFigures(2e-5)),
+    ('time_offset', 'bandwidth'): Twins({'motion': 'smooth', 'top_rate': 2.0}, {'top_rate': 3.0},
+                                        _late, multiple=20.0, figures=NoiseFigures(5e-4)),
+    ('bias_temperature_rate', 'thermal_lag'): Twins({'temperature': 'smooth'},
+                                                    {'temperature': 'triangles'}, _quickly),
     ('bias_temperature_rate', 'thermal_hysteresis'): Twins({'temperature': 'triangles'}, {}),
     ('bias_step', 'thermal_hysteresis'): Twins({'temperature': 'triangle'}, {}, _at_the_turn),
     ('bias_step', 'bias_temperature_rate'): Twins({'temperature': 'triangle'}, {}, _at_the_turn),
     ('bias_temperature', 'supply_sensitivity'): Twins({'supply': 'heating'}, {}),
-    ('bias', 'acceleration_sensitivity'): Twins({'force': 'one_pose'}, {}, multiple=8.0, against_a_model=True),
+    ('bias', 'acceleration_sensitivity'): Twins({'force': 'one_pose'}, {}, multiple=8.0,
+                                                against_a_model=True),
     ('scale_factor_error', 'reference_scale'): Twins({}, None, against_a_model=True),
 }
 
 
-def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *, multiple: float | None = None, noise: str = 'white',
+def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *,
+         multiple: float | None = None, noise: str = 'white',
          duration: float = 900.0, sample_rate: float = 50.0) -> HiddenLog:
     """
     Hide one of a pair where it cannot be told from the other.
@@ -101,8 +107,9 @@ def twin(pair: tuple[str, str], hidden: str, generator: np.random.Generator, *, 
 
     """
     twins = TWINS[pair]
-    return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration, sample_rate=sample_rate,
-                figures=twins.figures, conditions=twins.alike, given=twins.given, against_a_model=twins.against_a_model)[0]
+    return hide([hidden], multiple or twins.multiple, generator, noise=noise, duration=duration,
+                sample_rate=sample_rate, figures=twins.figures, conditions=twins.alike,
+                given=twins.given, against_a_model=twins.against_a_model)[0]
 
 
 def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) -> HiddenLog:
@@ -118,4 +125,6 @@ def part(pair: tuple[str, str], log: HiddenLog, generator: np.random.Generator) 
     if twins.apart is None:
         raise ValueError(f'{pair[0]} and {pair[1]} are parted by another reference alone')
     duration = twins.longer * len(first.time) * first.interval
-    return record(log.truth.gyro, session(generator, duration, 1.0 / first.interval, **twins.apart), generator, run=1)
+    return record(log.truth.gyro,
+                  session(generator, duration, 1.0 / first.interval, **twins.apart), generator,
+                  run=1)
