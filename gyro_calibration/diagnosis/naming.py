@@ -23,23 +23,27 @@ _DEVIATIONS = 1.96
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
 
 
-def named_finding(search: Search, found: Outcome, place: int, p_value: float, rivals: Sequence[Named], separate_by: str) -> Finding:
+def named_finding(search: Search, found: Outcome, place: int, p_value: float,
+                  rivals: Sequence[Named], separate_by: str) -> Finding:
     """Return what is said of a named cause."""
     candidate = found.named[place].candidate
     cause = CAUSES[candidate.cause]
     parameters = _parameters(found, place)
-    twins = tuple(dict.fromkeys(each.candidate.cause for each in rivals if each.candidate.cause != candidate.cause))
+    twins = tuple(dict.fromkeys(each.candidate.cause for each in rivals
+                                if each.candidate.cause != candidate.cause))
     unit = _unit(candidate.cause, parameters, found)
     size = next(iter(parameters.values()))
     half = 0.5 * (size.interval[1] - size.interval[0]) / _DEVIATIONS
-    return Finding(candidate.cause, cause.sentence, parameters, p_value, _detectable(search, found.named[place], half), (*twins, *unit),
-                   separate_by or (cause.separate_by if twins or unit else ''), _evidence(size, half, candidate.run, len(found.replays)),
-                   cause.along)
+    return Finding(candidate.cause, cause.sentence, parameters, p_value,
+                   _detectable(search, found.named[place], half), (*twins, *unit),
+                   separate_by or (cause.separate_by if twins or unit else ''),
+                   _evidence(size, half, candidate.run, len(found.replays)), cause.along)
 
 
 def _evidence(size: Estimate, half: float, run: int | None, logs: int) -> str:
     where = '' if run is None or logs == 1 else f'in log {run + 1}, '
-    return f'{where}the estimate is {abs(size.estimate) / half:.3g} standard deviations from nothing' if half > 0.0 else ''
+    return (f'{where}the estimate is {abs(size.estimate) / half:.3g} standard deviations from '
+            'nothing' if half > 0.0 else '')
 
 
 def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tuple[str, ...]:
@@ -48,13 +52,16 @@ def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tupl
         return ()
     offset = parameters[name]
     deviation = (offset.interval[1] - offset.interval[0]) / (2.0 * _DEVIATIONS)
-    return ('unit_error',) if unit_of_offset(offset.estimate, deviation, found.replays[0].interval) else ()
+    return (('unit_error',)
+            if unit_of_offset(offset.estimate, deviation, found.replays[0].interval) else ())
 
 
 def _detectable(search: Search, known: Named, deviation: float) -> float | None:
-    """Return what would be found with the power that is asked for: half its square is evidence beyond chance and price."""
+    """Return the smallest size that is found with the power asked for; None without a deviation."""
     needed = search.chance.threshold(known.candidate.cause, search.rate) + price_of_freedom(known)
-    return float(np.sqrt(2.0 * max(needed, 0.0)) + norm.isf(1.0 - _POWER)) * deviation if deviation > 0.0 else None
+    # Half the square of a size in standard deviations is its evidence.
+    return (float(np.sqrt(2.0 * max(needed, 0.0)) + norm.isf(1.0 - _POWER)) * deviation
+            if deviation > 0.0 else None)
 
 
 def _parameters(found: Outcome, place: int) -> dict[str, Estimate]:
@@ -62,17 +69,21 @@ def _parameters(found: Outcome, place: int) -> dict[str, Estimate]:
     candidate = found.named[place].candidate
     coefficients, shapes = found.coefficients(place), found.shapes(place)
     name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
-    names = _SHAPES.get(name, ()) if effect is None else tuple(parameter.name for parameter in effect.shapes + effect.coefficients)
-    unit = effect.coefficients[0].unit if effect is not None and effect.coefficients else CAUSES[name].units.get(name, '1')
+    names = (_SHAPES.get(name, ()) if effect is None
+             else tuple(parameter.name for parameter in effect.shapes + effect.coefficients))
+    unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
+            else CAUSES[name].units.get(name, '1'))
     parameters = {}
     if len(coefficients) == 2 and name != 'reference_slip':
         parameters = _as_phase(found, place, name, coefficients, unit)
     elif coefficients:
         parameters = {name: _estimate(coefficients[0], unit)}
     for number, value in shapes.items():
-        parameters[names[number] if parameters else name] = _estimate(value, 's' if effect is None else effect.parameters[number].unit)
+        parameters[names[number] if parameters else name] = _estimate(
+            value, 's' if effect is None else effect.parameters[number].unit)
     if name == 'reference_slip':
-        parameters.update({names[1 + number]: Estimate(at, (at, at), 's') for number, at in enumerate(candidate.shapes[1:])})
+        parameters.update({names[1 + number]: Estimate(at, (at, at), 's')
+                           for number, at in enumerate(candidate.shapes[1:])})
     return parameters
 
 
@@ -81,11 +92,13 @@ def _estimate(value: Value, unit: str) -> Estimate:
     return Estimate(value.value, (value.value - half, value.value + half), unit)
 
 
-def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Value], unit: str) -> dict[str, Estimate]:
-    """Return amplitude and phase of ``sine sin + cosine cos``, with the intervals that their covariance gives."""
+def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Value],
+              unit: str) -> dict[str, Estimate]:
+    """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
     sine, cosine = (value.value for value in coefficients)
     amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
-    ranks = [rank for rank in (found.place(place, number) for number in range(2)) if rank is not None]
+    ranks = [rank for rank in (found.place(place, number) for number in range(2))
+             if rank is not None]
     covariance = found.covariance[np.ix_(ranks, ranks)]
     turn = np.array([[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]])
     deviation = np.sqrt(np.diag(turn @ covariance @ turn.T))
@@ -94,17 +107,21 @@ def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Valu
 
 
 def unexplained(search: Search, found: Outcome, unnamed: Sequence[Named]) -> list[Unexplained]:
-    """Return the structures without a name, with the part of the variance that the named causes leave, which each would explain."""
+    """Return the structures without a name, with the part that each explains of what is left."""
     everything = (*found.named, *unnamed)
     variables: dict[str, list[int]] = {}
     for place, known in enumerate(unnamed):
-        name = CAUSES[known.candidate.cause].along if is_named(known.candidate) else along(known.candidate)
+        name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
+                else along(known.candidate))
         variables.setdefault(name, []).append(len(found.named) + place)
     least, most = _variance(search, found, everything), _variance(search, found, found.named)
     told = []
     for name, places in variables.items():
-        without = _variance(search, found, [known for place, known in enumerate(everything) if place not in places])
-        chance = min(search.chance.p_value(everything[place].candidate.cause, evidence_of(search, everything, place)) for place in places)
+        without = _variance(search, found, [known for place, known in enumerate(everything)
+                                            if place not in places])
+        chance = min(search.chance.p_value(everything[place].candidate.cause,
+                                           evidence_of(search, everything, place))
+                     for place in places)
         told.append(Unexplained(name, max(without - least, 0.0) / most, chance))
     return told
 
@@ -112,4 +129,5 @@ def unexplained(search: Search, found: Outcome, unnamed: Sequence[Named]) -> lis
 def _variance(search: Search, found: Outcome, named: Sequence[Named]) -> float:
     """Return the variance of what some causes leave, on the points that are searched."""
     left = Outcome(work(search.field, named), found.replays)
-    return float(np.var(joined([each.on_grid(rest - bias) for each, rest, bias in zip(found.replays, left.residuals, left.biases)])))
+    return float(np.var(joined([each.on_grid(rest - bias) for each, rest, bias
+                                in zip(found.replays, left.residuals, left.biases)])))

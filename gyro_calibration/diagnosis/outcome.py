@@ -1,4 +1,4 @@
-"""What a search found, in values: those of the gyro's effects, of bias and scale, and what they leave."""
+"""Values that a search found: those of effects, of bias and scale, and what they leave."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from gyro_calibration.diagnosis.candidates import fitted_shapes
-from gyro_calibration.diagnosis.field import Named, Work, deviation_of_leaping, is_of_the_rate, leaping_shapes, seen
+from gyro_calibration.diagnosis.field import (Named, Work, deviation_of_leaping, is_of_the_rate,
+                                              leaping_shapes, seen)
 from gyro_calibration.diagnosis.probes import is_named
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.log import Array
@@ -51,26 +52,30 @@ class Outcome:
 
     @cached_property
     def _leaping(self) -> dict[tuple[int, int], float]:
-        """Return the standard deviations of the shapes whose columns leap, by cause and place as in `place`."""
+        """Return standard deviations of shapes whose columns leap, by cause and place."""
         return {(place, -1 - shape): deviation_of_leaping(self.work, place, shape)
-                for place, known in enumerate(self.named) for shape in leaping_shapes(known.candidate)}
+                for place, known in enumerate(self.named)
+                for shape in leaping_shapes(known.candidate)}
 
     def place(self, cause: int, number: int) -> int | None:
-        """Return the place of a value among the estimates: of a column (from 0 on) or, as -1 less its place, of a shape."""
+        """Return the place of a value among the estimates: column from 0, or shape below 0."""
         ranks = [*self.work.owner, *self._leaping]
         return ranks.index((cause, number)) if (cause, number) in ranks else None
 
     @property
     def covariance(self) -> Array:
         """Return that of all estimates."""
-        return np.asarray(block_diag(self._estimates[2], np.diag(np.square(list(self._leaping.values())))))
+        return np.asarray(block_diag(self._estimates[2],
+                                     np.diag(np.square(list(self._leaping.values())))))
 
     def _value(self, cause: int, number: int, known: float | None = None) -> Value:
         ranks, values, covariance = self._estimates
         place = ranks.get((cause, number))
         if place is None:
-            return Value(0.0, 0.0) if known is None else Value(known, self._leaping.get((cause, number), 0.0))
-        return Value(float(values[place]) if known is None else known, float(np.sqrt(max(covariance[place, place], 0.0))))
+            return (Value(0.0, 0.0) if known is None
+                    else Value(known, self._leaping.get((cause, number), 0.0)))
+        return Value(float(values[place]) if known is None else known,
+                     float(np.sqrt(max(covariance[place, place], 0.0))))
 
     @property
     def scale_factor_error(self) -> Value:
@@ -87,31 +92,36 @@ class Outcome:
     def shapes(self, cause: int) -> dict[int, Value]:
         """Return the fitted shapes of a cause, by their places."""
         candidate = self.named[cause].candidate
-        return {place: self._value(cause, -1 - place, candidate.shapes[place]) for place in fitted_shapes(candidate)}
+        return {place: self._value(cause, -1 - place, candidate.shapes[place])
+                for place in fitted_shapes(candidate)}
 
     @cached_property
     def explained(self) -> list[Array]:
-        """Return what the causes and the scale add to the output of each log, less its bias, rad/s, shape (n,)."""
+        """Return what causes and scale add to each log's output, less bias, rad/s, shape (n,)."""
         return [self.explains(each, run) for run, each in enumerate(self.replays)]
 
     def explains(self, each: Replay, run: int, gyro_only: bool = False) -> Array:
         """Return what the causes and the scale add to the output of a log."""
         new = seen(each, self.named)
-        total = (new.channels.rate - each.channels.rate) + self.scale_factor_error.value * new.channels.rate
+        total = ((new.channels.rate - each.channels.rate)
+                 + self.scale_factor_error.value * new.channels.rate)
         for place, known in enumerate(self.named):
             candidate = known.candidate
             if is_of_the_rate(candidate.cause) or (candidate.run not in (None, run)):
                 continue
             if gyro_only and (not is_named(candidate) or candidate.cause.startswith('reference')):
                 continue
-            values = [candidate.amplitude] if candidate.amplitude is not None else [one.value for one in self.coefficients(place)]
-            total = total + sum(value * column for value, column in zip(values, candidate.columns(new)))
+            values = ([candidate.amplitude] if candidate.amplitude is not None
+                      else [one.value for one in self.coefficients(place)])
+            total = total + sum(value * column
+                                for value, column in zip(values, candidate.columns(new)))
         return total
 
     @cached_property
     def residuals(self) -> list[Array]:
         """Return what is left of each log, its bias too, rad/s, shape (n,)."""
-        return [each.channels.output - each.reference - added for each, added in zip(self.replays, self.explained)]
+        return [each.channels.output - each.reference - added
+                for each, added in zip(self.replays, self.explained)]
 
     @cached_property
     def biases(self) -> list[float]:
@@ -120,16 +130,17 @@ class Outcome:
 
     @cached_property
     def bias_variance(self) -> float:
-        """Return the variance of the mean of the biases by what is open of the other values, (rad/s)²."""
+        """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
         means = np.array([self._mean_change(place, number) for place, number in self.work.owner])
         return float(means @ self._estimates[2] @ means)
 
     def _mean_change(self, cause: int, number: int) -> float:
-        """Return by what one value more of a cause, or of the scale, lowers the mean of the biases."""
+        """Return by what one more of a cause's value, or of the scale, lowers the mean bias."""
         if cause < 0:
             parts = [seen(each, self.named).channels.rate for each in self.replays]
         elif number >= 0:
-            parts = [self.named[cause].candidate.columns(seen(each, self.named))[number] for each in self.replays]
+            parts = [self.named[cause].candidate.columns(seen(each, self.named))[number]
+                     for each in self.replays]
         else:
             return 0.0
         return float(np.mean([part[each.kept].mean() for part, each in zip(parts, self.replays)]))

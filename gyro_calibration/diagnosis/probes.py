@@ -1,7 +1,8 @@
 """
 Structure without a name: families of functions of each variable, of two of them, and of time.
 
-They compete with the causes. Where one of them is clearly better than every cause, the cause is none that is known here.
+They compete with the causes. Where one of them is clearly better than every cause, the cause is
+none that is known here.
 
 """
 
@@ -50,11 +51,13 @@ def probes(replays: Sequence[Replay]) -> list[Candidate]:
         found += [*_of_rate(variables['rate']), *_of_heading(variables)]
     for first, second in combinations(variables, 2):
         if (first, second) != ('rate', 'temperature'):  # their product has a name
-            found.append(_probe(f'{first} and {second}', _product(variables[first], variables[second])))
+            found.append(_probe(f'{first} and {second}',
+                                _product(variables[first], variables[second])))
     return [*found, *_of_time(replays)]
 
 
-def _probe(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None, *shapes: float) -> Candidate:
+def _probe(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None,
+           *shapes: float) -> Candidate:
     return Candidate(UNNAMED + name, shapes, columns, run)
 
 
@@ -154,7 +157,8 @@ def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for run, each in enumerate(replays):
         begin = float(each.channels.time[each.kept][0])
         for width in BUMPS:
-            for moment in begin + each.duration * np.linspace(0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
+            for moment in begin + each.duration * np.linspace(
+                    0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
                 yield _probe('time', _bump(moment, width * each.duration), run, moment)
 
 

@@ -1,16 +1,16 @@
 """
 Headings over spans: the change of a reference regressed on what the gyro integrates to.
 
-The reference errs, and its errors are larger than those of the gyro over seconds. So the heading of
-the reference is observed, and all columns are integrals of what the gyro says: nothing of the
+The reference errs, and its errors are larger than those of the gyro over seconds. So the heading
+of the reference is observed, and all columns are integrals of what the gyro says: nothing of the
 reference is a regressor. With the output ``y``, the rate ``w`` that the values so far make of it,
-and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi`` of the reference is, at
-points ``t`` and less a constant::
+and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi`` of the reference is,
+at points ``t`` and less a constant::
 
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
-with ``J`` the integrals. A point is the mean over some samples; the observations are the differences
-between points, so that a gap of the reference is a long span that the gyro bridges.
+with ``J`` the integrals. A point is the mean over some samples; the observations are the
+differences between points, so that a gap of the reference is a long span that the gyro bridges.
 
 """
 
@@ -36,7 +36,7 @@ from gyro_calibration.noise_grid import GridFit, SharedNoise, heading_noise, noi
 #: Names and prior standard deviations of the values that every model has: what gyros on wheels are
 #: sold with (scale 1 %, bias 1 deg/s), and delays of references (1 s).
 PLAIN = {'scale_factor_error': 0.01, 'bias': DEGREE, 'time_offset': 1.0}
-#: Length of a span, s, and most spans of a log; stretches whose scores are taken as independent, s.
+#: Length of a span, s; most spans of a log; stretches whose scores count as independent, s.
 SPAN, MOST_SPANS, STRETCH = 1.0, 400, 15.0
 #: Evidence of fewer stretches establishes nothing.
 FEWEST_STRETCHES = 3.0
@@ -46,7 +46,7 @@ _WILDEST = 10.0
 _NOT = 1e-6
 #: Delays of a reference that are tried first, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
-#: Angle random walk that gyros on wheels have at most, rad/√s (1.7 deg/√h): samples may vibrate more.
+#: Angle random walk of gyros on wheels at most, rad/√s (1.7 deg/√h): samples may vibrate more.
 _WALK = 5e-4
 #: Cosines of a bias that wanders, and the bias instability that gyros on wheels have, rad/s (up to
 #: 40 deg/h).
