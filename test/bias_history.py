@@ -1,4 +1,4 @@
-"""Gyros of known truth over days: what their rests show, and how right a table of them is; for the tests and `benchmarks/bias_table.py`."""
+"""Gyros of known truth over days: what their rests show, and errors of a bias table of them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -19,7 +19,8 @@ WHITE = NOISE.angle_random_walk ** 2 / 10.0
 MODEL = GyroModel(noise=NOISE)
 #: Standard deviation of the bias of a calibration, rad/s.
 OWN = 0.011 * DEGREE
-CALIBRATION = SelfCalibration(0.01, 1.0 * DEGREE, ((1e-6, 1e-8), (1e-8, OWN ** 2)), '2026-01-01T00:00:00+00:00', 20.0, 'likelihood')
+CALIBRATION = SelfCalibration(0.01, 1.0 * DEGREE, ((1e-6, 1e-8), (1e-8, OWN ** 2)),
+                              '2026-01-01T00:00:00+00:00', 20.0, 'likelihood')
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,9 @@ def linear(generator, size=1.0):
 
 
 def cubic(generator, size=1.0):
-    """Return a bias over temperature whose slope is a parabola; over 0 to 50 degC the slope varies as the prior has it."""
-    first, second, third = generator.normal(0.0, size * Prior().coefficient / np.sqrt(3.0) * np.array([1.0, np.sqrt(3.0), np.sqrt(5.0)]))
+    """Return a bias over temperature whose slope is a parabola of the size of the prior."""
+    first, second, third = generator.normal(0.0, size * Prior().coefficient / np.sqrt(3.0)
+                                            * np.array([1.0, np.sqrt(3.0), np.sqrt(5.0)]))
 
     def curve(temperature):
         x = (temperature - 25.0) / 25.0
@@ -63,12 +65,14 @@ def cubic(generator, size=1.0):
     return curve
 
 
-def simulate(generator, curve, runs=6, rests=30, turn_on=None, outliers=0.02, jump=0.0, noise=NOISE, prior=None):
+def simulate(generator, curve, runs=6, rests=30, turn_on=None, outliers=0.02, jump=0.0,
+             noise=NOISE, prior=None):
     """
     Return runs of a gyro on as many days.
 
-    Each begins between 10 and 25 degC and warms up by 3 to 20 K. Flicker, random walk and ageing go on between the runs; the bias turns on
-    anew each day. An outlier is off by 0.1 to 1 deg/s. A jump comes early in the middle run, and stays.
+    Each begins between 10 and 25 degC and warms up by 3 to 20 K. Flicker, random walk and ageing
+    go on between the runs; the bias turns on anew each day. An outlier is off by 0.1 to 1 deg/s.
+    A jump comes early in the middle run, and stays.
 
     """
     prior = prior or Prior()
@@ -76,21 +80,28 @@ def simulate(generator, curve, runs=6, rests=30, turn_on=None, outliers=0.02, ju
     day = 86400.0
     time = day * np.arange(runs)[:, None] + STEP * np.arange(rests) + 36000.0
     begin, rise = generator.uniform(10.0, 25.0, (runs, 1)), generator.uniform(3.0, 20.0, (runs, 1))
-    temperature = begin + rise * (1.0 - np.exp(-STEP * np.arange(rests) / generator.uniform(300.0, 1200.0, (runs, 1))))
-    drift = simulate_noise(Noise(0.0, noise.bias_instability, noise.rate_random_walk), int(runs * day / 10.0), 10.0, generator)
+    temperature = begin + rise * (
+        1.0 - np.exp(-STEP * np.arange(rests) / generator.uniform(300.0, 1200.0, (runs, 1))))
+    drift = simulate_noise(Noise(0.0, noise.bias_instability, noise.rate_random_walk),
+                           int(runs * day / 10.0), 10.0, generator)
     ageing = np.cumsum(generator.normal(0.0, prior.ageing * np.sqrt(1.0 / 365.25), runs))[:, None]
     steps = jump * (np.arange(runs * rests).reshape(runs, rests) >= runs // 2 * rests + rests // 6)
-    bias = (curve(temperature) + generator.normal(0.0, turn_on, (runs, 1)) + drift[(time / 10.0).astype(int) % len(drift)] + ageing + steps
+    bias = (curve(temperature) + generator.normal(0.0, turn_on, (runs, 1))
+            + drift[(time / 10.0).astype(int) % len(drift)] + ageing + steps
             + generator.normal(0.0, 1.0 * DEGREE))
     outlier = generator.random((runs, rests)) < outliers
-    off = generator.choice([-1.0, 1.0], (runs, rests)) * generator.uniform(0.1, 1.0, (runs, rests)) * DEGREE
-    estimate = bias + generator.normal(0.0, np.sqrt(noise.angle_random_walk ** 2 / 10.0), (runs, rests)) + outlier * off
+    off = (generator.choice([-1.0, 1.0], (runs, rests))
+           * generator.uniform(0.1, 1.0, (runs, rests)) * DEGREE)
+    estimate = (
+        bias + generator.normal(0.0, np.sqrt(noise.angle_random_walk ** 2 / 10.0), (runs, rests))
+        + outlier * off)
     return History(time, temperature, bias, curve, estimate, outlier)
 
 
 def learn(table, history, run, rests=slice(None)):
     """Give a table what the rests of a run showed, and return what it said."""
-    rows = zip(history.temperature[run, rests], history.estimate[run, rests], history.time[run, rests])
+    rows = zip(history.temperature[run, rests], history.estimate[run, rests],
+               history.time[run, rests])
     return [table.add(temperature, bias, WHITE, time) for temperature, bias, time in rows]
 
 
@@ -106,12 +117,13 @@ def learned(history, runs, model=MODEL):
 
 def answers(generator, curve, runs=5, rests=12, **given):
     """
-    Ask a table at the begin of each run and in its middle, up to 8 K away from the temperature there.
+    Ask a table at the begin of each run, and in its middle up to 8 K from the temperature there.
 
     Returns
     -------
-    shape (runs, 10): error and standard deviation of the bias at the begin, of the bias in the middle, of the difference; how large that
-    was, rad/s; then the number of outliers, of those held back, and of good estimates held back
+    shape (runs, 10): error and standard deviation of the bias at the begin, of the bias in the
+    middle, of the difference; the true difference, rad/s; then the number of outliers, of those
+    held back, and of good estimates held back
 
     """
     history, table, rows = simulate(generator, curve, runs, rests, **given), BiasTable(MODEL), []
@@ -120,7 +132,8 @@ def answers(generator, curve, runs=5, rests=12, **given):
         at_begin = _predicted(table, history, run, 0, 0.0)
         said = learn(table, history, run, slice(0, rests // 2))
         middle = _middle(table, history, run, rests // 2, generator.uniform(-8.0, 8.0))
-        said = np.array([bool(text) for text in said + learn(table, history, run, slice(rests // 2, None))])
+        said = np.array(
+            [bool(text) for text in said + learn(table, history, run, slice(rests // 2, None))])
         outlier = history.outlier[run]
         rows.append([*at_begin, *middle, outlier.sum(), said[outlier].sum(), said[~outlier].sum()])
     return np.array(rows)
@@ -130,14 +143,16 @@ def _predicted(table, history, run, rest, further):
     """Return what a prediction is off, rad/s, and its standard deviation."""
     temperature, time = history.temperature[run, rest], history.time[run, rest]
     bias, variance = table.predict(temperature + further, time)
-    return bias - history.bias[run, rest] - history.curve(temperature + further) + history.curve(temperature), math.sqrt(variance)
+    return (bias - history.bias[run, rest] - history.curve(temperature + further)
+            + history.curve(temperature), math.sqrt(variance))
 
 
 def _middle(table, history, run, rest, further):
     temperature, time = history.temperature[run, rest], history.time[run, rest]
     change = history.curve(temperature + further) - history.curve(temperature)
     difference, variance = table.difference(temperature, temperature + further, time)
-    return *_predicted(table, history, run, rest, further), difference - change, math.sqrt(variance), change
+    return (*_predicted(table, history, run, rest, further), difference - change,
+            math.sqrt(variance), change)
 
 
 def carried_answers(generator, curve, runs=4, rests=12, **given):
@@ -146,15 +161,18 @@ def carried_answers(generator, curve, runs=4, rests=12, **given):
 
     Returns
     -------
-    error and standard deviation of the bias, rad/s: without a table, and with one of the runs between, shape (2, 2)
+    error and standard deviation of the bias, rad/s: without a table, and with one of the runs
+    between, shape (2, 2)
 
     """
     history = simulate(generator, curve, runs, rests, **given)
     run, made = int(generator.integers(1, runs)), int(generator.integers(0, rests))
-    calibration = replace(CALIBRATION, bias=history.bias[0, made] + generator.normal(0.0, OWN), temperature=history.temperature[0, made])
+    calibration = replace(CALIBRATION, bias=history.bias[0, made] + generator.normal(0.0, OWN),
+                          temperature=history.temperature[0, made])
     time, rows = history.time[run, 0], []
     for table in (BiasTable(MODEL), learned(history, run)):
-        now = carry(calibration, table, time - history.time[0, made], time, history.temperature[run, 0]).calibration
+        now = carry(calibration, table, time - history.time[0, made], time,
+                    history.temperature[run, 0]).calibration
         rows.append((now.bias - history.bias[run, 0], now.standard_deviations[1]))
     return np.array(rows)
 

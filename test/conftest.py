@@ -1,4 +1,4 @@
-"""Fixtures for tests with real ROS 2 processes: kept on this machine, apart from each other, and ended whatever happens."""
+"""Fixtures for tests with ROS 2 processes: local, apart from each other, always ended."""
 
 import contextlib
 import fcntl
@@ -20,25 +20,31 @@ _FOLDER = Path(tempfile.mkdtemp(prefix='gyro_calibration_test_'))
 _SHARED_MEMORY = Path('/dev/shm')  # of Linux
 
 # Discovery takes 0.3 s or 3 s at random by default; so it takes less than 0.6 s.
-_PROFILE = """<?xml version="1.0" encoding="UTF-8" ?>
+_PROFILE = (
+    """<?xml version="1.0" encoding="UTF-8" ?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>{transport}
     <participant profile_name="test" is_default_profile="true">
       <rtps>{choice}<builtin><discovery_config>
         <leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec></leaseAnnouncement>
-        <initialAnnouncements><count>10</count><period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
+        <initialAnnouncements><count>10</count>"""
+    """<period><sec>0</sec><nanosec>100000000</nanosec></period></initialAnnouncements>
       </discovery_config></builtin></rtps>
     </participant>
   </profiles>
 </dds>
-"""
-_BY_UDP = '<defaultUnicastLocatorList><locator><udpv4><address>127.0.0.1</address></udpv4></locator></defaultUnicastLocatorList>'
-# By default a process that the machine does not let run for a second, or to which 512 messages come meanwhile, loses them all.
-_PATIENT = """
+""")
+_BY_UDP = ('<defaultUnicastLocatorList><locator><udpv4><address>127.0.0.1</address></udpv4>'
+           '</locator></defaultUnicastLocatorList>')
+# By default a process that the machine does not let run for a second, or to which 512 messages
+# come meanwhile, loses them all.
+_PATIENT = (
+    """
     <transport_descriptors><transport_descriptor>
       <transport_id>patient</transport_id><type>SHM</type><segment_size>2097152</segment_size>
-      <port_queue_capacity>8192</port_queue_capacity><healthy_check_timeout_ms>20000</healthy_check_timeout_ms>
-    </transport_descriptor></transport_descriptors>"""
+      <port_queue_capacity>8192</port_queue_capacity>"""
+    """<healthy_check_timeout_ms>20000</healthy_check_timeout_ms>
+    </transport_descriptor></transport_descriptors>""")
 _BY_PATIENT = '<userTransports><transport_id>patient</transport_id></userTransports>'
 
 
@@ -46,12 +52,14 @@ def _profile(name, choice='', transport=''):
     """Write a profile of Fast DDS and return the environment that has it used."""
     path = _FOLDER / name
     path.write_text(_PROFILE.format(choice=choice, transport=transport))
-    return {'FASTRTPS_DEFAULT_PROFILES_FILE': str(path), 'FASTDDS_DEFAULT_PROFILES_FILE': str(path)}
+    return {'FASTRTPS_DEFAULT_PROFILES_FILE': str(path),
+            'FASTDDS_DEFAULT_PROFILES_FILE': str(path)}
 
 
 def _prepare_environment():
     os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-    os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
+    os.environ['PYTHONPATH'] = os.pathsep.join(
+        filter(None, [str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH')]))
     os.environ.update({
         'ROS_LOG_DIR': str(_FOLDER),
         'OPENBLAS_NUM_THREADS': '1',  # as the program does; NumPy is not imported yet
@@ -124,7 +132,7 @@ def data():
 
 @pytest.fixture
 def run(capsys):
-    """Return a function that runs the program and gives its exit code, standard output and standard error."""
+    """Return a function that runs the program and gives exit code, output and error output."""
     from gyro_calibration.cli.main import main  # not before the environment is prepared
 
     def run(*words):
@@ -155,30 +163,35 @@ def _is_mine(lock):
 
 def _is_empty(domain):
     """
-    Remove the ports that killed nodes left in shared memory, and tell whether nobody listens in a domain.
+    Remove the ports that killed nodes left in shared memory; return whether nobody listens.
 
-    Fast DDS would use such a port again as it is, with less room than `_PATIENT` says. Who listens holds a lock.
+    Fast DDS would use such a port of the domain again as it is, with less room than `_PATIENT`
+    says. Who listens holds a lock.
 
     """
-    ports = {int(re.findall(r'[0-9]+', path.name)[0]) for path in _SHARED_MEMORY.glob('fastrtps_port*')}
+    ports = {int(re.findall(r'[0-9]+', path.name)[0])
+             for path in _SHARED_MEMORY.glob('fastrtps_port*')}
     first = 7400 + 250 * domain  # below 7400 are ports that all domains share
-    listened = [port for port in ports if (port < 7400 or first <= port < first + 250) and not _is_left(port)]
+    listened = [port for port in ports
+                if (port < 7400 or first <= port < first + 250) and not _is_left(port)]
     return all(port < 7400 for port in listened)
 
 
 def _is_left(port):
     """Tell whether nobody listens at a port of Fast DDS in shared memory, and remove it then."""
-    with contextlib.suppress(FileNotFoundError), open(_SHARED_MEMORY / f'fastrtps_port{port}_el') as lock:
+    with contextlib.suppress(FileNotFoundError), open(
+            _SHARED_MEMORY / f'fastrtps_port{port}_el') as lock:
         if not _is_mine(lock):
             return False
-    for name in (f'fastrtps_port{port}', f'fastrtps_port{port}_el', f'sem.fastrtps_port{port}_mutex'):
+    for name in (f'fastrtps_port{port}', f'fastrtps_port{port}_el',
+                 f'sem.fastrtps_port{port}_mutex'):
         (_SHARED_MEMORY / name).unlink(missing_ok=True)
     return True
 
 
 @contextlib.contextmanager
 def _free_domain():
-    """Give a domain where nobody is, and that no other run of these tests on this machine uses: each holds the lock of its own."""
+    """Give a domain where nobody is; its lock keeps other test runs on this machine out of it."""
     for number in random.SystemRandom().sample(range(1, 102), 101):
         with open(Path(tempfile.gettempdir()) / f'gyro_calibration_domain_{number}', 'w') as lock:
             if _is_mine(lock) and _is_empty(number):
@@ -192,8 +205,8 @@ def by_udp(monkeypatch):
     """
     Have the nodes of a test, which kills them, hear by UDP.
 
-    Fast DDS 2.14 may go on sending to the shared memory of a process that was killed, and the one that comes in its place hears nothing
-    (issues 5053 and 5469 of Fast DDS).
+    Fast DDS 2.14 may go on sending to the shared memory of a process that was killed; then the
+    one that comes in its place hears nothing (issues 5053 and 5469 of Fast DDS).
 
     """
     for name, value in _profile('udp.xml', _BY_UDP).items():
@@ -213,12 +226,15 @@ class NodeProcess:
         arguments = [f'{name}:={value}' for name, value in parameters.items()]
         self._command = [sys.executable, '-m', f'gyro_calibration.ros.{module}', '--ros-args']
         self._command += [word for argument in arguments for word in ('-p', argument)]
-        self._command += [word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
-        self._command += [word for file in parameter_files for word in ('--params-file', str(file))]
+        self._command += [
+            word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
+        self._command += [word for file in parameter_files
+                          for word in ('--params-file', str(file))]
         self.waited = False
         handle, self._output = tempfile.mkstemp(dir=_FOLDER)
         with os.fdopen(handle, 'wb') as output:
-            self.process = subprocess.Popen(self._command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+            self.process = subprocess.Popen(self._command, stdout=output, stderr=subprocess.STDOUT,
+                                            start_new_session=True)
 
     @property
     def output(self):
@@ -248,7 +264,8 @@ class NodeProcess:
             code = 'none: it had to be killed'
         finally:
             self._kill()
-        assert code in (None, 0), f'{" ".join(self._command)} ended with code {code}:\n{self.output}'
+        assert code in (None, 0), (
+            f'{" ".join(self._command)} ended with code {code}:\n{self.output}')
         assert 'Traceback' not in self.output, self.output
 
     def _kill(self):
@@ -260,11 +277,12 @@ class NodeProcess:
 @pytest.fixture
 def start_node(ros_domain, request):
     """
-    Return a function that starts ``python -m gyro_calibration.<module>`` and ends it after the test.
+    Return a function that starts ``python -m gyro_calibration.<module>``, ended after the test.
 
-    ``start_node('driver_node', parameters={'port': '/dev/x'}, remappings={'imu/data_raw': 'raw'}, parameter_files=[path])`` gives a
-    `NodeProcess` with ``output``, ``wait()``, ``stop()`` and ``process``. A node that a test did not itself wait for must still run at
-    the end, end on SIGINT with code 0, and never print a traceback.
+    ``start_node('driver_node', parameters={'port': '/dev/x'}, remappings={'imu/data_raw': 'raw'},
+    parameter_files=[path])`` gives a `NodeProcess` with ``output``, ``wait()``, ``stop()`` and
+    ``process``. A node that a test did not itself wait for must still run at the end, end on
+    SIGINT with code 0, and never print a traceback.
 
     """
     nodes = []
@@ -314,7 +332,8 @@ class Ros:
     def collect(self, message_type, topic, quality=None):
         """Subscribe, and return the list that the messages go to."""
         messages = []
-        self.node.create_subscription(message_type, topic, messages.append, quality or _sensor_quality())
+        self.node.create_subscription(message_type, topic, messages.append,
+                                      quality or _sensor_quality())
         return messages
 
     def publisher(self, message_type, topic, quality=None):
@@ -339,10 +358,11 @@ class Ros:
         self._context.try_shutdown()
 
     def _settle(self, quiet=0.15, timeout=5.0):
-        """Wait until nobody comes or goes: Fast DDS 2.14 may hang or crash where it hears of others while it ends."""
+        """Wait until nobody comes or goes; else Fast DDS 2.14 may hang or crash as it ends."""
         seen, since, deadline = None, time.monotonic(), time.monotonic() + timeout
         while time.monotonic() < min(since + quiet, deadline):
-            around = sorted(self.node.get_node_names()), sorted(self.node.get_topic_names_and_types())
+            around = (sorted(self.node.get_node_names()),
+                      sorted(self.node.get_topic_names_and_types()))
             if around != seen:
                 seen, since = around, time.monotonic()
             time.sleep(0.01)
@@ -356,9 +376,10 @@ def _sensor_quality():
 @pytest.fixture
 def ros(ros_domain):
     """
-    Return a `Ros`: ``node``, ``collect(type, topic)``, ``publisher(type, topic)`` and ``call(service_type, name)``.
+    Return a `Ros`, whose node is in the domain of the nodes that `start_node` started.
 
-    Nodes started by `start_node` in the same test are in the same domain.
+    It has ``node``, ``collect(type, topic)``, ``publisher(type, topic)`` and
+    ``call(service_type, name)``.
 
     """
     client = Ros()

@@ -1,4 +1,4 @@
-"""Hidden logs put to the diagnosis, and how right its answers are; for the tests and for `benchmarks/diagnosis.py`."""
+"""Hidden logs given to the diagnosis, and how right its answers are."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from gyro_calibration.noise import Noise
 SAME = {'reference_scale': 'scale_factor_error'}
 #: An answer with more names is no answer.
 LARGEST_SET = 3
-#: What has no size that an interval could hold: what is counted, steps that are read off, and what has none.
+#: What has no size that an interval could hold: what is counted, steps that are read off, and what
+#: has none.
 WITHOUT_SIZE = {*COUNTED, *STEPPED, 'unit_error', 'bias_instability'}
 #: A diagnosis holds out one of so many blocks, of so many s.
 EVERY, BLOCK = 3, 60.0
@@ -29,20 +30,26 @@ EVERY, BLOCK = 3, 60.0
 
 def log_of(hidden: HiddenLog) -> Log:
     """Return what the package reads of a hidden log."""
-    return Log(**{COLUMNS[name][0]: column * COLUMNS[name][1] for name, column in hidden.columns.items()})
+    return Log(
+        **{COLUMNS[name][0]: column * COLUMNS[name][1] for name, column in hidden.columns.items()})
 
 
 def model_of(hidden: HiddenLog) -> GyroModel:
     """Return the model of who knows all but what is hidden."""
     known = hidden.truth.expected
-    terms = (Term(BIAS, (known['bias'],)), Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],)))
-    return GyroModel(terms, noise=Noise(known['angle_random_walk'], known['bias_instability'], known['rate_random_walk']))
+    terms = (Term(BIAS, (known['bias'],)),
+             Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],)))
+    return GyroModel(terms, noise=Noise(known['angle_random_walk'], known['bias_instability'],
+                                        known['rate_random_walk']))
 
 
-def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator, with_model: bool | None = None) -> Diagnosis:
-    """Diagnose hidden logs; with the model of who knows the rest where what is hidden is a finding only against one."""
-    wanted = bool(set(hidden[0].truth.names) & set(AGAINST_A_MODEL)) if with_model is None else with_model
-    return diagnose([log_of(each) for each in hidden], generator, model_of(hidden[0]) if wanted else None)
+def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
+                 with_model: bool | None = None) -> Diagnosis:
+    """Diagnose hidden logs, with a model where the hidden cause is found only against one."""
+    wanted = (bool(set(hidden[0].truth.names) & set(AGAINST_A_MODEL)) if with_model is None
+              else with_model)
+    return diagnose([log_of(each) for each in hidden], generator,
+                    model_of(hidden[0]) if wanted else None)
 
 
 @dataclass(frozen=True)
@@ -58,9 +65,9 @@ class Judged:
     set_sizes : of the findings that hold a hidden cause
     extra : names of the findings that hold none
     beyond : variables of structures without a name
-    right : each hidden cause is in a set of at most three, and nothing else is reported; of one outside the catalogue, that it is
-        unexplained, and nothing is named
-    held : of each cause that is named and has a number, whether its interval of 95 % holds the truth
+    right : each hidden cause is in a set of at most three, and nothing else is reported; a cause
+        outside the catalogue is reported as unexplained, and nothing is named
+    held : of each cause that is named with a number, whether its interval of 95 % holds the truth
 
     """
 
@@ -74,7 +81,8 @@ class Judged:
     held: dict[str, bool]
 
 
-def judged(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str], allowed: Collection[str] = ()) -> Judged:
+def judged(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str],
+           allowed: Collection[str] = ()) -> Judged:
     """
     Compare an answer with the truth.
 
@@ -92,10 +100,13 @@ def judged(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str]
     matched = _matched(sorted(wanted - set(OUTSIDE)), sets)
     extra = tuple(each.effect for each, names in zip(findings, sets) if not names & wanted)
     sizes = tuple(len(each) for each in sets if each & wanted)
-    complete = len(matched) == len(wanted) == len(sizes) and max(sizes, default=0) <= LARGEST_SET and not extra and not beyond
+    complete = (len(matched) == len(wanted) == len(sizes) and max(sizes, default=0) <= LARGEST_SET
+                and not extra and not beyond)
     right = bool(beyond) and not findings if wanted & set(OUTSIDE) else complete
-    return Judged(bool(findings or beyond), bool(findings) and SAME.get(findings[0].effect, findings[0].effect) in wanted,
-                  len(matched) == len(wanted), sizes, extra, tuple(beyond), right, held(hidden.truth.gyro.causes, findings))
+    return Judged(bool(findings or beyond),
+                  bool(findings) and SAME.get(findings[0].effect, findings[0].effect) in wanted,
+                  len(matched) == len(wanted), sizes, extra, tuple(beyond), right,
+                  held(hidden.truth.gyro.causes, findings))
 
 
 def judged_diagnosis(hidden: HiddenLog, found: Diagnosis, allowed: Collection[str] = ()) -> Judged:
@@ -110,7 +121,8 @@ def _names(finding: Finding) -> set[str]:
 
 def _matched(wanted: Sequence[str], sets: Sequence[set[str]]) -> dict[str, int]:
     """Give each hidden cause a finding of its own that holds it, to as many as can be."""
-    places: list[list[int | None]] = [[*(place for place, each in enumerate(sets) if name in each), None] for name in wanted]
+    places: list[list[int | None]] = [
+        [*(place for place, each in enumerate(sets) if name in each), None] for name in wanted]
     ways = (way for way in itertools.product(*places) if _once(way))
     best = max(ways, key=lambda way: sum(place is not None for place in way))
     return {name: place for name, place in zip(wanted, best) if place is not None}
@@ -121,12 +133,14 @@ def _once(way: Sequence[int | None]) -> bool:
     return len(set(given)) == len(given)
 
 
-def held(causes: Iterable[Cause], findings: Sequence[Finding], deviations: float = 1.96) -> dict[str, bool]:
+def held(causes: Iterable[Cause], findings: Sequence[Finding],
+         deviations: float = 1.96) -> dict[str, bool]:
     """
-    Tell of each cause that was named with a number whether its interval holds the truth.
+    Return for each cause named with a number whether its interval holds the truth.
 
-    Where the phase says the sign of a wave, the size has none. What is counted has no interval, a wrong unit no size, and
-    flicker beside a Gauss-Markov process none that an Allan deviation would tell.
+    Where the phase says the sign of a wave, the size has none. What is counted has no interval, a
+    wrong unit no size, and flicker beside a Gauss-Markov process none that an Allan deviation
+    would tell.
 
     """
     by_name = {each.effect: each.parameters.get(each.effect) for each in findings}
@@ -142,35 +156,40 @@ def held(causes: Iterable[Cause], findings: Sequence[Finding], deviations: float
 
 def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:
     """
-    Return what of the mean squares of rate and heading errors is won on the parts held out, by the diagnosis and by who knows the truth.
+    Return the gains in mean square rate and heading error, by the diagnosis and by the truth.
 
-    In units of what is left to who knows; nothing where the diagnosis measured no gain, or where what is hidden has no gain to measure.
+    Both on the parts held out, in units of what the truth leaves; nothing where the diagnosis
+    measured no gain, or where what is hidden has no gain to measure.
 
     """
     if found.gain is None or set(hidden.truth.names) <= WITHOUT_COLUMN:
         return {}
     changes = {'rate': found.gain.rate, 'heading': found.gain.heading}
     knowing = _knowing(hidden)
-    return {name: ((change.before ** 2 - change.after ** 2) / knowing[name][1], (knowing[name][0] - knowing[name][1]) / knowing[name][1])
+    return {name: ((change.before ** 2 - change.after ** 2) / knowing[name][1],
+                   (knowing[name][0] - knowing[name][1]) / knowing[name][1])
             for name, change in changes.items() if change is not None and knowing[name][1] > 0.0}
 
 
 def _knowing(hidden: HiddenLog) -> dict[str, tuple[float, float]]:
     """
-    Return the mean squares that are left on the parts held out, by bias and scale alone, and by who knows all that is hidden.
+    Return the mean squares left on the parts held out, by bias and scale alone and by the truth.
 
-    Who knows it takes the bias, as everybody does, from the other parts: it wanders.
+    The truth takes the bias, as the others do, from the other parts: it wanders.
 
     """
-    truth, output, stamps, good = hidden.truth, hidden.columns['gyro_rad_s'], hidden.columns['time_s'], hidden.truth.good
+    truth, output, stamps, good = (hidden.truth, hidden.columns['gyro_rad_s'],
+                                   hidden.columns['time_s'], hidden.truth.good)
     length = min(BLOCK, (stamps[-1] - stamps[0]) / 6.0)
     number = np.floor((stamps - stamps[0]) / length).astype(int)
     out = (number % EVERY == 1) & (number < int((stamps[-1] - stamps[0]) / length + 1e-9))
     kept = good & ~out
     design = np.column_stack([np.ones_like(output), truth.reference])
-    left = [output - design @ np.linalg.lstsq(design[kept], output[kept], rcond=None)[0], output - _predicted(hidden)]
+    left = [output - design @ np.linalg.lstsq(design[kept], output[kept], rcond=None)[0],
+            output - _predicted(hidden)]
     left[1] = left[1] - np.mean(left[1][kept])
-    headings = [[length * np.mean(each[out & good & (number == block)]) for block in np.unique(number[out])] for each in left]
+    headings = [[length * np.mean(each[out & good & (number == block)])
+                 for block in np.unique(number[out])] for each in left]
     return {'rate': _squares([each[out & good] for each in left]), 'heading': _squares(headings)}
 
 
@@ -188,10 +207,14 @@ def _squares(both: Sequence[Sequence[float]]) -> tuple[float, float]:
 
 def described(hidden: HiddenLog, found: Diagnosis) -> str:
     """Return what was hidden and what was answered, in a few lines."""
-    causes = [f'{cause.name} {cause.size:.4g} {cause.unit} at {cause.multiple:.3g} times, apart {cause.apart:.3g}, '
-              f'{ {name: float(f"{value:.4g}") for name, value in cause.shapes.items()} }' for cause in hidden.truth.gyro.causes]
+    causes = [f'{cause.name} {cause.size:.4g} {cause.unit} at {cause.multiple:.3g} times, '
+              f'apart {cause.apart:.3g}, '
+              f'{ {name: float(f"{value:.4g}") for name, value in cause.shapes.items()} }'
+              for cause in hidden.truth.gyro.causes]
     said = [f'{"|".join([each.effect, *each.ambiguous_with])} p={each.p_value:.1e} '
-            f'{ {name: [float(f"{x:.4g}") for x in (value.estimate, *value.interval)] for name, value in each.parameters.items()} }'
+            f"""{ {name: [float(f"{x:.4g}") for x in (value.estimate, *value.interval)]
+                    for name, value in each.parameters.items()} }"""
             for each in found.findings]
-    said += [f'unexplained along {each.along}, {each.share_of_variance:.2g} of the variance' for each in found.unexplained]
+    said += [f'unexplained along {each.along}, {each.share_of_variance:.2g} of the variance'
+             for each in found.unexplained]
     return f'hidden: {"; ".join(causes) or "nothing"}\n    answer: {"; ".join(said) or "nothing"}'

@@ -86,7 +86,7 @@ class FakeGyro:
             sent += 1
             time.sleep(PACE)
             if sent % 100 == 0:  # a machine that is busy elsewhere must not overrun the queues
-                self.wait_until(lambda: len(self.imu) >= received + sent - 300,  # noqa: B023, at once
+                self.wait_until(lambda: len(self.imu) >= received + sent - 300,  # noqa: B023
                                 what='the node to keep up')
             if until():
                 break

@@ -139,7 +139,8 @@ class Reading:
 
     def __init__(self, world, protocol='auto', port='/dev/gyro', settings=None, baud=0):
         self.world, self.states, self.times = world, [], []
-        self.connection = Connection(str(port), protocol, baud, settings, self._on_change, world, world.port)
+        self.connection = Connection(str(port), protocol, baud, settings, self._on_change, world,
+                                     world.port)
         self.chunks = list(self.connection.chunks(world))
         self.samples = [sample for chunk in self.chunks for sample in chunk.samples]
         self.stamps = [stamp for chunk in self.chunks for stamp in chunk.stamps]

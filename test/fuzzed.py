@@ -1,8 +1,9 @@
 """
-What is fuzzed: each target takes any bytes, and raises where a claim about its reader or decoder is broken.
+Targets for fuzzing: each takes any bytes, and raises where a claim about its reader is broken.
 
-The documented errors (LogError, ModelError, MotionError, UsageError, ValueError of a parameter) are the right answer to bytes that are
-wrong; any other exception is a fault, and so is a message of several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
+The documented errors (LogError, ModelError, MotionError, UsageError, ValueError of a parameter)
+are the right answer to wrong bytes; any other exception is a fault, and so is a message of
+several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
 
 """
 
@@ -45,10 +46,13 @@ from gyro_calibration.motion import CALIBRATION, MotionError, read_motion
 from gyro_calibration.noise import Noise
 from gyro_calibration.recording import Topics, read_recording
 
-#: Longest message of an error, in characters without the path; s that an input may take; bytes that a decoder may hold back.
+#: Longest message of an error, in characters without the path; s that an input may take; bytes
+#: that a decoder may hold back.
 MESSAGE, SECONDS, HELD = 1000, 5.0, 1024
-#: In memory, where the machine has such a folder: a fuzzer writes a file thousands of times a second.
-_FOLDER = tempfile.TemporaryDirectory(prefix='gyro_calibration_fuzz_', dir='/dev/shm' if os.access('/dev/shm', os.W_OK) else None)
+#: In memory, where the machine has such a folder: a fuzzer writes a file thousands of times a
+#: second.
+_FOLDER = tempfile.TemporaryDirectory(prefix='gyro_calibration_fuzz_',
+                                      dir='/dev/shm' if os.access('/dev/shm', os.W_OK) else None)
 HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 
@@ -89,7 +93,8 @@ def _said(error: Exception | str, path: object = '') -> None:
     """Check that an error is one line and names its file."""
     text = str(error)
     assert text.startswith(str(path)), text
-    assert len(text.splitlines()) == 1 and len(text.replace(str(path), '')) <= MESSAGE, text[:2 * MESSAGE]
+    assert len(text.splitlines()) == 1 and len(text.replace(str(path), '')) <= MESSAGE, (
+        text[:2 * MESSAGE])
 
 
 # Decoders
@@ -116,36 +121,43 @@ class _Wire:
 def _wire(protocol: Protocol) -> _Wire:
     settings, decoder = settings_of(protocol), protocol.decoder(settings_of(protocol))
     encode = protocol.encoder(settings)
-    frames = [encode(Sample(0.01 * number - 0.05, 20.0, 0.01 * number, number)) for number in range(1, 5)]
+    frames = [encode(Sample(0.01 * number - 0.05, 20.0, 0.01 * number, number))
+              for number in range(1, 5)]
     decoder.feed(protocol.preamble)
-    return _Wire(protocol, settings, frames, [sample.output for frame in frames for sample in decoder.feed(frame)])
+    return _Wire(protocol, settings, frames,
+                 [sample.output for frame in frames for sample in decoder.feed(frame)])
 
 
 def pieces(data: bytes) -> list[bytes]:
-    """Cut bytes at places that follow from them, so that a failure is repeated by the same bytes."""
+    """Cut bytes at places that follow from them, so that the same bytes repeat a failure."""
     chosen = zlib.crc32(data)
-    cuts = sorted((chosen >> 4 * number) * 2654435761 % (len(data) + 1) for number in range(chosen % 6))
+    cuts = sorted((chosen >> 4 * number) * 2654435761 % (len(data) + 1)
+                  for number in range(chosen % 6))
     return [data[begin:end] for begin, end in zip([0, *cuts], [*cuts, len(data)])]
 
 
 def check_decoder(wire: _Wire, data: bytes) -> int:
-    """Any bytes in any pieces: the same samples, all of them finite; every byte is accounted for; then two frames suffice."""
+    """Check that pieces of any bytes give the same finite samples, and two frames recover."""
     whole, parted = (wire.protocol.decoder(wire.settings) for _ in range(2))
     samples = whole.feed(data)
     assert [sample for piece in pieces(data) for sample in parted.feed(piece)] == samples
-    counts = [(each.discarded_bytes, each.faults, each.refused_samples) for each in (whole, parted)]
+    counts = [(each.discarded_bytes, each.faults, each.refused_samples)
+              for each in (whole, parted)]
     assert counts[0] == counts[1], counts
     for sample in samples:
-        numbers = (sample.output, sample.temperature, sample.time, sample.specific_force, *sample.health.values())
-        assert all(number is None or math.isfinite(number) for number in numbers) and sample.missing >= 0, sample
+        numbers = (sample.output, sample.temperature, sample.time, sample.specific_force,
+                   *sample.health.values())
+        assert (all(number is None or math.isfinite(number) for number in numbers)
+                and sample.missing >= 0), sample
     _check_account(wire, data, len(samples) + whole.faults + whole.refused_samples)
     after = [(sample.output, sample.missing) for sample in whole.feed(b''.join(wire.frames))]
-    assert after[-len(wire.rates) + 2:] == [(rate, 0) for rate in wire.rates[2:]], 'not right again after two frames'
+    assert after[-len(wire.rates) + 2:] == [(rate, 0) for rate in wire.rates[2:]], (
+        'not right again after two frames')
     return len(samples)
 
 
 def _check_account(wire: _Wire, data: bytes, used: int) -> None:
-    """Every byte is in a frame, or discarded, or the end of a line; little is held back; garbage costs no frame, or one line."""
+    """Check that every byte is accounted for, little is held back, and garbage costs one line."""
     good, splitter = b''.join(wire.frames), wire.protocol.splitter()
     splitter.feed(data)
     found, wanted = len(splitter.feed(good)), len(_clean(wire).feed(good))
@@ -158,8 +170,10 @@ def _check_account(wire: _Wire, data: bytes, used: int) -> None:
     splitter.reset()
     ends = data.count(b'\r') + data.count(b'\n') if isinstance(splitter, LineSplitter) else 0
     framed = sum(len(frame.data) for frame in frames)
-    assert framed + splitter.discarded_bytes + ends == len(data), (framed, splitter.discarded_bytes, ends, len(data))
-    assert splitter.discarded_bytes - before <= HELD and sum(frame.garbage for frame in frames) <= before and used <= len(frames)
+    assert framed + splitter.discarded_bytes + ends == len(data), (
+        framed, splitter.discarded_bytes, ends, len(data))
+    assert (splitter.discarded_bytes - before <= HELD
+            and sum(frame.garbage for frame in frames) <= before and used <= len(frames))
 
 
 def _clean(wire: _Wire) -> Splitter:
@@ -171,7 +185,8 @@ def _clean(wire: _Wire) -> Splitter:
 
 def _decoder_seeds(wire: _Wire) -> list[bytes]:
     frames, garbage = wire.frames, random.Random(0).randbytes(20)
-    return [wire.protocol.preamble + b''.join(frames), frames[0] + garbage + frames[1], frames[0][:-1] + b''.join(frames[1:]), frames[2]]
+    return [wire.protocol.preamble + b''.join(frames), frames[0] + garbage + frames[1],
+            frames[0][:-1] + b''.join(frames[1:]), frames[2]]
 
 
 #: Every protocol, also those to come.
@@ -195,14 +210,19 @@ def _listening_seeds() -> list[bytes]:
 
 
 def check_clock(data: bytes) -> int:
-    """Any samples at any times: stamps are finite and increase strictly, and the count of what was lost is one."""
+    """Check that stamps of any samples are finite and increase, and losses are counted."""
     head, data = (data[:2] + b'\0\0')[:2], data[2:]
-    clock = SampleClock((1.0, 10.0, 100.0, 1000.0, 11000.0)[head[0] % 5], (0, 128, 256, 65536)[head[1] % 4])
+    clock = SampleClock((1.0, 10.0, 100.0, 1000.0, 11000.0)[head[0] % 5],
+                        (0, 128, 256, 65536)[head[1] % 4])
     arrival, last = 1000.0, -math.inf
     for sequence, late, count, missing in struct.iter_unpack('<HBBB', data[:len(data) // 5 * 5]):
         arrival += 10.0 ** (late / 32.0 - 5.0)
-        samples = [Sample(0.0, None, struct.unpack('<d', struct.pack('<HHHH', sequence, missing, count, sequence))[0] if late & 8 else
-                          0.001 * sequence + index, sequence + index, missing % 64) for index in range(1 + count % 4)]
+        samples = [
+            Sample(0.0, None,
+                   struct.unpack('<d', struct.pack('<HHHH', sequence, missing, count, sequence))[0]
+                   if late & 8 else 0.001 * sequence + index,
+                   sequence + index, missing % 64)
+            for index in range(1 + count % 4)]
         samples = [sample for sample in samples if math.isfinite(sample.time)]
         if missing == 255:
             clock.interrupt()
@@ -211,14 +231,16 @@ def check_clock(data: bytes) -> int:
         for stamp in stamps:
             assert math.isfinite(stamp) and stamp > last, (stamp, last)
             last = stamp
-    assert math.isfinite(clock.period) and clock.period > 0.0 and math.isfinite(clock.jitter_before + clock.jitter_after)
+    assert (math.isfinite(clock.period) and clock.period > 0.0
+            and math.isfinite(clock.jitter_before + clock.jitter_after))
     assert isinstance(clock.lost, int) and clock.lost >= 0, clock.lost
     return len(data)
 
 
 def _clock_seeds() -> list[bytes]:
     even = b''.join(struct.pack('<HBBB', number, 96, 0, 0) for number in range(60))
-    bursts = b''.join(struct.pack('<HBBB', 4 * number, 112, 3, number % 7 == 0) for number in range(60))
+    bursts = b''.join(struct.pack('<HBBB', 4 * number, 112, 3, number % 7 == 0)
+                      for number in range(60))
     return [b'\2\0' + even, b'\3\1' + even, b'\3\1' + bursts, b'\2\4' + even]
 
 
@@ -226,15 +248,18 @@ def _clock_seeds() -> list[bytes]:
 
 def _full_model() -> GyroModel:
     terms = (Term(CATALOGUE['bias'], (0.002,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)),
-             Term(rate_temperature_polynomial(1, 1), (0.1, 2.0, 25.0, 10.0, 0.01, 0.02, -0.03, 0.04)))
+             Term(rate_temperature_polynomial(1, 1),
+                  (0.1, 2.0, 25.0, 10.0, 0.01, 0.02, -0.03, 0.04)))
     noise = Noise(7.3e-4, 8.7e-5, 1e-6)
-    calibration = SelfCalibration(0.01, -0.002, ((1e-6, 1e-8), (1e-8, 1e-7)), '2026-11-21T12:00:00+00:00', 21.5, 'likelihood')
-    return GyroModel(terms, np.diag([1e-8, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8]), (-1.0, 1.0), (0.0, 50.0), 25.0, noise,
-                     {'name': 'a gyro', 'serial_number': '0012e3'}, {'date': '2026-11-21', 'files': [{'name': 'a.csv'}]}, calibration)
+    calibration = SelfCalibration(0.01, -0.002, ((1e-6, 1e-8), (1e-8, 1e-7)),
+                                  '2026-11-21T12:00:00+00:00', 21.5, 'likelihood')
+    return GyroModel(terms, np.diag([1e-8, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8]), (-1.0, 1.0),
+                     (0.0, 50.0), 25.0, noise, {'name': 'a gyro', 'serial_number': '0012e3'},
+                     {'date': '2026-11-21', 'files': [{'name': 'a.csv'}]}, calibration)
 
 
 def check_log(data: bytes, suffix: str = '.csv') -> bool:
-    """A log is refused in a line, or read the same at once and in blocks, and again after it was written."""
+    """Check that a log is refused in a line, or read the same whole, in blocks, and rewritten."""
     path = _file(data, suffix)
     try:
         log = read_log(path)
@@ -248,13 +273,17 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
         assert log is None, 'refused in blocks only'
         return False
     assert log is not None, 'refused as a whole only'
-    assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1), _values(log), equal_nan=True)
+    assert np.array_equal(np.concatenate([_values(block) for block in blocks], axis=1),
+                          _values(log), equal_nan=True)
     assert not (np.abs(_values(log)) > LARGEST).any()
-    assert all(np.isfinite(values).all() for values in (log.time, log.temperature, log.specific_force, log.supply) if values is not None)
+    assert all(np.isfinite(values).all()
+               for values in (log.time, log.temperature, log.specific_force, log.supply)
+               if values is not None)
     again = path_of('_again.csv')
     write_log(again, log)
     other = read_log(again)
-    assert np.array_equal(_values(other), _values(log), equal_nan=True) and list(other.others) == list(log.others)
+    assert (np.array_equal(_values(other), _values(log), equal_nan=True)
+            and list(other.others) == list(log.others))
     return True
 
 
@@ -267,9 +296,12 @@ def _log_seeds(suffix: str = '.csv') -> list[bytes]:
     path, generator = path_of(f'_seed{suffix}'), np.random.default_rng(0)
     time = 0.01 * np.arange(12)
     seeds = []
-    for log in (Log(output=generator.normal(size=12), time=time, temperature=20.0 + time, notes=('a log',)),
-                Log(counts=np.arange(12.0), reference_rate=np.full(12, math.nan), others={'lap': tuple('ab"\n,fghijkl')}),
-                Log(output=time, reference_heading=time, specific_force=time, supply=time, moving=time)):
+    for log in (Log(output=generator.normal(size=12), time=time, temperature=20.0 + time,
+                    notes=('a log',)),
+                Log(counts=np.arange(12.0), reference_rate=np.full(12, math.nan),
+                    others={'lap': tuple('ab"\n,fghijkl')}),
+                Log(output=time, reference_heading=time, specific_force=time, supply=time,
+                    moving=time)):
         write_log(path, log)
         seeds.append(path.read_bytes())
     return seeds
@@ -283,8 +315,10 @@ def check_model(data: bytes) -> bool:
     except ModelError as error:
         _said(error, path)
         return False
-    noise, values = vars(model.noise).values(), [value for term in model.terms for value in term.values]
-    assert all(abs(value) <= LARGEST for value in (*noise, *values, model.reference_temperature)), values
+    noise, values = (vars(model.noise).values(),
+                     [value for term in model.terms for value in term.values])
+    assert all(abs(value) <= LARGEST
+               for value in (*noise, *values, model.reference_temperature)), values
     text = model_text(model)
     again = path_of('_again.yaml')
     write_model(again, model)
@@ -294,13 +328,16 @@ def check_model(data: bytes) -> bool:
             compensate(model, np.array([-1.0, 0.0, 1.0]), np.array([-20.0, 20.0, 60.0]))
         model.noise.heading_variance(60.0)
     if model.self_calibration is not None:
-        json.dumps([str(model.self_calibration), model.self_calibration.figures()], allow_nan=False)
+        json.dumps([str(model.self_calibration), model.self_calibration.figures()],
+                   allow_nan=False)
     return True
 
 
 def _model_seeds() -> list[bytes]:
-    lag = GyroModel((Term(CATALOGUE['thermal_lag'], (120.0, 1e-4)), Term(CATALOGUE['sine_response'], (1.0, 0.01))))
-    by_hand = b'effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3, 4]]}}\nself_calibration: {scale_factor_error: 0, bias: 0}'
+    lag = GyroModel((Term(CATALOGUE['thermal_lag'], (120.0, 1e-4)),
+                     Term(CATALOGUE['sine_response'], (1.0, 0.01))))
+    by_hand = (b'effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3, 4]]}}\n'
+               b'self_calibration: {scale_factor_error: 0, bias: 0}')
     return [*(model_text(model).encode() for model in (_full_model(), GyroModel(), lag)), by_hand]
 
 
@@ -314,8 +351,10 @@ def check_bias_table(data: bytes) -> bool:
     with np.errstate(all='ignore'):
         bias, variance = table.predict(25.0, 1.7e9)
         change, spread = table.difference(10.0, 30.0, 1.7e9)
-        carried = carry(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0), table, 3600.0, 1.7e9, 25.0)
-    assert all(map(math.isfinite, (bias, change, spread, carried.change))) and variance > 0.0 and spread >= 0.0
+        carried = carry(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0),
+                        table, 3600.0, 1.7e9, 25.0)
+    assert (all(map(math.isfinite, (bias, change, spread, carried.change))) and variance > 0.0
+            and spread >= 0.0)
     table.add(24.0, bias, 1e-8, 1.7e9)
     write_bias_table(path, table, 1.7e9)
     assert not read_bias_table(path, GyroModel())[1]
@@ -339,7 +378,8 @@ def check_profile(data: bytes) -> bool:
         _said(error, path)
         return False
     times = np.linspace(-1.0, motion.duration + 1.0, 9)
-    assert np.isfinite(motion.heading_at(times)).all() and np.isfinite(motion.rate_at(times)).all() and motion.duration > 0.0
+    assert (np.isfinite(motion.heading_at(times)).all()
+            and np.isfinite(motion.rate_at(times)).all() and motion.duration > 0.0)
     return True
 
 
@@ -361,7 +401,8 @@ def check_limits(data: bytes) -> bool:
 
 
 def _limits_seeds() -> list[bytes]:
-    return [(Path(__file__).parents[1] / 'config' / 'limits.yaml').read_bytes(), b'maximum_rate_dps: 90\nmaximum_acceleration_dps2: 180\n']
+    return [(Path(__file__).parents[1] / 'config' / 'limits.yaml').read_bytes(),
+            b'maximum_rate_dps: 90\nmaximum_acceleration_dps2: 180\n']
 
 
 def check_recording(suffix: str, data: bytes) -> bool:
@@ -386,27 +427,36 @@ def _messages() -> list[tuple[str, str, int, bytes]]:
     found = []
     for number in range(5):
         stamp = 1_700_000_000_000_000_000 + 10_000_000 * number
-        for topic, kind in (('imu/data_raw', IMU), ('imu/temperature', TEMPERATURE), ('table', 'geometry_msgs/msg/PoseStamped')):
-            found.append((topic, kind, stamp + 1000, serialize(stamp, 'gyro', [0.1 * number] * LAYOUTS[kind].numbers)))
+        for topic, kind in (('imu/data_raw', IMU), ('imu/temperature', TEMPERATURE),
+                            ('table', 'geometry_msgs/msg/PoseStamped')):
+            found.append((topic, kind, stamp + 1000,
+                          serialize(stamp, 'gyro', [0.1 * number] * LAYOUTS[kind].numbers)))
     return found
 
 
 def _mcap_seeds() -> list[bytes]:
-    """Return a recording as the format lays it out: a magic, records of one byte, a length of eight and content, and the magic again."""
+    """Return a recording in MCAP: a magic, records of one byte, length and content, the magic."""
     def record(code: int, body: bytes) -> bytes:
         return struct.pack('<BQ', code, len(body)) + body
 
     def text(words: str) -> bytes:
         return struct.pack('<I', len(words)) + words.encode()
-    channels = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
-    declared = b''.join(record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
-                        + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr') + struct.pack('<I', 0))
-                        for topic, (number, kind) in channels.items())
-    messages = b''.join(record(5, struct.pack('<HIQQ', channels[topic][0], 0, time, time) + data) for topic, _, time, data in _messages())
-    chunk = record(6, struct.pack('<QQQI', 0, 1, len(declared + messages), zlib.crc32(declared + messages)) + text('')
-                   + struct.pack('<Q', len(declared + messages)) + declared + messages)
-    magic, head, end = b'\x89MCAP0\r\n', record(1, text('ros2') + text('')), record(15, bytes(4)) + record(2, bytes(20))
-    return [magic + head + declared + messages + end + magic, magic + head + chunk + end + magic, magic + head + chunk[:-40]]
+    channels = {
+        topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
+    declared = b''.join(
+        record(3, struct.pack('<H', number) + text(kind) + text('ros2msg') + text(''))
+        + record(4, struct.pack('<HH', number, number) + text(topic) + text('cdr')
+                 + struct.pack('<I', 0))
+        for topic, (number, kind) in channels.items())
+    messages = b''.join(record(5, struct.pack('<HIQQ', channels[topic][0], 0, time, time) + data)
+                        for topic, _, time, data in _messages())
+    chunk = record(
+        6, struct.pack('<QQQI', 0, 1, len(declared + messages), zlib.crc32(declared + messages))
+        + text('') + struct.pack('<Q', len(declared + messages)) + declared + messages)
+    magic, head, end = (b'\x89MCAP0\r\n', record(1, text('ros2') + text('')),
+                        record(15, bytes(4)) + record(2, bytes(20)))
+    return [magic + head + declared + messages + end + magic, magic + head + chunk + end + magic,
+            magic + head + chunk[:-40]]
 
 
 def _database_seeds() -> list[bytes]:
@@ -415,9 +465,12 @@ def _database_seeds() -> list[bytes]:
     path.unlink(missing_ok=True)
     with contextlib.closing(sqlite3.connect(path)) as database:
         database.execute('PRAGMA page_size = 512')
-        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
-        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)')
-        topics = {topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
+        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
+                         'serialization_format TEXT)')
+        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, '
+                         'timestamp INTEGER, data BLOB)')
+        topics = {
+            topic: (number, kind) for number, (topic, kind, _, _) in enumerate(_messages()[:3], 1)}
         rows = [(number, name, kind, 'cdr') for name, (number, kind) in topics.items()]
         database.executemany('INSERT INTO topics VALUES (?, ?, ?, ?)', rows)
         messages = [(topics[name][0], time, data) for name, _, time, data in _messages()]
@@ -433,8 +486,8 @@ def wild_value(data: bytes) -> object:
     kind, rest = data[0] % 9 if data else 0, data[1:]
     text = rest.decode('utf-8', 'surrogateescape')
     number = struct.unpack('<d', rest[:8].ljust(8, b'\0'))[0]
-    return (None, bool(rest[:1] > b'\x7f'), int.from_bytes(rest[:40], 'little', signed=True), number, text, rest, text.split('\n'),
-            list(rest), [number, text, None])[kind]
+    return (None, bool(rest[:1] > b'\x7f'), int.from_bytes(rest[:40], 'little', signed=True),
+            number, text, rest, text.split('\n'), list(rest), [number, text, None])[kind]
 
 
 def check_parameters(data: bytes) -> bool:
@@ -447,12 +500,14 @@ def check_parameters(data: bytes) -> bool:
     except ValueError as error:
         _said(error, f'parameter {parameter.name}')
         return False
-    assert isinstance(accepted, (bool, int, float, str, list)) and not (isinstance(accepted, str) and '\0' in accepted)
+    assert (isinstance(accepted, (bool, int, float, str, list))
+            and not (isinstance(accepted, str) and '\0' in accepted))
     return True
 
 
 def _parameter_seeds() -> list[bytes]:
-    values = [b'\0', b'\1\xff', b'\2\x01', b'\3' + struct.pack('<d', 0.5), b'\4rest', b'\4/dev/ttyUSB0', b'\6time_s\ngyro_dps']
+    values = [b'\0', b'\1\xff', b'\2\x01', b'\3' + struct.pack('<d', 0.5), b'\4rest',
+              b'\4/dev/ttyUSB0', b'\6time_s\ngyro_dps']
     return [bytes([place]) + value for place in range(0, 60, 4) for value in values]
 
 
@@ -462,7 +517,8 @@ _program = cache(_parser)
 def check_arguments(data: bytes) -> bool:
     """The program takes its arguments, or ends with 0 or 2; nothing is run."""
     words = data.replace(b'\0', b'').decode('utf-8', 'surrogateescape').split('\n')
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(
+            io.StringIO()) as said:
         try:
             _program().parse_args(words)
         except SystemExit as end:
@@ -473,39 +529,52 @@ def check_arguments(data: bytes) -> bool:
 
 
 _ARGUMENTS = (
-    'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json', 'diagnose a.csv --model b.yaml --out c',
-    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --window 0.2 --rest', 'allan rest.csv --rate 100 --sensitivity 1e-3',
-    'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3', 'emulate --protocol csv --model m.yaml --speed 2 --repeat',
-    'simulate --model m.yaml --motion robot --out l.csv --seed 1 --temperature 25 --sample-rate 100', 'plan --limits l.yaml --seconds 20',
-    'record --port /dev/ttyUSB0 --out x.csv', 'reproduce hong_park --seed 3', 'demo --out d', '--version', 'fit --help')
+    'fit table.csv --out model.yaml --polynomial 3,2 --technology mems', 'turn table.csv --json',
+    'diagnose a.csv --model b.yaml --out c',
+    'compensate drive.csv --model m.yaml --out o.csv --threshold 0.3 --window 0.2 --rest',
+    'allan rest.csv --rate 100 --sensitivity 1e-3',
+    'self-calibrate run.csv --turns -5 --marking 1 --reference-drift 1e-3',
+    'emulate --protocol csv --model m.yaml --speed 2 --repeat',
+    'simulate --model m.yaml --motion robot --out l.csv --seed 1 --temperature 25 '
+    '--sample-rate 100',
+    'plan --limits l.yaml --seconds 20',
+    'record --port /dev/ttyUSB0 --out x.csv', 'reproduce hong_park --seed 3', 'demo --out d',
+    '--version', 'fit --help')
 
 
 def _argument_seeds() -> list[bytes]:
     return [words.replace(' ', '\n').encode() for words in _ARGUMENTS]
 
 
-_YAML = (b'[' * 60, b'- ' * 30, b': ', b'- ', b'{', b'}', b'[', b']', b'&a ', b'*a', b'!!int', b'"', b"'", b'|', b'>', b'? ', b'---',
-         b'...', b'#', b'%', b'.nan', b'.inf', b'1e300', b'9' * 30, b'null', b'true', b'\\x00', b'<<')
-_MODEL = (b'effects', b'covariance', b'valid', b'rate', b'temperature', b'reference_temperature', b'noise', b'gyro', b'origin',
-          b'self_calibration', b'standard_deviations', b'orders', b'matrix_dps', b'version', b'format',
-          *(name.encode() for name in CATALOGUE))
-_CSV = (b',', b'\n', b'\r\n', b'"', b'#', b'nan', b'inf', b'1e300', b'-0', b'1_0', b'time_s', b'gyro_dps', b'gyro_rad_s', b'gyro_counts',
-        b'temperature_degc', b'reference_rate_dps', b'reference_heading_deg', b'heading_deg', b'rate_dps', b'\xef\xbb\xbf')
-_TABLE = (b'entries', b'jumps', b'standard_deviation', b'time', b'run', b'bias', b'temperature', b'model', b'1e-9', b'1e9')
+_YAML = (b'[' * 60, b'- ' * 30, b': ', b'- ', b'{', b'}', b'[', b']', b'&a ', b'*a', b'!!int',
+         b'"', b"'", b'|', b'>', b'? ', b'---', b'...', b'#', b'%', b'.nan', b'.inf', b'1e300',
+         b'9' * 30, b'null', b'true', b'\\x00', b'<<')
+_MODEL = (b'effects', b'covariance', b'valid', b'rate', b'temperature', b'reference_temperature',
+          b'noise', b'gyro', b'origin', b'self_calibration', b'standard_deviations', b'orders',
+          b'matrix_dps', b'version', b'format', *(name.encode() for name in CATALOGUE))
+_CSV = (b',', b'\n', b'\r\n', b'"', b'#', b'nan', b'inf', b'1e300', b'-0', b'1_0', b'time_s',
+        b'gyro_dps', b'gyro_rad_s', b'gyro_counts', b'temperature_degc', b'reference_rate_dps',
+        b'reference_heading_deg', b'heading_deg', b'rate_dps', b'\xef\xbb\xbf')
+_TABLE = (b'entries', b'jumps', b'standard_deviation', b'time', b'run', b'bias', b'temperature',
+          b'model', b'1e-9', b'1e9')
 
 TARGETS: dict[str, Target] = {
-    **{f'decoder {name}': Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256, _parts(wire), 2.0)
+    **{f'decoder {name}':
+       Target(partial(check_decoder, wire), partial(_decoder_seeds, wire), 256, _parts(wire), 2.0)
        for name, wire in WIRES.items()},
     'listening': Target(check_listening, _listening_seeds, 1024),
     'sample clock': Target(check_clock, _clock_seeds, 512),
     'log': Target(check_log, _log_seeds, 1024, _CSV),
-    'compressed log': Target(partial(check_log, suffix='.csv.gz'), partial(_log_seeds, '.csv.gz'), 1024),
+    'compressed log': Target(partial(check_log, suffix='.csv.gz'),
+                             partial(_log_seeds, '.csv.gz'), 1024),
     'model': Target(check_model, _model_seeds, 2048, (*_YAML, *_MODEL)),
     'bias table': Target(check_bias_table, _bias_table_seeds, 2048, (*_YAML, *_TABLE)),
     'motion profile': Target(check_profile, _profile_seeds, 1024, _CSV),
     'motion limits': Target(check_limits, _limits_seeds, 1024, _YAML),
     'recording .mcap': Target(partial(check_recording, '.mcap'), _mcap_seeds, 4096),
     'recording .db3': Target(partial(check_recording, '.db3'), _database_seeds, 8192),
-    'arguments': Target(check_arguments, _argument_seeds, 256, (b'\n', b'--', b'nan', b'1e999', b'-1')),
-    **({'parameters': Target(check_parameters, _parameter_seeds, 128, weight=2.0)} if HAS_ROS else {}),
+    'arguments': Target(check_arguments, _argument_seeds, 256,
+                        (b'\n', b'--', b'nan', b'1e999', b'-1')),
+    **({'parameters': Target(check_parameters, _parameter_seeds, 128, weight=2.0)}
+       if HAS_ROS else {}),
 }

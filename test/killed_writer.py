@@ -1,10 +1,11 @@
 """
-Writes what a robot keeps, and is killed meanwhile: 500 processes that begin to write the next calibration and bias table, and are killed.
+Writes calibrations and bias tables in processes that are killed meanwhile.
 
     python killed_writer.py FOLDER KILLS
 
-Each child is forked, so that it writes at once, and is killed at a random time around its writing. What it leaves must be, byte by byte,
-what was there before or what the same writing gives that nobody kills. Prints how often it was which, as JSON.
+Each of KILLS children is forked, so that it writes at once, and is killed at a random time around
+its writing. What it leaves must be, byte by byte, what was there before or what the same writing
+gives that nobody kills. Prints the number of each, as JSON.
 
 """
 
@@ -32,7 +33,8 @@ def opened(folder):
 
 def write(memory, number):
     """Write a calibration, and each fourth time a bias table as well, as the node does."""
-    memory.keep(SelfCalibration(0.01 + 1e-6 * number, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)), '2026-01-01T00:00:00+00:00', 25.0, 'rest'))
+    memory.keep(SelfCalibration(0.01 + 1e-6 * number, 1e-3, ((1e-8, 0.0), (0.0, 1e-10)),
+                                '2026-01-01T00:00:00+00:00', 25.0, 'rest'))
     if number % 4:
         return
     memory.table.add(10.0 + number % 32, 1e-3 + 1e-5 * (number % 7), 1e-10, BEGIN + STEP * number)
@@ -86,7 +88,8 @@ def main():
                 found['new' if content == new[place] else 'old'][place] += 1
         found['half_written'] += len(os.listdir(folder / 'robot')) > len(FILES)
     memory = opened(folder / 'robot')
-    print(json.dumps(found | {'hints': memory.hint + memory.table_hint, 'left': sorted(os.listdir(folder / 'robot'))}))
+    print(json.dumps(found | {'hints': memory.hint + memory.table_hint,
+                              'left': sorted(os.listdir(folder / 'robot'))}))
 
 
 if __name__ == '__main__':

@@ -1,5 +1,5 @@
 """
-Subscribers in a process of their own, as many as are asked for, each a participant of its own: they take all that the nodes say.
+Subscribers in a process of their own, each a participant of its own, to all that nodes say.
 
     python listeners.py NUMBER
 

@@ -1,4 +1,4 @@
-"""Recordings for tests, written by the library rosbags, which shares no line with what reads them here."""
+"""Recordings for tests, written by the library rosbags, independent of the reader here."""
 
 
 import numpy as np
@@ -8,14 +8,16 @@ BEGIN = 1_700_000_000_000_000_000  # ns
 #: How long after its stamp a message was received, in ns.
 DELAY = 2_000_000
 #: Kind of storage -> arguments of `write`.
-KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'mode': 'MESSAGE'}, 'mcap': {'storage': 'MCAP'},
-         'mcap-chunks': {'storage': 'MCAP', 'mode': 'STORAGE'}, 'mcap-file': {'storage': 'MCAP', 'mode': 'FILE'},
+KINDS = {'sqlite3': {}, 'sqlite3-file': {'mode': 'FILE'}, 'sqlite3-message': {'mode': 'MESSAGE'},
+         'mcap': {'storage': 'MCAP'}, 'mcap-chunks': {'storage': 'MCAP', 'mode': 'STORAGE'},
+         'mcap-file': {'storage': 'MCAP', 'mode': 'FILE'},
          'mcap-message': {'storage': 'MCAP', 'mode': 'MESSAGE'}}
 
 
 def rosbags():
     """Return the modules of the library; skip where it is missing."""
-    pytest.importorskip('rosbags', reason='rosbags, which writes recordings for tests, is not installed')
+    pytest.importorskip('rosbags',
+                        reason='rosbags, which writes recordings for tests, is not installed')
     from rosbags import rosbag2, typesys
     return rosbag2, typesys
 
@@ -33,7 +35,8 @@ class Messages:
 
     def header(self, time, frame='gyro'):
         stamp = 0 if time is None else BEGIN + round(time * 1e9)
-        return self._make('std_msgs/msg/Header', self._make('builtin_interfaces/msg/Time', stamp // 10 ** 9, stamp % 10 ** 9), frame)
+        return self._make('std_msgs/msg/Header', self._make(
+            'builtin_interfaces/msg/Time', stamp // 10 ** 9, stamp % 10 ** 9), frame)
 
     def vector(self, z, kind='geometry_msgs/msg/Vector3'):
         return self._make(kind, 0.0, 0.0, float(z))
@@ -46,29 +49,35 @@ class Messages:
     def imu(self, time, rate, force=None, heading=None, frame='gyro', reports_rate=True):
         def covariance(value):
             return np.array([value, *8 * [0.0]])
-        return self._make('sensor_msgs/msg/Imu', self.header(time, frame), self.quaternion(heading), covariance(-float(heading is None)),
-                          self.vector(rate), covariance(0.0 if reports_rate else -1.0), self.vector(force or 0.0),
-                          covariance(-float(force is None)))
+        return self._make('sensor_msgs/msg/Imu', self.header(time, frame),
+                          self.quaternion(heading), covariance(-float(heading is None)),
+                          self.vector(rate), covariance(0.0 if reports_rate else -1.0),
+                          self.vector(force or 0.0), covariance(-float(force is None)))
 
     def temperature(self, time, value):
         return self._make('sensor_msgs/msg/Temperature', self.header(time), float(value), 0.0)
 
     def _pose(self, heading):
-        return self._make('geometry_msgs/msg/Pose', self.vector(0.0, 'geometry_msgs/msg/Point'), self.quaternion(heading))
+        return self._make('geometry_msgs/msg/Pose', self.vector(0.0, 'geometry_msgs/msg/Point'),
+                          self.quaternion(heading))
 
     def _twist(self, rate):
         return self._make('geometry_msgs/msg/Twist', self.vector(0.0), self.vector(rate))
 
     def odometry(self, time, heading, rate, child='base_link'):
-        pose = self._make('geometry_msgs/msg/PoseWithCovariance', self._pose(heading), np.zeros(36))
-        twist = self._make('geometry_msgs/msg/TwistWithCovariance', self._twist(rate), np.zeros(36))
+        pose = self._make('geometry_msgs/msg/PoseWithCovariance', self._pose(heading),
+                          np.zeros(36))
+        twist = self._make('geometry_msgs/msg/TwistWithCovariance', self._twist(rate),
+                           np.zeros(36))
         return self._make('nav_msgs/msg/Odometry', self.header(time, 'odom'), child, pose, twist)
 
     def pose(self, time, heading):
-        return self._make('geometry_msgs/msg/PoseStamped', self.header(time, 'map'), self._pose(heading))
+        return self._make('geometry_msgs/msg/PoseStamped', self.header(time, 'map'),
+                          self._pose(heading))
 
     def twist(self, time, rate):
-        return self._make('geometry_msgs/msg/TwistStamped', self.header(time, 'base_link'), self._twist(rate))
+        return self._make('geometry_msgs/msg/TwistStamped', self.header(time, 'base_link'),
+                          self._twist(rate))
 
 
 def write(path, topics, storage='SQLITE3', mode='NONE', distribution='ROS2_JAZZY'):
@@ -84,27 +93,33 @@ def write(path, topics, storage='SQLITE3', mode='NONE', distribution='ROS2_JAZZY
     """
     rosbag2, _ = rosbags()
     store = Messages(distribution).store
-    rows = sorted(((time, topic, message) for topic, messages in topics.items() for time, message in messages), key=lambda row: row[0])
+    rows = sorted(((time, topic, message) for topic, messages in topics.items()
+                   for time, message in messages), key=lambda row: row[0])
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage])
     writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
     with writer:
         kinds = {topic: messages[0][1].__msgtype__ for topic, messages in topics.items()}
-        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        connections = {topic: writer.add_connection(topic, kind, typestore=store)
+                       for topic, kind in kinds.items()}
         for time, topic, message in rows:
-            writer.write(connections[topic], BEGIN + round(time * 1e9) + DELAY, store.serialize_cdr(message, kinds[topic]))
+            writer.write(connections[topic], BEGIN + round(time * 1e9) + DELAY,
+                         store.serialize_cdr(message, kinds[topic]))
     return path
 
 
 def of_log(log, distribution='ROS2_JAZZY'):
-    """Return the topics of a recording with all that is in a log, each value a message at the time of its sample."""
+    """Return the topics of a recording of a whole log, a message for each value at its time."""
     make, time = Messages(distribution), log.time - log.time[0]
     force = [None] * len(log) if log.specific_force is None else log.specific_force.tolist()
-    topics = {'imu/data_raw': [(at, make.imu(at, rate, each)) for at, rate, each in zip(time, log.output, force, strict=True)]}
+    topics = {'imu/data_raw': [(at, make.imu(at, rate, each))
+                               for at, rate, each in zip(time, log.output, force, strict=True)]}
     if log.temperature is not None:
-        topics['imu/temperature'] = [(at, make.temperature(at, value)) for at, value in zip(time, log.temperature, strict=True)]
+        topics['imu/temperature'] = [(at, make.temperature(at, value))
+                                     for at, value in zip(time, log.temperature, strict=True)]
     if log.reference_heading is not None:
         known = np.flatnonzero(np.isfinite(log.reference_heading))
-        topics['table'] = [(time[row], make.pose(time[row], log.reference_heading[row])) for row in known]
+        topics['table'] = [(time[row], make.pose(time[row], log.reference_heading[row]))
+                           for row in known]
     return topics
 
 

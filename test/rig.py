@@ -89,7 +89,8 @@ class Rig:
                  **parameters):
         self.clock, self.robot = StepClock(ros), robot or Robot()
         self.commands, self.outputs, self.truth = [], [], {}
-        self.publishers, self.receivers, self.ros_speed, self.other = ['/driver_node'], 1, 1.0, None
+        self.publishers, self.receivers, self.ros_speed, self.other = (
+            ['/driver_node'], 1, 1.0, None)
         self.fed, self._steps, self._stamp, self._echoes = BEGIN * NSEC_PER_SEC, 0, 0, []
         if model:
             (folder / 'model.yaml').write_text(model)
@@ -97,8 +98,8 @@ class Rig:
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given = {names[attribute]: value for attribute, value in parameters.items()}
         self.calibration_file = calibration_file or folder / 'calibration.yaml'
-        self.pipeline = Pipeline(record(PARAMETERS, self._given), self.calibration_file, self.clock,
-                                 self._send)
+        self.pipeline = Pipeline(record(PARAMETERS, self._given), self.calibration_file,
+                                 self.clock, self._send)
         self._timers, self.speed = {}, 1.0
         self.session, self.journal = self.pipeline.session, self.pipeline.journal
 
@@ -238,7 +239,7 @@ class Rig:
         return self.session.conclude()
 
     def drive_to(self, rate=0.7):
-        """Begin a calibration that drives the robot, and return when it turns faster than a rate."""
+        """Begin a calibration that drives the robot; return when it turns faster than a rate."""
         assert not self.begin()
         assert self.go(10.0, lambda: abs(self.robot.rate) > rate)
 

@@ -1,8 +1,8 @@
 """
 A small robot for tests: commands in, odometry and the samples of a gyro out.
 
-`Robot` is pure: it computes, with a time that the caller steps. `RosRobot` joins it to topics, in a
-thread. Both know nothing of the package that they test. All units are SI; angles are
+`Robot` is pure: it computes, with a time that the caller steps. `RosRobot` joins it to topics, in
+a thread. Both know nothing of the package that they test. All units are SI; angles are
 counter-clockwise positive.
 
 """
@@ -87,7 +87,7 @@ class Robot:
         self._commands = deque()
 
     def command(self, rate):
-        """Take a command to turn, rad/s, at the time of the last step; it acts after the latency."""
+        """Take a command to turn, rad/s, at the time of the last step; it acts after a latency."""
         if not self.deaf:
             self._heard = self.time
             self._commands.append((self.time + self._latency, rate))
@@ -102,11 +102,13 @@ class Robot:
             self._target = 0.0
         # exact for a target that is constant over the step
         kept = math.exp(-INTERVAL / self._lag)
-        self.heading += self._target * INTERVAL + (self.rate - self._target) * self._lag * (1 - kept)
+        self.heading += (self._target * INTERVAL
+                         + (self.rate - self._target) * self._lag * (1 - kept))
         self.rate = self._target + (self.rate - self._target) * kept
         if not self.stamps_stand:
             self._stamp += INTERVAL
-        output = (1.0 + self.scale_factor_error) * self.rate + self.bias + self._random.gauss(0.0, self.noise)
+        output = ((1.0 + self.scale_factor_error) * self.rate + self.bias
+                  + self._random.gauss(0.0, self.noise))
         return Reading(self._stamp, None if self.unplugged else output, self.heading, self.rate)
 
 
@@ -133,8 +135,8 @@ class RosRobot:
     stamped : bool
         Whether cmd_vel is a TwistStamped.
     speed : float or None
-        Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and stamps
-        are those of the node's clock.
+        Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
+        stamps are those of the node's clock.
 
     Attributes
     ----------
@@ -207,11 +209,12 @@ class RosRobot:
     def _stamp(self, reading):
         """Return the stamp in ns: of the simulation, or of the node's clock."""
         if not (self.clock_stands or self.robot.stamps_stand) or self._last is None:
-            self._last = round(reading.stamp * 1e9) if self._speed else self.node.get_clock().now().nanoseconds
+            self._last = (round(reading.stamp * 1e9) if self._speed
+                          else self.node.get_clock().now().nanoseconds)
         return self._last
 
     def turned_since(self, since):
-        """Return the angle that it has turned since a time of the steady clock, rad, either way."""
+        """Return the angle turned since a time of the steady clock, rad, in either direction."""
         after = [moment.heading for moment in self.moments if moment.time >= since]
         return sum(abs(b - a) for a, b in zip(after, after[1:]))
 
