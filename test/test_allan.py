@@ -1,4 +1,4 @@
-"""Allan deviation, and the noise figures in it, against textbook definitions, simulated noise with known truth, and recordings."""
+"""Allan deviation and its noise figures, against definitions, simulated truth and recordings."""
 
 import json
 import math
@@ -21,7 +21,7 @@ WALK = Noise(1e-3, 0.0, 5e-4)
 
 
 def textbook(rate, size):
-    """Return the overlapping Allan deviation as IEEE Std 952 defines it: means over neighbouring windows, at every sample."""
+    """Return the overlapping Allan deviation by the definition of IEEE Std 952."""
     means = np.array([rate[start:start + size].mean() for start in range(len(rate) - size + 1)])
     return math.sqrt(0.5 * np.mean((means[size:] - means[:-size]) ** 2))
 
@@ -29,10 +29,12 @@ def textbook(rate, size):
 @pytest.mark.parametrize('samples', [100, 1001, 40000])
 def test_the_deviation_is_the_textbooks(samples):
     generator = np.random.default_rng(952)
-    rate = 3.0 + np.cumsum(generator.standard_normal(samples)) + 30.0 * generator.standard_normal(samples)
+    rate = (3.0 + np.cumsum(generator.standard_normal(samples))
+            + 30.0 * generator.standard_normal(samples))
     chart = allan_deviation(rate, INTERVAL)
     chosen = slice(None) if samples < 2000 else slice(None, None, 9)
-    np.testing.assert_allclose(chart.deviation[chosen], [textbook(rate, size) for size in chart.size[chosen]], rtol=1e-9)
+    np.testing.assert_allclose(chart.deviation[chosen],
+                               [textbook(rate, size) for size in chart.size[chosen]], rtol=1e-9)
     assert chart.time[-1] == pytest.approx(samples // 3 * INTERVAL) and len(chart.size) >= 13
     assert (chart.differences == samples + 1 - 2 * chart.size).all()
 
@@ -46,16 +48,20 @@ def test_averaging_times_can_be_given_and_must_fit_twice_into_the_record():
 
 
 def published_freedom(symbol, count, size):
-    """Return the degrees of freedom of NIST SP 1065, table 5, which holds within some percent; `count` values of the angle."""
+    """Return the degrees of freedom for `count` angles: NIST SP 1065, table 5, to some percent."""
     if symbol == 'N':
-        return (3 * (count - 1) / (2 * size) - 2 * (count - 2) / count) * 4 * size ** 2 / (4 * size ** 2 + 5)
+        return ((3 * (count - 1) / (2 * size) - 2 * (count - 2) / count)
+                * 4 * size ** 2 / (4 * size ** 2 + 5))
     if symbol == 'B':
         return 5 * count ** 2 / (4 * size * (count + 3 * size))
-    return (count - 2) / size * ((count - 1) ** 2 - 3 * size * (count - 1) + 4 * size ** 2) / (count - 3) ** 2
+    return ((count - 2) / size * ((count - 1) ** 2 - 3 * size * (count - 1) + 4 * size ** 2)
+            / (count - 3) ** 2)
 
 
-@pytest.mark.parametrize('symbol, noise', [('N', WHITE), ('B', Noise(0.0, 1e-3)), ('K', Noise(0.0, 0.0, 1e-3))])
-def test_degrees_of_freedom_are_the_published_ones_for_the_noise_that_the_slope_shows(symbol, noise):
+@pytest.mark.parametrize('symbol, noise',
+                         [('N', WHITE), ('B', Noise(0.0, 1e-3)), ('K', Noise(0.0, 0.0, 1e-3))])
+def test_degrees_of_freedom_are_the_published_ones_for_the_noise_that_the_slope_shows(
+        symbol, noise):
     rate = simulate_noise(noise, 100_000, INTERVAL, np.random.default_rng(2))
     chart = allan_deviation(rate, INTERVAL, [0.04, 0.08, 0.16, 0.32, 0.64, 1.28])
     wanted = [published_freedom(symbol, 100_001, size) for size in chart.size]
@@ -64,11 +70,14 @@ def test_degrees_of_freedom_are_the_published_ones_for_the_noise_that_the_slope_
 
 def test_the_bounds_of_the_deviation_hold_in_95_of_100_records():
     generator, runs, times = np.random.default_rng(3), 400, [0.01, 0.04, 0.16, 0.64, 2.56]
-    charts = [allan_deviation(simulate_noise(WHITE, 2000, INTERVAL, generator), INTERVAL, times) for _ in range(runs)]
+    charts = [allan_deviation(simulate_noise(WHITE, 2000, INTERVAL, generator), INTERVAL, times)
+              for _ in range(runs)]
     true = WHITE.angle_random_walk / np.sqrt(times)
     held = np.mean([(chart.lower <= true) & (true <= chart.upper) for chart in charts], axis=0)
-    # Short times: the binomial scatter of 400 runs, four times. At the longest, one in three records shows another slope than it has.
-    assert (np.abs(held[:4] - 0.95) < 4.0 * math.sqrt(0.05 * 0.95 / runs)).all() and 0.88 < held[4] < 0.99, held
+    # Short times: the binomial scatter of 400 runs, four times. At the longest time one in three
+    # records shows a wrong slope.
+    assert ((np.abs(held[:4] - 0.95) < 4.0 * math.sqrt(0.05 * 0.95 / runs)).all()
+            and 0.88 < held[4] < 0.99), held
 
 
 def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
@@ -76,13 +85,16 @@ def figures(noise, runs, seed, samples=20_000, quantization=0.0, ramp=0.0):
     generator = np.random.default_rng(seed)
     fits = []
     for _ in range(runs):
-        rate = simulate_noise(noise, samples, INTERVAL, generator) + ramp * INTERVAL * np.arange(samples)
-        fits.append(fit_noise(rate + np.diff(generator.standard_normal(samples + 1)) * quantization / INTERVAL, INTERVAL).figures)
+        rate = (simulate_noise(noise, samples, INTERVAL, generator)
+                + ramp * INTERVAL * np.arange(samples))
+        fits.append(fit_noise(
+            rate + np.diff(generator.standard_normal(samples + 1)) * quantization / INTERVAL,
+            INTERVAL).figures)
     return {part.symbol: [fit[part.symbol] for fit in fits] for part in PARTS}
 
 
-CASES = {'white': (WHITE, 0.0, 0.0), 'flicker': (FLICKER, 0.0, 0.0), 'walk': (WALK, 0.0, 0.0), 'quantization': (WHITE, 3e-5, 0.0),
-         'ramp': (WHITE, 0.0, 1e-4)}
+CASES = {'white': (WHITE, 0.0, 0.0), 'flicker': (FLICKER, 0.0, 0.0), 'walk': (WALK, 0.0, 0.0),
+         'quantization': (WHITE, 3e-5, 0.0), 'ramp': (WHITE, 0.0, 1e-4)}
 RUNS = 30
 
 
@@ -90,7 +102,8 @@ RUNS = 30
 def case(request):
     """Return symbol -> (truth, figures of simulated records)."""
     noise, quantization, ramp = CASES[request.param]
-    truths = dict(zip('NBKQR', (noise.angle_random_walk, noise.bias_instability, noise.rate_random_walk, quantization, ramp)))
+    truths = dict(zip('NBKQR', (noise.angle_random_walk, noise.bias_instability,
+                                noise.rate_random_walk, quantization, ramp)))
     found = figures(noise, RUNS, 4, quantization=quantization, ramp=ramp)
     return {symbol: (truths[symbol], found[symbol]) for symbol in truths}
 
@@ -110,39 +123,50 @@ def test_the_bounds_hold_in_95_of_100_records(case):
 def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
     for symbol, (truth, records) in case.items():
         seen = [figure for figure in records if figure.value and truth]
-        if seen and symbol != 'R':  # one record has one ramp: it scatters by the white noise alone, far less than its bounds allow for
-            ratio = np.std([figure.value for figure in seen]) / np.median([figure.standard_deviation for figure in seen])
+        # One record has one ramp: it scatters by the white noise alone, within its bounds.
+        if seen and symbol != 'R':
+            ratio = (np.std([figure.value for figure in seen])
+                     / np.median([figure.standard_deviation for figure in seen]))
             assert 0.5 < ratio < 1.5, (symbol, ratio)  # a scatter of 30 is known to 13 %
 
 
 def test_white_noise_alone_shows_nothing_else():
-    """In five of 100 records at most something that is not there: in 60 records, with four times the scatter, in 9 at most."""
+    """At most 5 % of records show what is not there: of 60, with four times the scatter, 9."""
     found = figures(WHITE, 60, 5, samples=3000)
     false = np.any([[figure.value > 0.0 for figure in found[symbol]] for symbol in 'BKQR'], axis=0)
     assert false.sum() <= 9
     assert all(figure.value > 0.0 for figure in found['N'])
 
 
-@pytest.mark.parametrize('numerator, denominator', [([0.25, 0.5, 0.25], [1.0]), ([0.3], [1.0, -0.7])], ids=['mean of three', 'lag'])
+@pytest.mark.parametrize('numerator, denominator', [
+    ([0.25, 0.5, 0.25], [1.0]), ([0.3], [1.0, -0.7])], ids=['mean of three', 'lag'])
 def test_a_filter_of_the_output_does_not_fool_the_angle_random_walk(numerator, denominator):
     generator = np.random.default_rng(7)
-    fits = [fit_noise(lfilter(numerator, denominator, simulate_noise(WHITE, 50_000, INTERVAL, generator)), INTERVAL) for _ in range(10)]
+    fits = [fit_noise(lfilter(numerator, denominator,
+                              simulate_noise(WHITE, 50_000, INTERVAL, generator)), INTERVAL)
+            for _ in range(10)]
     walks = [fit.figures['N'].value for fit in fits]
-    assert np.mean(walks) == pytest.approx(1e-3, abs=4.0 * np.std(walks) / math.sqrt(10.0)) and np.std(walks) < 3e-5
+    assert (np.mean(walks) == pytest.approx(1e-3, abs=4.0 * np.std(walks) / math.sqrt(10.0))
+            and np.std(walks) < 3e-5)
     assert sum(fit.figures[symbol].value > 0.0 for fit in fits for symbol in 'BKQR') <= 1
 
 
 def test_a_line_that_the_gyro_picks_up_does_not_fool_the_angle_random_walk():
     line = 0.01 * np.sin(2.0 * math.pi * 31.4 * stamps(100_000))
-    fit = fit_noise(simulate_noise(WHITE, 100_000, INTERVAL, np.random.default_rng(8)) + line, INTERVAL)
-    assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.03) and not any(fit.figures[symbol].value for symbol in 'BKQR')
+    fit = fit_noise(
+        simulate_noise(WHITE, 100_000, INTERVAL, np.random.default_rng(8)) + line, INTERVAL)
+    assert (fit.figures['N'].value == pytest.approx(1e-3, rel=0.03)
+            and not any(fit.figures[symbol].value for symbol in 'BKQR'))
 
 
 def test_a_record_that_is_too_short_for_the_floor_says_so_and_bounds_the_bias_instability():
     generator = np.random.default_rng(9)
-    short, long = (fit_noise(simulate_noise(Noise(1e-3, 3e-4), count, INTERVAL, generator), INTERVAL) for count in (2000, 200_000))
-    assert not short.floor_reached and not short.figures['B'].value and short.figures['B'].upper > 3e-4
-    assert long.floor_reached and long.chart.floor.bias_instability[0] == pytest.approx(3e-4, rel=0.4)
+    short, long = (fit_noise(simulate_noise(Noise(1e-3, 3e-4), count, INTERVAL, generator),
+                             INTERVAL) for count in (2000, 200_000))
+    assert (not short.floor_reached and not short.figures['B'].value
+            and short.figures['B'].upper > 3e-4)
+    assert (long.floor_reached
+            and long.chart.floor.bias_instability[0] == pytest.approx(3e-4, rel=0.4))
 
 
 def stamps(count):
@@ -151,27 +175,35 @@ def stamps(count):
 
 def test_lost_samples_are_counted_and_do_not_change_the_figures():
     generator = np.random.default_rng(10)
-    rate, kept = simulate_noise(WHITE, 100_000, INTERVAL, generator), generator.random(100_000) > 0.001
+    rate, kept = (simulate_noise(WHITE, 100_000, INTERVAL, generator),
+                  generator.random(100_000) > 0.001)
     kept[[0, -1]] = True
     kept[50_000:50_500] = False
     record = even_record(stamps(100_000)[kept] + 0.0005 * generator.random(kept.sum()), rate[kept])
-    assert np.isnan(record.rate).sum() == (~kept).sum() and f'{(~kept).sum()} samples are lost' in record.remarks[0]
+    assert (np.isnan(record.rate).sum() == (~kept).sum()
+            and f'{(~kept).sum()} samples are lost' in record.remarks[0])
     np.testing.assert_array_equal(record.rate[kept], rate[kept])
     assert record.interval == pytest.approx(INTERVAL, rel=1e-6)
-    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(1e-3, rel=0.02)
+    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
+        1e-3, rel=0.02)
     times = [0.01, 0.1, 1.0, 10.0, 50.0]
-    np.testing.assert_allclose(*(allan_deviation(each, INTERVAL, times).deviation for each in (record.rate, rate)), rtol=0.05)
+    np.testing.assert_allclose(*(allan_deviation(each, INTERVAL, times).deviation
+                                 for each in (record.rate, rate)), rtol=0.05)
 
 
 @pytest.mark.parametrize('jitter', [0.0, 0.1])
 @pytest.mark.parametrize('share', [0.02, 0.05, 0.1, 0.19])
 def test_many_lost_samples_do_not_make_the_interval_longer(share, jitter):
     generator = np.random.default_rng(int(1000 * share))
-    rate, kept = simulate_noise(WHITE, 60_000, INTERVAL, generator), generator.random(60_000) > share
+    rate, kept = (simulate_noise(WHITE, 60_000, INTERVAL, generator),
+                  generator.random(60_000) > share)
     kept[[0, -1]] = True
-    record = even_record((stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
-    assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and np.isnan(record.rate).sum() == pytest.approx((~kept).sum(), abs=3)
-    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(1e-3, rel=0.015)
+    record = even_record(
+        (stamps(60_000) + jitter * INTERVAL * generator.standard_normal(60_000))[kept], rate[kept])
+    assert (record.interval == pytest.approx(INTERVAL, rel=1e-4)
+            and np.isnan(record.rate).sum() == pytest.approx((~kept).sum(), abs=3))
+    assert fit_noise(record.rate, record.interval).figures['N'].value == pytest.approx(
+        1e-3, rel=0.015)
 
 
 @pytest.mark.parametrize('every', [8, 20])
@@ -181,18 +213,21 @@ def test_one_lost_sample_of_so_many_is_seen(every):
 
 
 def test_two_records_hours_apart_are_not_taken_for_one():
-    rate = simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11)) + np.where(np.arange(40_000) < 20_000, 0.0, 0.1)
+    rate = (simulate_noise(WHITE, 40_000, INTERVAL, np.random.default_rng(11))
+            + np.where(np.arange(40_000) < 20_000, 0.0, 0.1))
     record = even_record(stamps(40_000) + np.where(np.arange(40_000) < 20_000, 0.0, 1e7), rate)
     assert len(record.rate) < 50_000
     fit = fit_noise(record.rate, record.interval)
-    assert fit.figures['N'].value == pytest.approx(1e-3, rel=0.03) and not any(fit.figures[symbol].value for symbol in 'BKQR')
+    assert (fit.figures['N'].value == pytest.approx(1e-3, rel=0.03)
+            and not any(fit.figures[symbol].value for symbol in 'BKQR'))
 
 
 def test_every_averaging_time_of_a_chart_has_an_upper_bound_however_few_windows_fit_between_gaps():
-    """Of two records in one, the first is just long enough for a window or two over the longest averaging times."""
+    """The first of two records is just long enough for one or two of the longest windows."""
     for first in range(2600, 2720, 8):
         time = stamps(4000) + np.where(np.arange(4000) < first, 0.0, 1e3)
-        record = even_record(time, simulate_noise(WHITE, 4000, INTERVAL, np.random.default_rng(first)))
+        record = even_record(time,
+                             simulate_noise(WHITE, 4000, INTERVAL, np.random.default_rng(first)))
         chart = allan_deviation(record.rate, record.interval)
         assert chart.degrees_of_freedom.min() > 0.99 and np.isfinite(chart.upper).all()
 
@@ -200,13 +235,15 @@ def test_every_averaging_time_of_a_chart_has_an_upper_bound_however_few_windows_
 def bursts(count):
     """Return stamps of packets of five that come when the host gets to it, up to 0.2 s late."""
     generator = np.random.default_rng(12)
-    late = np.repeat(0.05 * generator.random(count // 5) + 0.15 * (generator.random(count // 5) < 0.002), 5)
+    late = np.repeat(
+        0.05 * generator.random(count // 5) + 0.15 * (generator.random(count // 5) < 0.002), 5)
     arrival = np.maximum.accumulate(np.repeat(stamps(count)[4::5], 5) + late)
     return arrival + 0.0002 * np.arange(count) / 5 % 0.001 + 1e-9 * np.arange(count)
 
 
 def test_stamps_in_bursts_give_the_interval_of_the_gyro():
-    time, rate = np.sort(bursts(50_000)), simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(13))
+    time, rate = np.sort(bursts(50_000)), simulate_noise(WHITE, 50_000, INTERVAL,
+                                                         np.random.default_rng(13))
     record = even_record(time, rate)
     assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and 'bursts' in record.remarks[0]
     np.testing.assert_array_equal(record.rate, rate)
@@ -215,7 +252,8 @@ def test_stamps_in_bursts_give_the_interval_of_the_gyro():
 
 
 def moved(kind):
-    rate, generator = simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(14)), np.random.default_rng(15)
+    rate, generator = (simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(14)),
+                       np.random.default_rng(15))
     time = stamps(50_000)
     return {'turn': (time, rate + 0.02 * ((time > 200.0) & (time < 230.0))),
             'jolt': (time, rate + 0.2 * np.sin(40.0 * time) * ((time > 200.0) & (time < 200.5))),
@@ -225,14 +263,17 @@ def moved(kind):
             'few': (time[:99], rate[:99]),
             'lost': (time, np.where(generator.random(50_000) < 0.4, np.nan, rate)),
             'tatters': (time + 5.0 * np.cumsum(generator.random(50_000) < 0.015), rate),
-            'uneven': (np.cumsum(0.006 + 0.008 * generator.random(50_000) + 0.05 * np.sin(time / 80.0) ** 2), rate)}[kind]
+            'uneven': (np.cumsum(0.006 + 0.008 * generator.random(50_000)
+                                 + 0.05 * np.sin(time / 80.0) ** 2), rate)}[kind]
 
 
 @pytest.mark.parametrize('kind, said', [
-    ('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'), ('jolt', r'moved.*from (199|200)\.\d+ s on'),
-    ('swing', 'something else in the record'), ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
+    ('turn', r'moved.*from (19|20)\d\.\d+ s on.*at rest longest from 2[23]\d.*to 500'),
+    ('jolt', r'moved.*from (199|200)\.\d+ s on'), ('swing', 'something else in the record'),
+    ('dead', 'same value 50000 times'), ('dies', 'same value 9999 times'),
     ('tatters', r'10 ms apart.*--rate'),
-    ('few', '99 samples.*at least 100'), ('lost', '40 % of the samples are lost'), ('uneven', 'no even interval.*--rate')])
+    ('few', '99 samples.*at least 100'), ('lost', '40 % of the samples are lost'),
+    ('uneven', 'no even interval.*--rate')])
 def test_what_is_no_record_at_rest_is_refused_with_the_reason(kind, said):
     with pytest.raises(DataRefused, match=said):
         record = even_record(*moved(kind))
@@ -243,25 +284,29 @@ def test_figures_want_noise_and_windows_without_a_gap():
     with pytest.raises(DataRefused, match='lowest Allan deviation 0 rad/s'):
         fit_noise(np.ones(1000), INTERVAL)
     with pytest.raises(DataRefused, match='wanted 4 octaves'):
-        fit_noise(np.where(np.arange(1000) % 6 == 0, np.nan, np.random.default_rng(19).standard_normal(1000)), INTERVAL)
+        fit_noise(np.where(np.arange(1000) % 6 == 0, np.nan,
+                           np.random.default_rng(19).standard_normal(1000)), INTERVAL)
 
 
 def test_a_wild_sample_is_left_out_and_a_walking_bias_is_no_motion():
     rate = simulate_noise(Noise(1e-3, 3e-4, 3e-4), 50_000, INTERVAL, np.random.default_rng(16))
     rate[[700, 30_000]] += 0.5, -2.0
     record = even_record(stamps(50_000), rate)
-    assert np.nonzero(np.isnan(record.rate))[0].tolist() == [700, 30_000] and 'left out: 2 single samples' in record.remarks[0]
-    assert not even_record(stamps(50_000), simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL, np.random.default_rng(20))).remarks
+    assert (np.nonzero(np.isnan(record.rate))[0].tolist() == [700, 30_000]
+            and 'left out: 2 single samples' in record.remarks[0])
+    assert not even_record(stamps(50_000), simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL,
+                                                          np.random.default_rng(20))).remarks
 
 
 def test_what_the_log_says_was_moved_is_left_out():
     moving = (stamps(50_000) > 300.0).astype(float)
     rate = simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(17)) + moving
-    assert fit_noise(even_record(stamps(50_000), rate, moving).rate, INTERVAL).figures['N'].value == pytest.approx(1e-3, rel=0.03)
+    assert fit_noise(even_record(stamps(50_000), rate, moving).rate,
+                     INTERVAL).figures['N'].value == pytest.approx(1e-3, rel=0.03)
 
 
 def test_three_recordings_of_one_kind_of_gyro_agree(data):
-    """ADIS16405, data sheet: 2 deg/√h and 0.007 deg/s, typical; without what filters bend at 0.01 to 0.1 s."""
+    """ADIS16405, data sheet: 2 deg/√h and 0.007 deg/s, typical; 0.01 to 0.1 s are filtered."""
     fits = []
     for number in (1, 2, 3):
         log = read_log(data / f'mems_static/adis16405_{number}.csv.gz', rate=100.0)
@@ -271,7 +316,8 @@ def test_three_recordings_of_one_kind_of_gyro_agree(data):
     walks = np.array([fit.figures['N'].value / DEGREE * 60.0 for fit in fits])
     floors = np.array([fit.chart.floor.deviation / DEGREE for fit in fits])
     assert (np.abs(walks - 2.3) < 0.1).all(), walks
-    assert (floors > 0.006).all() and (floors < 0.012).all() and all(fit.floor_reached and not fit.misfit for fit in fits)
+    assert ((floors > 0.006).all() and (floors < 0.012).all()
+            and all(fit.floor_reached and not fit.misfit for fit in fits))
     assert all(fit.figures['B'].value / DEGREE == pytest.approx(0.008, rel=0.4) for fit in fits)
     assert all(not fit.figures[symbol].value for fit in fits for symbol in 'QR')
 
@@ -281,7 +327,8 @@ def test_a_recording_in_bursts_is_taken_by_the_gyros_clock(data):
     record = even_record(log.time, log.output)
     assert 'bursts' in record.remarks[0] and record.interval == pytest.approx(0.01007, rel=0.001)
     fit = fit_noise(record.rate, record.interval)
-    assert fit.figures['N'].value / DEGREE == pytest.approx(0.0097, rel=0.1) and not fit.figures['B'].value and not fit.floor_reached
+    assert (fit.figures['N'].value / DEGREE == pytest.approx(0.0097, rel=0.1)
+            and not fit.figures['B'].value and not fit.floor_reached)
 
 
 def test_a_turntable_is_not_at_rest(data):
@@ -293,33 +340,44 @@ def test_a_turntable_is_not_at_rest(data):
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / 'rest.csv'
-    write_log(path, Log(time=stamps(20_000), output=simulate_noise(FLICKER, 20_000, INTERVAL, np.random.default_rng(18))))
+    write_log(path, Log(time=stamps(20_000), output=simulate_noise(
+        FLICKER, 20_000, INTERVAL, np.random.default_rng(18))))
     return path
 
 
 def test_the_verb_says_the_figures_in_units_of_people_and_in_si(log, capsys):
     assert main(['allan', str(log)]) == 0
     text = capsys.readouterr().out
-    assert 'Angle random walk N: 3.4' in text and 'deg/√h, 95 %:' in text and 'rad/√s' in text  # 1e-3 rad/√s is 3.44 deg/√h
+    # 1e-3 rad/√s is 3.44 deg/√h
+    assert 'Angle random walk N: 3.4' in text and 'deg/√h, 95 %:' in text and 'rad/√s' in text
     assert 'Rate random walk K: not seen; below' in text and 'deg/h/√h' in text
     assert main(['allan', str(log), '--json']) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert answer['angle_random_walk']['lower'] < 1e-3 < answer['angle_random_walk']['upper'] and answer['samples'] == 20_000
-    assert answer['rate_random_walk']['value'] == 0.0 and answer['rate_random_walk']['standard_deviation'] is None
-    assert len({len(values) for values in answer['chart'].values()}) == 1 and answer['interval_s'] == pytest.approx(INTERVAL)
+    assert (answer['angle_random_walk']['lower'] < 1e-3 < answer['angle_random_walk']['upper']
+            and answer['samples'] == 20_000)
+    assert (answer['rate_random_walk']['value'] == 0.0
+            and answer['rate_random_walk']['standard_deviation'] is None)
+    assert (len({len(values) for values in answer['chart'].values()}) == 1
+            and answer['interval_s'] == pytest.approx(INTERVAL))
 
 
 def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_path, capsys):
     old = tmp_path / 'old.yaml'
-    old.write_text('effects: {bias: {bias: 0.01}, scale_factor_error: {scale_factor_error: -0.1}}\ncovariance: [[1, 0], [0, 2]]\n'
-                   'valid: {rate: [-2, 2], temperature: [10, 50]}\nnoise: {rate_random_walk: 1.0}\ngyro: {name: x}\norigin: {files: [a]}\n'
-                   'self_calibration: {scale_factor_error: 0.01, bias: 0.02}\n')
+    old.write_text(
+        'effects: {bias: {bias: 0.01}, scale_factor_error: {scale_factor_error: -0.1}}\n'
+        'covariance: [[1, 0], [0, 2]]\n'
+        'valid: {rate: [-2, 2], temperature: [10, 50]}\nnoise: {rate_random_walk: 1.0}\n'
+        'gyro: {name: x}\norigin: {files: [a]}\n'
+        'self_calibration: {scale_factor_error: 0.01, bias: 0.02}\n')
     assert main(['allan', str(log), '--model', str(old), '--out', str(tmp_path / 'new.yaml')]) == 0
     assert main(['allan', str(log), '--out', str(tmp_path / 'alone.yaml')]) == 0
-    before, after, alone = (read_model(tmp_path / name) for name in ('old.yaml', 'new.yaml', 'alone.yaml'))
+    before, after, alone = (read_model(tmp_path / name)
+                            for name in ('old.yaml', 'new.yaml', 'alone.yaml'))
     assert after.noise == alone.noise and after.noise.rate_random_walk == 0.0
-    assert after.noise.angle_random_walk == pytest.approx(1e-3, rel=0.03) and after.noise.bias_instability == pytest.approx(1e-3, rel=0.3)
-    assert {**vars(after), 'noise': 0, 'covariance': 0} == {**vars(before), 'noise': 0, 'covariance': 0}
+    assert (after.noise.angle_random_walk == pytest.approx(1e-3, rel=0.03)
+            and after.noise.bias_instability == pytest.approx(1e-3, rel=0.3))
+    assert {**vars(after), 'noise': 0, 'covariance': 0} == {**vars(before), 'noise': 0,
+                                                            'covariance': 0}
     assert (after.covariance == before.covariance).all() and not alone.terms
 
 
@@ -338,15 +396,19 @@ def test_wrong_use_of_the_verb_is_said_before_the_work(log, capsys):
     assert end.value.code == 2 and 'ends in .png or .svg' in capsys.readouterr().err
 
 
-def test_bias_instability_is_the_floor_over_0_664_and_a_model_gets_what_the_others_do_not_explain(tmp_path, capsys):
+def test_bias_instability_is_the_floor_over_0_664_and_a_model_gets_what_the_others_do_not_explain(
+        tmp_path, capsys):
     path, out = tmp_path / 'rest.csv', tmp_path / 'model.yaml'
     noise = Noise(3e-4, 1e-4, 3e-5)
-    write_log(path, Log(time=stamps(100_000), output=simulate_noise(noise, 100_000, INTERVAL, np.random.default_rng(19))))
+    write_log(path, Log(time=stamps(100_000), output=simulate_noise(
+        noise, 100_000, INTERVAL, np.random.default_rng(19))))
     assert main(['allan', str(path), '--out', str(out), '--json']) == 0
     answer = json.loads(capsys.readouterr().out)
     lowest = int(np.argmin(answer['chart']['upper']))
-    assert answer['bias_instability']['value'] == pytest.approx(answer['chart']['deviation'][lowest] / ALLAN_FLOOR)
-    assert read_model(out).noise.bias_instability == answer['flicker']['value'] < answer['bias_instability']['value']
+    assert answer['bias_instability']['value'] == pytest.approx(
+        answer['chart']['deviation'][lowest] / ALLAN_FLOOR)
+    assert (read_model(out).noise.bias_instability == answer['flicker']['value']
+            < answer['bias_instability']['value'])
 
 
 def test_the_verb_names_the_file_that_it_refuses(tmp_path, capsys):

@@ -1,11 +1,25 @@
-"""The table of biases knows what it says it knows: its intervals hold, outliers and jumps do not spoil it, and no file is lost."""
+"""Bias tables: intervals hold, outliers and jumps do not spoil them, and no file is lost."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from bias_history import CALIBRATION, MODEL, NOISE, OWN, WHITE, answers, carried_answers, coverage, cubic, learn, learned, linear, simulate
+from bias_history import (
+    CALIBRATION,
+    MODEL,
+    NOISE,
+    OWN,
+    WHITE,
+    answers,
+    carried_answers,
+    coverage,
+    cubic,
+    learn,
+    learned,
+    linear,
+    simulate,
+)
 
 from gyro_calibration.bias_table import (
     BIN,
@@ -25,7 +39,8 @@ from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term, same_effects
 from gyro_calibration.noise import Noise
 
-COMPENSATED = GyroModel((Term(CATALOGUE['bias_temperature'], (25.0, 1e-4)),), temperature_range=(10.0, 40.0), noise=NOISE)
+COMPENSATED = GyroModel((Term(CATALOGUE['bias_temperature'], (25.0, 1e-4)),),
+                        temperature_range=(10.0, 40.0), noise=NOISE)
 DAY = 86400.0
 
 
@@ -36,15 +51,18 @@ def _asked():
     return np.array([answers(generator, curve(generator)) for curve in [linear, cubic] * 50])
 
 
-@pytest.mark.parametrize('place', [0, 2, 4], ids=['predict at the begin of a run', 'predict', 'difference'])
+@pytest.mark.parametrize('place', [0, 2, 4],
+                         ids=['predict at the begin of a run', 'predict', 'difference'])
 def test_intervals_of_95_percent_hold_as_often(asked, place):
-    # 100 gyros, whose answers are not independent: the standard error is up to 2 %. benchmarks/bias_table.py asks more of them.
+    # 100 gyros, whose answers are not independent: the standard error is up to 2 %.
+    # benchmarks/bias_table.py asks more of them.
     assert 0.91 < coverage(asked[:, 1:, place], asked[:, 1:, place + 1]) < 0.99
 
 
 def test_a_difference_is_better_known_than_without_a_table(asked):
     off, change = np.abs(asked[:, 2:, 4]), np.abs(asked[:, 2:, 6])
-    assert np.median(off) < np.median(change) / 5.0 and np.mean(off ** 2) < np.mean(change ** 2) / 6.0
+    assert (np.median(off) < np.median(change) / 5.0
+            and np.mean(off ** 2) < np.mean(change ** 2) / 6.0)
 
 
 def test_outliers_are_held_back_and_said():
@@ -53,8 +71,10 @@ def test_outliers_are_held_back_and_said():
         history, table = simulate(generator, cubic(generator)), BiasTable(MODEL)
         learn(table, replace(history, estimate=history.bias), 0)
         table.begin_run()
-        said, outlier = np.array([bool(text) for text in learn(table, history, 1)]), history.outlier[1]
-        found, held, wrong, kept = found + outlier.sum(), held + said[outlier].sum(), wrong + said[~outlier].sum(), kept + (~outlier).sum()
+        said, outlier = (np.array([bool(text) for text in learn(table, history, 1)]),
+                         history.outlier[1])
+        found, held, wrong, kept = (found + outlier.sum(), held + said[outlier].sum(),
+                                    wrong + said[~outlier].sum(), kept + (~outlier).sum())
     assert found >= 5 and held >= 0.8 * found and wrong <= 0.02 * kept
 
 
@@ -63,7 +83,8 @@ def test_an_empty_table_knows_nothing():
     assert table.predict(20.0, 0.0) == (0.0, math.inf)
     changes = [table.difference(20.0, 20.0 + distance, 0.0) for distance in (0.0, 5.0, 10.0)]
     assert [change for change, _ in changes] == [0.0] * 3
-    assert changes[0][1] == 0.0 and math.sqrt(changes[2][1]) == pytest.approx(10.0 * Prior().coefficient, rel=0.3)
+    assert (changes[0][1] == 0.0
+            and math.sqrt(changes[2][1]) == pytest.approx(10.0 * Prior().coefficient, rel=0.3))
 
 
 def test_a_single_run_at_one_temperature_teaches_the_offset_alone():
@@ -71,17 +92,23 @@ def test_a_single_run_at_one_temperature_teaches_the_offset_alone():
     for number in range(20):
         assert not table.add(20.0, 1.0 * DEGREE, WHITE, 60.0 * number)
     bias, variance = table.predict(20.0, 1200.0)
-    assert bias == pytest.approx(1.0 * DEGREE, abs=1e-4 * DEGREE) and math.sqrt(variance) < 0.02 * DEGREE
+    assert (bias == pytest.approx(1.0 * DEGREE, abs=1e-4 * DEGREE)
+            and math.sqrt(variance) < 0.02 * DEGREE)
     for there in (10.0, 21.0, 60.0):
         change, of_change = table.difference(20.0, there, 1200.0)
-        assert change == pytest.approx(0.0, abs=1e-12) and of_change == pytest.approx(empty.difference(20.0, there, 1200.0)[1], rel=1e-6)
+        assert (change == pytest.approx(0.0, abs=1e-12)
+                and of_change == pytest.approx(empty.difference(20.0, there, 1200.0)[1], rel=1e-6))
 
 
 def test_the_variance_grows_with_the_distance_and_with_the_age():
-    table = learned(simulate(np.random.default_rng(1), linear(np.random.default_rng(2)), runs=3), 3)
-    low, high = min(each.temperature for each in table.entries), max(each.temperature for each in table.entries)
-    by_distance = [table.predict(high + distance, 3 * DAY)[1] for distance in (0.0, 3.0, 10.0, 30.0)]
-    by_age = [table.predict(0.5 * (low + high), 3 * DAY + age)[1] for age in (0.0, DAY, 100 * DAY, 1000 * DAY)]
+    table = learned(
+        simulate(np.random.default_rng(1), linear(np.random.default_rng(2)), runs=3), 3)
+    low, high = (min(each.temperature for each in table.entries),
+                 max(each.temperature for each in table.entries))
+    by_distance = [table.predict(high + distance, 3 * DAY)[1]
+                   for distance in (0.0, 3.0, 10.0, 30.0)]
+    by_age = [table.predict(0.5 * (low + high), 3 * DAY + age)[1]
+              for age in (0.0, DAY, 100 * DAY, 1000 * DAY)]
     assert by_distance == sorted(by_distance) and by_age == sorted(by_age)
     assert math.sqrt(by_distance[-1]) > 2.0 * math.sqrt(by_distance[0])
 
@@ -90,25 +117,31 @@ def test_the_scatter_of_turning_on_is_learned():
     deviations = {}
     for scatter in (0.01, 0.3):
         generator = np.random.default_rng(3)
-        tables = [learned(simulate(generator, linear(generator), turn_on=scatter * DEGREE, outliers=0.0), 6) for _ in range(4)]
-        deviations[scatter] = np.mean([math.sqrt(table.predict(22.0, 6 * DAY)[1]) for table in tables])
+        tables = [learned(simulate(generator, linear(generator), turn_on=scatter * DEGREE,
+                                   outliers=0.0), 6) for _ in range(4)]
+        deviations[scatter] = np.mean(
+            [math.sqrt(table.predict(22.0, 6 * DAY)[1]) for table in tables])
     assert deviations[0.01] < 0.05 * DEGREE and 0.15 * DEGREE < deviations[0.3] < 0.6 * DEGREE
 
 
 def jumped():
-    """Return a table that knew a curve when the bias jumped by 0.5 deg/s, with what it said, and the curve."""
-    history = simulate(np.random.default_rng(8), linear(np.random.default_rng(9)), runs=4, outliers=0.0)
+    """Return a table whose bias jumped by 0.5 deg/s, its reports, and the curve it knew."""
+    history = simulate(np.random.default_rng(8), linear(np.random.default_rng(9)), runs=4,
+                       outliers=0.0)
     table = learned(history, 3)
     learn(table, history, 3, slice(0, 15))
-    moved = replace(history, estimate=history.estimate + 0.5 * DEGREE, bias=history.bias + 0.5 * DEGREE)
+    moved = replace(history, estimate=history.estimate + 0.5 * DEGREE,
+                    bias=history.bias + 0.5 * DEGREE)
     return table, learn(table, moved, 3, slice(15, 20)), moved
 
 
 def test_a_jump_is_noticed_and_shifts_the_whole_curve():
     table, said, history = jumped()
-    assert ['held back' in text for text in said] == [True, True, False, False, False] and 'jumped' in said[2] and not any(said[3:])
+    assert (['held back' in text for text in said] == [True, True, False, False, False]
+            and 'jumped' in said[2] and not any(said[3:]))
     assert table.held_back == 0
-    here, there, time = history.temperature[3, 20], float(history.temperature[:3].min()), history.time[3, 20]
+    here, there, time = (history.temperature[3, 20], float(history.temperature[:3].min()),
+                         history.time[3, 20])
     bias, variance = table.predict(there, time)
     true = history.bias[3, 20] + history.curve(there) - history.curve(here)
     assert abs(bias - true) < 3.0 * math.sqrt(variance) and math.sqrt(variance) < 0.2 * DEGREE
@@ -118,10 +151,12 @@ def test_what_is_off_and_does_not_agree_is_no_jump():
     table, before = BiasTable(MODEL), 20.0
     for number in range(5):
         table.add(before, 0.0, WHITE, 60.0 * number)
-    said = [table.add(before, off * DEGREE, WHITE, 300.0 + 60.0 * number) for number, off in enumerate([0.5, -0.5, 1.0, 2.0, 0.5, 0.5])]
+    said = [table.add(before, off * DEGREE, WHITE, 300.0 + 60.0 * number)
+            for number, off in enumerate([0.5, -0.5, 1.0, 2.0, 0.5, 0.5])]
     assert all('held back' in text for text in said) and table.held_back == 6 and not table.jumps
     assert not table.add(before, 0.0, WHITE, 700.0)
-    assert 'held back' in table.add(before, 0.5 * DEGREE, WHITE, 760.0)  # the two of before no longer count
+    # the two of before no longer count
+    assert 'held back' in table.add(before, 0.5 * DEGREE, WHITE, 760.0)
     assert abs(table.predict(before, 800.0)[0]) < 0.01 * DEGREE
 
 
@@ -141,7 +176,8 @@ def test_what_is_forgotten_is_the_oldest_of_the_fullest_bin():
     for run in range(ENTRIES + 20):
         table.begin_run()
         table.add(20.0, 0.0, WHITE, DAY * run)
-    assert len(table.entries) == ENTRIES and table.entries[0].temperature == -10.0 and table.entries[1].time == 21 * DAY
+    assert (len(table.entries) == ENTRIES and table.entries[0].temperature == -10.0
+            and table.entries[1].time == 21 * DAY)
 
 
 def test_rests_of_a_run_in_a_bin_become_one_entry_that_knows_its_time():
@@ -150,11 +186,13 @@ def test_rests_of_a_run_in_a_bin_become_one_entry_that_knows_its_time():
         table.add(temperature, 0.0, WHITE, 60.0 * number)
     table.add(21.0 + BIN, 0.0, WHITE, 240.0)
     first, second = table.entries
-    assert first.time == 120.0 and 20.9 < first.temperature < 21.1 and WHITE / 3.0 < first.variance < WHITE and second.time == 240.0
+    assert (first.time == 120.0 and 20.9 < first.temperature < 21.1
+            and WHITE / 3.0 < first.variance < WHITE and second.time == 240.0)
 
 
-@pytest.mark.parametrize('given', [(math.nan, 0.0, WHITE, 0.0), (20.0, math.inf, WHITE, 0.0), (20.0, 0.0, 0.0, 0.0),
-                                   (20.0, 0.0, WHITE, math.nan), (1e9, 0.0, WHITE, 0.0), (20.0, 0.0, WHITE, 1e300)])
+@pytest.mark.parametrize(
+    'given', [(math.nan, 0.0, WHITE, 0.0), (20.0, math.inf, WHITE, 0.0), (20.0, 0.0, 0.0, 0.0),
+              (20.0, 0.0, WHITE, math.nan), (1e9, 0.0, WHITE, 0.0), (20.0, 0.0, WHITE, 1e300)])
 def test_what_no_gyro_has_is_not_used(given):
     table = BiasTable(MODEL)
     assert 'is not used' in table.add(*given) and not table.entries
@@ -164,7 +202,8 @@ def test_a_model_that_compensates_leaves_less_inside_its_range_and_as_much_outsi
     known, plain = BiasTable(COMPENSATED), BiasTable(MODEL)
     inside, outside = known.difference(15.0, 35.0, 0.0)[1], known.difference(40.0, 60.0, 0.0)[1]
     of_plain = plain.difference(40.0, 60.0, 0.0)[1]
-    assert math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated, rel=1e-6) and 1.0 < outside / of_plain < 2.5
+    assert (math.sqrt(inside / of_plain) == pytest.approx(Prior().compensated, rel=1e-6)
+            and 1.0 < outside / of_plain < 2.5)
     assert known.difference(-10.0, 5.0, 0.0)[1] > 10.0 * inside
 
 
@@ -181,7 +220,8 @@ def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
         assert not table.add(20.24 + 0.0002 * number, 1e-3, 1e-18, float(number))
     write_bias_table(tmp_path / 'table.yaml', table, 0.0)
     again, said = read_bias_table(tmp_path / 'table.yaml', GyroModel())
-    assert said == '' and len(again.entries) == 2 and again.predict(20.25, 100.0)[0] == pytest.approx(1e-3)
+    assert (said == '' and len(again.entries) == 2
+            and again.predict(20.25, 100.0)[0] == pytest.approx(1e-3))
 
 
 # A stored calibration
@@ -189,9 +229,10 @@ def test_what_is_known_as_well_as_can_be_still_can_be_read(tmp_path):
 
 @pytest.fixture(scope='module', name='carried')
 def _carried():
-    """Return how 120 calibrations did in a later run: error, standard deviation, without and with a table."""
+    """Return error and standard deviation of 120 later calibrations, without and with a table."""
     generator = np.random.default_rng(7)
-    return np.array([carried_answers(generator, curve(generator)) for curve in [linear, cubic] * 60])
+    return np.array(
+        [carried_answers(generator, curve(generator)) for curve in [linear, cubic] * 60])
 
 
 @pytest.mark.parametrize('with_table', [0, 1])
@@ -207,12 +248,14 @@ def test_a_table_makes_a_carried_calibration_better(carried):
 
 def test_a_fresh_calibration_is_used_as_it_is():
     carried = carry(CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, this_run=True)
-    assert carried.change == 0.0 and not carried.sentence and carried.variance == pytest.approx(NOISE.wander(10.0, 10.0), rel=1e-6)
+    assert (carried.change == 0.0 and not carried.sentence
+            and carried.variance == pytest.approx(NOISE.wander(10.0, 10.0), rel=1e-6))
     assert carried.calibration.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
 
 
 @pytest.mark.parametrize('age,temperature,words', [
-    (400 * DAY, 20.0, '400 days ago at 20.0 degC, and now it is 20.0 degC'), (60.0, 45.0, '1 minutes ago at 20.0 degC, and now it is 45.0'),
+    (400 * DAY, 20.0, '400 days ago at 20.0 degC, and now it is 20.0 degC'),
+    (60.0, 45.0, '1 minutes ago at 20.0 degC, and now it is 45.0'),
     (7 * 3600.0, None, '7 hours ago at a temperature that is not known')])
 def test_age_and_distance_are_said_where_they_matter(age, temperature, words):
     carried = carry(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
@@ -220,18 +263,22 @@ def test_age_and_distance_are_said_where_they_matter(age, temperature, words):
 
 
 def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_covariance_one():
-    history = simulate(np.random.default_rng(3), lambda temperature: 0.05 * DEGREE * (temperature - 20.0), outliers=0.0)
+    history = simulate(np.random.default_rng(3),
+                       lambda temperature: 0.05 * DEGREE * (temperature - 20.0), outliers=0.0)
     table = learned(history, 6)
     high = max(each.temperature for each in table.entries)
-    carried = carry(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0, 6 * DAY, high, this_run=True)
+    carried = carry(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0, 6 * DAY, high,
+                    this_run=True)
     expected = 0.05 * DEGREE * (high - 20.0)
-    assert carried.change == pytest.approx(expected, rel=0.1) and carried.calibration.bias == CALIBRATION.bias + carried.change
+    assert (carried.change == pytest.approx(expected, rel=0.1)
+            and carried.calibration.bias == CALIBRATION.bias + carried.change)
     assert np.linalg.eigvalsh(carried.calibration.covariance).min() > 0.0
 
 
 def test_a_calibration_of_which_nobody_knows_how_good_it_is_keeps_no_variance():
     carried = carry(replace(CALIBRATION, covariance=None), BiasTable(MODEL), DAY, 2 * DAY, 30.0)
-    assert carried.calibration.covariance is None and math.isnan(carried.variance) and not carried.sentence
+    assert (carried.calibration.covariance is None and math.isnan(carried.variance)
+            and not carried.sentence)
 
 
 def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
@@ -239,7 +286,8 @@ def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
     table.add(20.0, 0.0, WHITE, 1000.0)
     table.begin_run()
     stored = replace(CALIBRATION, bias=0.0)
-    near, far = (carry(stored, table, DAY - made, DAY, 20.0).variance for made in (1060.0, 20000.0))
+    near, far = (carry(stored, table, DAY - made, DAY, 20.0).variance
+                 for made in (1060.0, 20000.0))
     alone = carry(stored, BiasTable(MODEL), DAY - 1060.0, DAY, 20.0).variance
     assert far < 0.7 * alone < 0.75 * near
 
@@ -249,8 +297,9 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
     time, temperature = history.time[3, 20], history.temperature[3, 20]
     stored = replace(CALIBRATION, bias=history.bias[3, 20], temperature=temperature)
     unjumped = BiasTable(MODEL, jumps=table.jumps)
-    after, before, in_this_run = (carry(stored, unjumped, age, time, temperature, this_run).variance
-                                  for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
+    after, before, in_this_run = (
+        carry(stored, unjumped, age, time, temperature, this_run).variance
+        for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
     assert min(before, in_this_run) > after + 0.9 * table.jumps[0].variance
 
 
@@ -263,18 +312,24 @@ def test_a_table_survives_a_restart(tmp_path):
     assert [write_bias_table(path, table, time)[0] for _ in range(2)] == ['', '']
     again, said = read_bias_table(path, MODEL)
     table.run = again.run
-    assert said == '' and again.run == 5 and [each.name for each in path.parent.iterdir()] == ['table.yaml']
-    assert again.predict(22.0, time + DAY) == pytest.approx(table.predict(22.0, time + DAY), rel=1e-3)
+    assert (said == '' and again.run == 5
+            and [each.name for each in path.parent.iterdir()] == ['table.yaml'])
+    assert again.predict(22.0, time + DAY) == pytest.approx(
+        table.predict(22.0, time + DAY), rel=1e-3)
     assert 'rad/s' in path.read_text() and '1970-01-04T10:' in path.read_text()
 
 
 def test_a_person_may_write_one(tmp_path):
     path = tmp_path / 'table.yaml'
-    path.write_text(f'format: gyro_calibration/bias_table\nversion: 1\nmodel: {model_digest(MODEL)}\njumps: []\nentries:\n'
-                    '- {temperature: 20, bias: 1e-3, standard_deviation: 1e-5, time: 2026-01-01 12:00:00, run: 0}\n')
+    path.write_text(
+        f'format: gyro_calibration/bias_table\nversion: 1\nmodel: {model_digest(MODEL)}\n'
+        'jumps: []\nentries:\n'
+        '- {temperature: 20, bias: 1e-3, standard_deviation: 1e-5, '
+        'time: 2026-01-01 12:00:00, run: 0}\n')
     table, said = read_bias_table(path, MODEL)
     (entry,) = table.entries
-    assert said == '' and entry.bias == 1e-3 and entry.time == 1767268800.0 and entry.variance == pytest.approx(1e-10)
+    assert (said == '' and entry.bias == 1e-3 and entry.time == 1767268800.0
+            and entry.variance == pytest.approx(1e-10))
 
 
 def test_no_file_is_no_fault(tmp_path):
@@ -289,17 +344,23 @@ def whole(tmp_path):
 
 
 DAMAGES = {
-    'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2], 'garbage': lambda text: bytes(range(256)) * 4,
+    'empty': lambda text: b'', 'truncated': lambda text: text[:len(text) // 2],
+    'garbage': lambda text: bytes(range(256)) * 4,
     'zeros': lambda text: bytes(len(text)), 'too long': lambda text: text + b'# filled\n' * 30000,
     'a newer version': lambda text: text.replace(b'version: 1', b'version: 2'),
-    'another format': lambda text: text.replace(b'bias_table', b'model'), 'a list': lambda text: b'- 1\n',
-    'not a number': lambda text: text.replace(b'bias: ', b'bias: x'), 'infinite': lambda text: text.replace(b'bias: ', b'bias: .inf #'),
+    'another format': lambda text: text.replace(b'bias_table', b'model'),
+    'a list': lambda text: b'- 1\n',
+    'not a number': lambda text: text.replace(b'bias: ', b'bias: x'),
+    'infinite': lambda text: text.replace(b'bias: ', b'bias: .inf #'),
     'no variance': lambda text: text.replace(b'standard_deviation: ', b'standard_deviation: 0 #'),
-    'no time': lambda text: text.replace(b'time: ', b'time: yesterday #'), 'no run': lambda text: text.replace(b'run: ', b'walk: '),
+    'no time': lambda text: text.replace(b'time: ', b'time: yesterday #'),
+    'no run': lambda text: text.replace(b'run: ', b'walk: '),
     'no entries': lambda text: text.replace(b'entries:', b'others:'),
     'a call': lambda text: text + b'x: !!python/object/apply:os.getcwd []\n',
-    'deep': lambda text: b'[' * 5000, 'unfolding': lambda text: b'a: &a [1, 1]\n' + b''.join(
-        b'%c: &%c [*%c, *%c, *%c]\n' % (98 + i, 98 + i, 97 + i, 97 + i, 97 + i) for i in range(24)) + b'entries: *y\n',
+    'deep': lambda text: b'[' * 5000,
+    'unfolding': lambda text: b'a: &a [1, 1]\n' + b''.join(
+        b'%c: &%c [*%c, *%c, *%c]\n' % (98 + i, 98 + i, 97 + i, 97 + i, 97 + i)
+        for i in range(24)) + b'entries: *y\n',
 }
 
 
@@ -308,11 +369,13 @@ def test_a_damaged_file_is_told_in_one_sentence_and_kept(tmp_path, damage):
     path, content = tmp_path / 'table.yaml', damage(whole(tmp_path))
     path.write_bytes(content)
     table, said = read_bias_table(path, MODEL)
-    assert 'cannot be read' in said and '\n' not in said and len(said) < 400 + len(str(path)) and not table.entries
+    assert ('cannot be read' in said and '\n' not in said and len(said) < 400 + len(str(path))
+            and not table.entries)
     assert path.read_bytes() == content
     table.add(20.0, 0.0, WHITE, 0.0)
     assert 'kept-1' in write_bias_table(path, table, 0.0)[0]
-    assert (tmp_path / 'table.yaml.kept-1').read_bytes() == content and len(read_bias_table(path, MODEL)[0].entries) == 1
+    assert ((tmp_path / 'table.yaml.kept-1').read_bytes() == content
+            and len(read_bias_table(path, MODEL)[0].entries) == 1)
 
 
 def test_a_table_of_another_model_is_not_used_and_kept_under_a_new_name_each_time(tmp_path):
@@ -333,26 +396,31 @@ def test_a_folder_that_cannot_be_written_to_is_an_os_error(tmp_path):
 
 
 def test_the_digest_tells_models_apart_as_same_effects_does():
-    models = [MODEL, COMPENSATED, replace(COMPENSATED, noise=Noise()), replace(COMPENSATED, self_calibration=CALIBRATION),
+    models = [MODEL, COMPENSATED, replace(COMPENSATED, noise=Noise()),
+              replace(COMPENSATED, self_calibration=CALIBRATION),
               replace(COMPENSATED, terms=(Term(CATALOGUE['bias_temperature'], (25.0, 2e-4)),)),
               replace(COMPENSATED, terms=(Term(CATALOGUE['bias'], (1e-4,)),))]
     for first in models:
-        assert [model_digest(first) == model_digest(other) for other in models] == [same_effects(first, other) for other in models]
+        assert [model_digest(first) == model_digest(other) for other in models] == [
+            same_effects(first, other) for other in models]
     assert model_digest(MODEL) != model_digest(replace(MODEL, gyro={'serial_number': '7'}))
 
 
 @pytest.mark.parametrize('step', [1.7e9, -1.7e9])
 def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others(step, tmp_path):
     begin = 1.8e9 if step < 0.0 else 1000.0
-    table = BiasTable(MODEL, entries=[Entry(20.0, 0.0, WHITE, 1.6e9, 0)], jumps=[Jump(0, WHITE, 1.6e9)])
+    table = BiasTable(MODEL, entries=[Entry(20.0, 0.0, WHITE, 1.6e9, 0)],
+                      jumps=[Jump(0, WHITE, 1.6e9)])
     table.add(20.0, 0.0, WHITE, begin)
     table.begin_run()
     for number in range(1, 7):
-        table.add(20.0, 1.0 * DEGREE * (number > 1) + 1.0 * DEGREE * (number > 4), WHITE, begin + 60.0 * number)
+        table.add(20.0, 1.0 * DEGREE * (number > 1) + 1.0 * DEGREE * (number > 4), WHITE,
+                  begin + 60.0 * number)
     write_bias_table(tmp_path / 'table.yaml', table, begin + 360.0)
     assert [each.run for each in table.entries] == [0, 1, 2, 3] and not table.due(begin + 1e4)
     table.clock_was_set(step)
-    assert [each.time for each in table.entries] == [1.6e9, begin + step, begin + step + 60.0, begin + step + 240.0]
+    assert [each.time for each in table.entries] == [1.6e9, begin + step, begin + step + 60.0,
+                                                     begin + step + 240.0]
     assert [each.time for each in table.jumps] == [1.6e9, begin + step + 120.0]
     assert table.due(begin + step + 1e4), 'what is in the file has the old dates'
     table.add(20.0, 2.0 * DEGREE, WHITE, begin + step + 420.0)
@@ -369,7 +437,8 @@ def test_it_is_written_seldom_and_only_when_it_learned():
     table.kept(0.0)
     assert not table.due(INTERVAL, ending=True)
     table.add(25.0, 0.0, WHITE, 60.0)
-    assert [table.due(now) for now in (60.0, INTERVAL - 1.0, INTERVAL, -INTERVAL)] == [False, False, True, True]
+    assert [table.due(now) for now in (60.0, INTERVAL - 1.0, INTERVAL, -INTERVAL)] == [
+        False, False, True, True]
     assert table.due(60.0, ending=True)
 
 

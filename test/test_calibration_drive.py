@@ -208,7 +208,8 @@ def test_a_drive_that_is_taken_over_sends_one_zero_and_nothing_after_it(tmp_path
 
 @pytest.mark.parametrize('interval, burst', [(0.01, 2), (0.1, 1), (0.01, 20), (0.2, 1)],
                          ids=['100 Hz', '10 Hz', 'bursts', '5 Hz'])
-def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(tmp_path, interval, burst):
+def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
+        tmp_path, interval, burst):
     rig = Rig(tmp_path, model='', calibration_drive=True)
     rig.feed(np.zeros(round(2.0 / interval)), interval)
     assert not rig.begin()

@@ -1,4 +1,4 @@
-"""A calibration that goes on: when it is complete, what it is compared with, and what comes of it."""
+"""A running calibration: when it is complete, what it is compared with, and its results."""
 
 import math
 
@@ -38,7 +38,8 @@ def ran(kind, motion, given, duration=None, drift=0.0):
     noise = 1e-4 * np.random.default_rng(0).standard_normal(2000)
     for number in range(2000):
         time = number * INTERVAL
-        heading, turning = (float(of(np.array(time))) for of in (motion.heading_at, motion.rate_at))
+        heading, turning = (float(of(np.array(time)))
+                            for of in (motion.heading_at, motion.rate_at))
         rate = (1 + S) * turning + B + noise[number] + (drift if time > motion.duration else 0.0)
         if number % 3 == 0:
             run.odometry.append((BEGIN + time, heading, turning))
@@ -51,13 +52,15 @@ def ran(kind, motion, given, duration=None, drift=0.0):
 
 
 @pytest.mark.parametrize('kind, motion, duration, takes', [
-    (PROFILE, CALIBRATION, None, 24.0), (ODOMETRY, CALIBRATION, 20.0, 24.0), (ODOMETRY, CALIBRATION, 600.0, 24.0),
-    (TURNS, ROUND, math.inf, 18.0 + MARKED)], ids=['profile', 'odometry', 'odometry until it is finished', 'turns'])
+    (PROFILE, CALIBRATION, None, 24.0), (ODOMETRY, CALIBRATION, 20.0, 24.0),
+    (ODOMETRY, CALIBRATION, 600.0, 24.0), (TURNS, ROUND, math.inf, 18.0 + MARKED)],
+                         ids=['profile', 'odometry', 'odometry until it is finished', 'turns'])
 def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration, takes):
     run, answer = ran(kind, motion, rules(), duration)
     assert answer == '' and run.elapsed == pytest.approx(takes, abs=0.1) and run.progress > 0.99
     calibration, said = calibrated(run, rules(), Noise(), '2026-01-01')
-    assert (calibration.scale_factor_error, calibration.bias) == (pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said
+    assert ((calibration.scale_factor_error, calibration.bias) == (
+        pytest.approx(S, abs=2e-3), pytest.approx(B, abs=1e-4)) and said)
     assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
 
 
@@ -94,17 +97,19 @@ def test_finishing_acts_once_and_returns_how_long_to_wait():
 def test_odometry_without_a_yaw_is_taken_by_its_rates():
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
     run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
-    assert calibrated(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(S, abs=5e-3)
+    assert calibrated(run, rules(), Noise(), '')[0].scale_factor_error == pytest.approx(
+        S, abs=5e-3)
 
 
 def test_a_scale_is_no_better_known_than_that_of_the_odometry():
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
-    assert calibrated(run, rules(), Noise(), '')[0].standard_deviations[0] == pytest.approx(0.01 * (1 + S), rel=0.05)
+    assert calibrated(run, rules(), Noise(), '')[0].standard_deviations[0] == pytest.approx(
+        0.01 * (1 + S), rel=0.05)
 
 
 @pytest.mark.parametrize('spoil, reason', [
-    (lambda told: [], '0 messages came on odom'), (lambda told: told[:20], '20 messages came'), (lambda told: told[::-1], 'that increase')],
-    ids=['none', 'too few', 'out of order'])
+    (lambda told: [], '0 messages came on odom'), (lambda told: told[:20], '20 messages came'),
+    (lambda told: told[::-1], 'that increase')], ids=['none', 'too few', 'out of order'])
 def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
     run.odometry = spoil(run.odometry)
@@ -130,7 +135,8 @@ def test_a_drift_after_a_profile_refuses_it_unless_nobody_looks():
 def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0, drift=20.0 * DEGREE)
     run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
-    assert 'at rest after it' not in calibrated(run, Rules(Limits(time_offset=0.5), Reference(0.01), 2, True), Noise(), '')[1]
+    assert 'at rest after it' not in calibrated(
+        run, Rules(Limits(time_offset=0.5), Reference(0.01), 2, True), Noise(), '')[1]
 
 
 def test_a_rest_gives_the_bias_alone():
@@ -138,7 +144,8 @@ def test_a_rest_gives_the_bias_alone():
     for number, noise in enumerate(1e-4 * np.random.default_rng(1).standard_normal(520)):
         run.add(number * INTERVAL, B + noise, B + noise, None)
     calibration, said = calibrated(run, rules(), Noise(), '')
-    assert run.over == '' and calibration.bias == pytest.approx(B, abs=1e-5) and calibration.method == 'rest' and not said
+    assert (run.over == '' and calibration.bias == pytest.approx(B, abs=1e-5)
+            and calibration.method == 'rest' and not said)
 
 
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():

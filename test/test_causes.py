@@ -8,13 +8,19 @@ from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import QUANTITIES
 
-NAMES = re.findall(r'\w+', """
-    bias scale_factor_error scale_factor_asymmetry quadratic_nonlinearity cubic_nonlinearity sine_response bias_temperature
-    bias_temperature_quadratic scale_factor_temperature bias_temperature_rate thermal_lag thermal_hysteresis warm_up rate_ramp bias_step
-    heading_sensitivity acceleration_sensitivity vibration_rectification supply_sensitivity interference_tone bandwidth time_offset
-    clock_rate dead_zone saturation quantization outliers stuck_samples dropped_samples reference_once_per_rev reference_scale
-    reference_slip reference_quantization unit_error angle_random_walk bias_instability rate_random_walk
-""")
+NAMES = re.findall(r'\w+', (
+    """
+    bias scale_factor_error scale_factor_asymmetry quadratic_nonlinearity cubic_nonlinearity """
+    """sine_response bias_temperature
+    bias_temperature_quadratic scale_factor_temperature bias_temperature_rate thermal_lag """
+    """thermal_hysteresis warm_up rate_ramp bias_step
+    heading_sensitivity acceleration_sensitivity vibration_rectification supply_sensitivity """
+    """interference_tone bandwidth time_offset
+    clock_rate dead_zone saturation quantization outliers stuck_samples dropped_samples """
+    """reference_once_per_rev reference_scale
+    reference_slip reference_quantization unit_error angle_random_walk bias_instability """
+    """rate_random_walk
+"""))
 
 
 def test_every_name_of_the_catalogue_is_a_cause_and_no_other():
@@ -32,13 +38,16 @@ def test_a_cause_says_what_it_is_and_what_parts_it_from_its_twins(name):
     assert cause.name == name and cause.sentence.endswith('.') and cause.units and cause.along
     assert bool(cause.twins) == bool(cause.separate_by)
     assert all(name in CAUSES[twin].twins for twin in cause.twins), 'a twin is one on both sides'
-    assert cause.needs <= {*QUANTITIES, 'reference'} and cause.of in {'gyro', 'reference', 'record', 'noise'}
+    assert (cause.needs <= {*QUANTITIES, 'reference'}
+            and cause.of in {'gyro', 'reference', 'record', 'noise'})
 
 
 @pytest.mark.parametrize('name, needed', [
-    ('bias', {'time'}), ('bias_temperature', {'time', 'temperature'}), ('scale_factor_temperature', {'time', 'temperature', 'reference'}),
-    ('supply_sensitivity', {'time', 'supply'}), ('time_offset', {'time', 'reference'}), ('heading_sensitivity', {'time', 'reference'}),
-    ('interference_tone', {'time'}), ('reference_quantization', {'time', 'reference_heading'})])
+    ('bias', {'time'}), ('bias_temperature', {'time', 'temperature'}),
+    ('scale_factor_temperature', {'time', 'temperature', 'reference'}),
+    ('supply_sensitivity', {'time', 'supply'}), ('time_offset', {'time', 'reference'}),
+    ('heading_sensitivity', {'time', 'reference'}), ('interference_tone', {'time'}),
+    ('reference_quantization', {'time', 'reference_heading'})])
 def test_what_a_log_must_hold_to_show_a_cause(name, needed):
     assert CAUSES[name].needs == needed
 
@@ -49,4 +58,5 @@ def test_a_reference_is_a_column_of_a_log():
 
 def test_no_sentence_is_written_twice():
     sentences = [cause.sentence for cause in CAUSES.values()]
-    assert len(set(sentences)) == len(sentences) and all(re.match('[A-Z]', sentence) for sentence in sentences)
+    assert (len(set(sentences)) == len(sentences)
+            and all(re.match('[A-Z]', sentence) for sentence in sentences))
