@@ -35,30 +35,35 @@ def model(tmp_path):
 @pytest.fixture
 def log(run, model, tmp_path):
     path = tmp_path / 'log.csv'
-    assert run('simulate', '--model', model, '--motion', 'calibration', '--out', path, '--seed', 1)[0] == 0
+    assert run('simulate', '--model', model, '--motion', 'calibration', '--out', path,
+               '--seed', 1)[0] == 0
     return path
 
 
 @pytest.mark.parametrize('verb', VERBS)
 def test_every_verb_has_help_with_an_example(run, verb):
     code, text, _ = run(verb, '--help')
-    assert code == 0 and f'example: gyro_calibration {verb}' in ' '.join(text.split()) and '--json' in text
+    assert (code == 0 and f'example: gyro_calibration {verb}' in ' '.join(text.split())
+            and '--json' in text)
 
 
 def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, tmp_path):
-    code, text, _ = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--json')
+    code, text, _ = run('compensate', log, '--model', model, '--out',
+                        tmp_path / 'out.csv', '--json')
     assert code == 0
     answer = json.loads(text)
     assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
     compensated = read_log(tmp_path / 'out.csv')
     heading = np.array(compensated.others['heading_rad'], dtype=float)
     np.testing.assert_allclose(heading, compensated.reference_heading, atol=1e-9)
-    np.testing.assert_allclose(np.array(compensated.others['rate_rad_s'], dtype=float), compensated.reference_rate, atol=1e-12)
+    np.testing.assert_allclose(np.array(compensated.others['rate_rad_s'], dtype=float),
+                               compensated.reference_rate, atol=1e-12)
 
 
 def test_compensate_says_how_sure_it_is(run, log, tmp_path):
     (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
-    code, text, _ = run('compensate', log, '--model', tmp_path / 'noisy.yaml', '--out', tmp_path / 'out.csv')
+    code, text, _ = run('compensate', log, '--model', tmp_path / 'noisy.yaml', '--out',
+                        tmp_path / 'out.csv')
     deviation = np.array(read_log(tmp_path / 'out.csv').others['heading_std_rad'], dtype=float)
     assert code == 0 and 'deg' in text
     assert deviation[-1] == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
@@ -67,7 +72,8 @@ def test_compensate_says_how_sure_it_is(run, log, tmp_path):
 def test_compensate_claims_no_deviation_where_the_model_knows_of_none(run, model, log, tmp_path):
     code, text, _ = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv')
     assert code == 0 and 'Heading at the end' in text and '+-' not in text
-    answer = json.loads(run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--json')[1])
+    answer = json.loads(
+        run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--json')[1])
     assert answer['heading_std_rad'] is None
 
 
@@ -77,55 +83,71 @@ def test_rows_of_others_between_the_samples_make_no_rate_noisier(run, tmp_path):
     time = np.arange(2000) / 100.0
     output = np.where(np.arange(2000) % 10 == 0, 0.0, np.nan)
     write_log(tmp_path / 'log.csv', Log(output=output, time=time))
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml', '--out', tmp_path / 'out.csv')[0] == 0
-    assert float(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'][0]) == pytest.approx(7.3e-4 / math.sqrt(0.1), rel=1e-6)
+    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml', '--out',
+               tmp_path / 'out.csv')[0] == 0
+    assert float(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'][0]) == pytest.approx(
+        7.3e-4 / math.sqrt(0.1), rel=1e-6)
 
 
-@pytest.mark.parametrize('words, resting', [(['--rest'], True), (['--hindsight'], True), ([], False)])
+@pytest.mark.parametrize('words, resting',
+                         [(['--rest'], True), (['--hindsight'], True), ([], False)])
 def test_compensate_looks_for_rests(run, tmp_path, words, resting):
-    """The robot's drive with the noise of an XV-3500 and a bias that the model knows to 0.02 deg/s only."""
+    """The robot's drive, with the noise of an XV-3500 and a bias known to 0.02 deg/s."""
     noise = '\nnoise: {angle_random_walk: 7.3e-4, bias_instability: 8.7e-5}'
     (tmp_path / 'gyro.yaml').write_text('effects: {bias: {bias: 0.002}}' + noise)
     known = '{scale_factor_error: 0.0, bias: 0.0017, covariance: [[1.0e-8, 0.0], [0.0, 1.2e-7]]}'
     (tmp_path / 'model.yaml').write_text(f'effects: {{}}\nself_calibration: {known}{noise}')
-    assert run('simulate', '--model', tmp_path / 'gyro.yaml', '--motion', 'robot', '--out', tmp_path / 'log.csv', '--seed', 1)[0] == 0
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv', *words)[0] == 0
+    assert run('simulate', '--model', tmp_path / 'gyro.yaml', '--motion', 'robot', '--out',
+               tmp_path / 'log.csv', '--seed', 1)[0] == 0
+    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out',
+               tmp_path / 'out.csv', *words)[0] == 0
     found = read_log(tmp_path / 'out.csv')
     columns = {name: np.array(values, float) for name, values in found.others.items()}
-    error, deviation = columns['heading_rad'] - found.reference_heading, columns['heading_std_rad'][-1]
+    error, deviation = (columns['heading_rad'] - found.reference_heading,
+                        columns['heading_std_rad'][-1])
     assert abs(error[-1]) < 4.0 * deviation and (deviation < 0.03) == resting
     stands = found.reference_rate == 0.0
-    assert columns['resting'][stands].mean() > 0.85 and columns['resting'][~stands].mean() < 0.05 if resting else 'resting' not in columns
+    assert (columns['resting'][stands].mean() > 0.85 and columns['resting'][~stands].mean() < 0.05
+            if resting else 'resting' not in columns)
 
 
 def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(run, model, log, tmp_path):
-    code, _, text = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv', '--rest')
+    code, _, text = run('compensate', log, '--model', model, '--out',
+                        tmp_path / 'out.csv', '--rest')
     assert code == 2 and 'allan' in text and not (tmp_path / 'out.csv').exists()
 
 
 def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
     (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0\n10,9.1\n')
-    assert run('compensate', tmp_path / 'table.csv', '--model', model, '--out', tmp_path / 'out.csv')[0] == 0
+    assert run('compensate', tmp_path / 'table.csv', '--model', model, '--out',
+               tmp_path / 'out.csv')[0] == 0
     columns = read_log(tmp_path / 'out.csv').others
     assert 'rate_rad_s' in columns and 'heading_rad' not in columns
 
 
-@pytest.mark.parametrize('method, tolerance', [('likelihood', 1e-6), ('rate', 1e-6), ('heading', 0.05)])
+@pytest.mark.parametrize('method, tolerance',
+                         [('likelihood', 1e-6), ('rate', 1e-6), ('heading', 0.05)])
 def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tolerance):
     profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,rate_dps\n' + ''.join(f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
-    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method, '--out', tmp_path / 'new.yaml', '--json')
+    profile.write_text('time_s,rate_dps\n' + ''.join(
+        f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
+    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method, '--out',
+                        tmp_path / 'new.yaml', '--json')
     answer = json.loads(text)
     assert code == 0 and answer['scale_factor_error'] == pytest.approx(-0.1, rel=tolerance)
-    assert read_model(tmp_path / 'new.yaml').self_calibration.bias == pytest.approx(0.002, rel=tolerance)
+    assert read_model(tmp_path / 'new.yaml').self_calibration.bias == pytest.approx(
+        0.002, rel=tolerance)
 
 
-def test_a_new_model_says_which_log_it_comes_from_and_a_given_one_what_it_said_before(run, log, model, tmp_path):
-    write_log(tmp_path / 'rest.csv', Log(output=np.random.default_rng(1).normal(size=2000), time=np.arange(2000) / 100.0))
+def test_a_new_model_says_which_log_it_comes_from_and_a_given_one_what_it_said_before(
+        run, log, model, tmp_path):
+    write_log(tmp_path / 'rest.csv',
+              Log(output=np.random.default_rng(1).normal(size=2000), time=np.arange(2000) / 100.0))
     for verb, given in (('self-calibrate', log), ('allan', tmp_path / 'rest.csv')):
         assert run(verb, given, '--out', tmp_path / 'new.yaml')[0] == 0
         origin = read_model(tmp_path / 'new.yaml').origin
-        assert origin['files'] == [{'name': given.name, 'sha256': hashlib.sha256(given.read_bytes()).hexdigest()}]
+        assert origin['files'] == [{'name': given.name,
+                                    'sha256': hashlib.sha256(given.read_bytes()).hexdigest()}]
         assert origin['date'] and origin['program'].startswith('gyro_calibration ')
         assert run(verb, given, '--model', model, '--out', tmp_path / 'new.yaml')[0] == 0
         assert read_model(tmp_path / 'new.yaml').origin == {}
@@ -137,28 +159,37 @@ def test_self_calibrate_takes_the_reference_of_the_log_itself(run, log):
 
 
 @pytest.mark.parametrize('words', [(), ('--turns', 'nearest')], ids=['profile', 'turns'])
-def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate(run, tmp_path, words):
+def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate(
+        run, tmp_path, words):
     """A gyro that is as its model says: what its specific force adds is no bias."""
-    (tmp_path / 'model.yaml').write_text('effects: {acceleration_sensitivity: {acceleration_sensitivity: 0.001}}')
-    rate = np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)]) + np.sin(np.arange(3000)) * 1e-9
-    write_log(tmp_path / 'log.csv', Log(output=rate + 0.00981, time=np.arange(3000) / 100.0, specific_force=np.full(3000, 9.81),
-                                        reference_rate=rate))
-    code, text, error = run('self-calibrate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json', *words)
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {acceleration_sensitivity: {acceleration_sensitivity: 0.001}}')
+    rate = (np.concatenate([np.zeros(500), np.full(2000, TURN / 20.0), np.zeros(500)])
+            + np.sin(np.arange(3000)) * 1e-9)
+    write_log(tmp_path / 'log.csv', Log(output=rate + 0.00981, time=np.arange(3000) / 100.0,
+                                        specific_force=np.full(3000, 9.81), reference_rate=rate))
+    code, text, error = run('self-calibrate', tmp_path / 'log.csv', '--model',
+                            tmp_path / 'model.yaml', '--json', *words)
     assert code == 0, error
     assert abs(json.loads(text)['bias']) < 1e-5
 
 
 def test_what_the_data_do_not_allow_ends_with_1_and_one_sentence(run, tmp_path):
-    (tmp_path / 'dead.csv').write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},0\n' for i in range(2000)))
+    (tmp_path / 'dead.csv').write_text('time_s,gyro_dps\n'
+                                       + ''.join(f'{i / 100},0\n' for i in range(2000)))
     (tmp_path / 'profile.csv').write_text('time_s,rate_dps\n0,0\n5,30\n10,-30\n20,0\n')
-    code, text, error = run('self-calibrate', tmp_path / 'dead.csv', '--profile', tmp_path / 'profile.csv')
+    code, text, error = run('self-calibrate', tmp_path / 'dead.csv', '--profile',
+                            tmp_path / 'profile.csv')
     assert code == 1 and not text and 'same value' in error and error.count('\n') == 1
 
 
 @pytest.mark.parametrize('words, said', [
-    (['compensate', 'missing.csv', '--model', 'MODEL', '--out', 'x.csv'], 'missing.csv: cannot be read'),
-    (['compensate', 'LOG', '--model', 'missing.yaml', '--out', 'x.csv'], 'missing.yaml: there is no such file'),
-    (['simulate', '--model', 'MODEL', '--motion', 'waltz', '--out', 'x.csv'], 'waltz: there is no such motion'),
+    (['compensate', 'missing.csv', '--model', 'MODEL', '--out', 'x.csv'],
+     'missing.csv: cannot be read'),
+    (['compensate', 'LOG', '--model', 'missing.yaml', '--out', 'x.csv'],
+     'missing.yaml: there is no such file'),
+    (['simulate', '--model', 'MODEL', '--motion', 'waltz', '--out', 'x.csv'],
+     'waltz: there is no such motion'),
     (['emulate', '--protocol', 'morse', '--model', 'MODEL'], "protocol 'morse' is not known"),
     (['emulate', '--protocol', 'fizoptika', '--model', 'MODEL'], 'sensitivity is not set'),
     (['dance'], 'invalid choice'),
@@ -171,11 +202,13 @@ def test_wrong_use_ends_with_2_and_says_why(run, model, log, words, said):
 
 def test_a_log_of_counts_wants_its_sensitivity(run, model, tmp_path):
     (tmp_path / 'counts.csv').write_text('gyro_counts\n' + '100\n' * 10)
-    words = ['compensate', tmp_path / 'counts.csv', '--model', model, '--out', tmp_path / 'out.csv', '--rate', 10]
+    words = ['compensate', tmp_path / 'counts.csv', '--model', model, '--out',
+             tmp_path / 'out.csv', '--rate', 10]
     code, _, error = run(*words)
     assert code == 2 and '--sensitivity' in error
     assert run(*words, '--sensitivity', 0.07)[0] == 0
-    assert float(read_log(tmp_path / 'out.csv').others['rate_rad_s'][0]) == pytest.approx((7 * DEGREE - 0.002) / 0.9)
+    assert float(read_log(tmp_path / 'out.csv').others['rate_rad_s'][0]) == pytest.approx(
+        (7 * DEGREE - 0.002) / 0.9)
 
 
 def test_the_same_seed_gives_the_same_log_and_the_seed_is_said(run, tmp_path):
@@ -188,18 +221,23 @@ def test_the_same_seed_gives_the_same_log_and_the_seed_is_said(run, tmp_path):
 
 @pytest.mark.parametrize('outputs', ['nan,nan', 'nan,1'])
 def test_emulate_sends_no_log_without_an_output(run, tmp_path, outputs):
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(f'{row},{each}\n' for row, each in enumerate(outputs.split(','))))
-    code, text, error = run('emulate', '--protocol', 'csv', '--log', tmp_path / 'log.csv', '--repeat')
-    assert code == 1 and not text and 'of 2 samples have an output; send a log with two or more' in error
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(
+        f'{row},{each}\n' for row, each in enumerate(outputs.split(','))))
+    code, text, error = run('emulate', '--protocol', 'csv', '--log', tmp_path / 'log.csv',
+                            '--repeat')
+    assert (code == 1 and not text
+            and 'of 2 samples have an output; send a log with two or more' in error)
 
 
 def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
-    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'kvh_dsp3000', '--model', model, '--json',
-               '--motion', 'calibration', '--wait', '--link', tmp_path / 'gyro']
+    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'kvh_dsp3000',
+               '--model', model, '--json', '--motion', 'calibration', '--wait',
+               '--link', tmp_path / 'gyro']
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert json.loads(process.stdout.readline())['path'] == str(tmp_path / 'gyro')
-        decoder, samples, port = find('kvh_dsp3000').decoder(), [], os.open(tmp_path / 'gyro', os.O_RDONLY | os.O_NOCTTY)
+        decoder, samples, port = (find('kvh_dsp3000').decoder(), [],
+                                  os.open(tmp_path / 'gyro', os.O_RDONLY | os.O_NOCTTY))
         while len(samples) < 30:
             samples += decoder.feed(os.read(port, 1000))
         assert samples[0].output == pytest.approx(0.002, abs=1e-7)
@@ -214,11 +252,13 @@ def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
 def demo(ros_domain, tmp_path):
     """Run the demonstration as a person would, and return its folder, time and process."""
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo', '--out', tmp_path / 'demo', '--seed', '2', '--json'],
+    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo', '--out',
+                           tmp_path / 'demo', '--seed', '2', '--json'],
                           capture_output=True, text=True, timeout=240), tmp_path / 'demo'
 
 
-def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_picture_table_and_log(demo):
+def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_picture_table_and_log(
+        demo):
     process, folder = demo
     assert process.returncode == 0 and 'Traceback' not in process.stderr, process.stderr
     errors = json.loads(process.stdout)['mean_error_deg']
@@ -229,7 +269,8 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
 
 
 @pytest.mark.parametrize('refusals', [0, 2, 3])
-def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(ros_domain, capsys, refusals):
+def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
+        ros_domain, capsys, refusals):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
     from gyro_calibration.demo import ATTEMPTS, Refused, calibrate
     answers = iter([Refused('calibrate: the gyro slipped')] * refusals + ['done'])
@@ -248,9 +289,12 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
 
 
 def test_rows_without_output_are_said_and_do_not_spoil_the_heading(run, model, tmp_path):
-    rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]  # 0.002 rad/s, the bias
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps\n' + ''.join(f'{i / 100},{row}\n' for i, row in enumerate(rows)))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model, '--out', tmp_path / 'out.csv', '--json')
+    # the bias, 0.002 rad/s
+    rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]
+    (tmp_path / 'log.csv').write_text(
+        'time_s,gyro_dps\n' + ''.join(f'{i / 100},{row}\n' for i, row in enumerate(rows)))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model, '--out',
+                        tmp_path / 'out.csv', '--json')
     answer = json.loads(text)
     assert code == 0 and answer['rows_without_output'] == 5 and abs(answer['heading_rad']) < 1e-12
     assert read_log(tmp_path / 'out.csv').others['rate_rad_s'][22] == 'nan'
@@ -260,7 +304,8 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_pat
     code, text, _ = run('self-calibrate', log, '--method', 'rate', '--out', tmp_path / 'new.yaml')
     assert code == 0 and '+-' not in text
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
-    assert run('compensate', log, '--model', tmp_path / 'new.yaml', '--out', tmp_path / 'out.csv')[0] == 0
+    assert run('compensate', log, '--model', tmp_path / 'new.yaml', '--out',
+               tmp_path / 'out.csv')[0] == 0
     assert read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1] == 'nan'
 
 
@@ -273,10 +318,13 @@ def test_a_reference_that_is_lost_at_the_beginning_does_not_shift_the_motion(run
             row[header.index(name)] = 'nan'
     (tmp_path / 'lost.csv').write_text('\n'.join(','.join(row) for row in [header, *rows]) + '\n')
     answer = json.loads(run('self-calibrate', tmp_path / 'lost.csv', '--json')[1])
-    assert answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6) and abs(answer['time_offset_s']) < 1e-3
+    assert (answer['scale_factor_error'] == pytest.approx(-0.1, abs=1e-6)
+            and abs(answer['time_offset_s']) < 1e-3)
 
 
-@pytest.mark.parametrize('words', [('reproduce', 'ojeda'), ('simulate', '--model', 'm.yaml', '--motion', 'rest', '--out', 'o.csv')])
+@pytest.mark.parametrize('words', [
+    ('reproduce', 'ojeda'),
+    ('simulate', '--model', 'm.yaml', '--motion', 'rest', '--out', 'o.csv')])
 def test_a_seed_below_zero_is_wrong_use(words, capsys):
     with pytest.raises(SystemExit) as end:
         main([*words, '--seed', '-1'])
@@ -284,43 +332,59 @@ def test_a_seed_below_zero_is_wrong_use(words, capsys):
 
 
 @pytest.mark.parametrize('words', [
-    ('fit', 'LOG', '--out', ''), ('compensate', 'LOG', '--model', 'MODEL', '--out', ''), ('fit', ''), ('allan', 'LOG', '--model', ''),
-    ('simulate', '--model', 'MODEL', '--motion', 'rest', '--out', ''), ('plan', '--limits', '', '--out', 'x.csv')])
+    ('fit', 'LOG', '--out', ''), ('compensate', 'LOG', '--model', 'MODEL', '--out', ''),
+    ('fit', ''), ('allan', 'LOG', '--model', ''),
+    ('simulate', '--model', 'MODEL', '--motion', 'rest', '--out', ''),
+    ('plan', '--limits', '', '--out', 'x.csv')])
 def test_an_empty_option_is_wrong_use(run, model, log, words):
-    """As a variable of the shell leaves it that is not set; nothing was written then, and nothing was said of it."""
+    """An unset variable of the shell leaves an empty argument, which is not no argument."""
     code, text, error = run(*[{'MODEL': model, 'LOG': log}.get(word, word) for word in words])
-    assert code == 2 and not text and 'is empty; give it a value, or leave it out' in error and error.count('\n') == 1
+    assert (code == 2 and not text and 'is empty; give it a value, or leave it out' in error
+            and error.count('\n') == 1)
 
 
 @pytest.mark.parametrize('words', [
-    ('--sample-rate', '1e-300'), ('--sample-rate', '1e300'), ('--temperature', 'nan'), ('--temperature', '1e9'), ('--sample-rate', '1e9')])
+    ('--sample-rate', '1e-300'), ('--sample-rate', '1e300'), ('--temperature', 'nan'),
+    ('--temperature', '1e9'), ('--sample-rate', '1e9')])
 def test_a_simulation_beyond_all_bounds_is_wrong_use(run, model, tmp_path, words):
-    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out', tmp_path / 'out.csv', *words)
-    assert code == 2 and not text and 'Traceback' not in error and not (tmp_path / 'out.csv').exists()
+    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out',
+                            tmp_path / 'out.csv', *words)
+    assert (code == 2 and not text and 'Traceback' not in error
+            and not (tmp_path / 'out.csv').exists())
 
 
 def test_a_simulation_of_a_single_sample_is_wrong_use(run, model, tmp_path):
-    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out', tmp_path / 'out.csv', '--sample-rate', 0.001)
-    assert code == 2 and not text and 'less than two samples; give a higher rate' in error and not (tmp_path / 'out.csv').exists()
+    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out',
+                            tmp_path / 'out.csv', '--sample-rate', 0.001)
+    assert (code == 2 and not text and 'less than two samples; give a higher rate' in error
+            and not (tmp_path / 'out.csv').exists())
 
 
 ROWS = {
-    'values of 1e300': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(f'{k / 10},{1e300 * (k % 3)},{k % 3}\n' for k in range(500)),
-    'values of 1e20': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n' for k in range(500)),
-    'values of 1e-300': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(f'{k / 10},{1e-300 * k},{k}\n' for k in range(500)),
-    'an eternity': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(f'{k * 1e17},{k % 7},{k % 5}\n' for k in range(500)),
-    'an instant': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(f'{k * 2e-9},{k % 7},{k % 5}\n' for k in range(500)),
+    'values of 1e300': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
+        f'{k / 10},{1e300 * (k % 3)},{k % 3}\n' for k in range(500)),
+    'values of 1e20': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
+        f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n' for k in range(500)),
+    'values of 1e-300': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
+        f'{k / 10},{1e-300 * k},{k}\n' for k in range(500)),
+    'an eternity': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
+        f'{k * 1e17},{k % 7},{k % 5}\n' for k in range(500)),
+    'an instant': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
+        f'{k * 2e-9},{k % 7},{k % 5}\n' for k in range(500)),
     'one dwell': 'gyro_dps,reference_rate_dps\n' + '1.5,2\n' * 40,
-    'samples far apart': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(f'{k * 1e10},{k % 7},{k % 5}\n' for k in range(200)),
+    'samples far apart': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
+        f'{k * 1e10},{k % 7},{k % 5}\n' for k in range(200)),
     'two samples': 'time_s,gyro_dps\n1e10,1\n2e10,-1e20\n',
-    'heat': 'gyro_dps,reference_rate_dps,temperature_degc\n' + ''.join(f'{k},{k},{(k % 3) * 1e19}\n' for k in range(60)),
+    'heat': 'gyro_dps,reference_rate_dps,temperature_degc\n' + ''.join(
+        f'{k},{k},{(k % 3) * 1e19}\n' for k in range(60)),
 }
 
 
 @pytest.mark.parametrize('text', ROWS.values(), ids=ROWS)
 @pytest.mark.parametrize('words', [
-    ('fit', '--out', 'OUT'), ('fit', '--method', 'dwells'), ('fit', '--method', 'likelihood'), ('fit', '--method', 'rate'), ('turn',),
-    ('fit', '--polynomial'), ('allan',), ('self-calibrate',), ('self-calibrate', '--turns', 'nearest'),
+    ('fit', '--out', 'OUT'), ('fit', '--method', 'dwells'), ('fit', '--method', 'likelihood'),
+    ('fit', '--method', 'rate'), ('turn',), ('fit', '--polynomial'), ('allan',),
+    ('self-calibrate',), ('self-calibrate', '--turns', 'nearest'),
     ('compensate', '--model', 'NOISY', '--out', 'OUT', '--threshold', '0'),
     ('compensate', '--model', 'NOISY', '--out', 'OUT', '--hindsight')], ids=' '.join)
 def test_what_no_gyro_says_is_refused_in_a_sentence_or_computed(run, tmp_path, words, text):
@@ -328,17 +392,21 @@ def test_what_no_gyro_says_is_refused_in_a_sentence_or_computed(run, tmp_path, w
     (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
     given = {'OUT': tmp_path / 'out', 'NOISY': tmp_path / 'noisy.yaml'}
     with np.errstate(all='ignore'):
-        code, answer, error = run(words[0], tmp_path / 'log.csv', *[given.get(word, word) for word in words[1:]], '--json')
+        code, answer, error = run(words[0], tmp_path / 'log.csv',
+                                  *[given.get(word, word) for word in words[1:]], '--json')
     said = [line for line in error.splitlines() if line.startswith('gyro_calibration: ')]
     assert code in (0, 1, 2) and len(said) == (code > 0) and bool(answer) == (code == 0)
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
     """Its sum would be waited for without end: whoever wrote it has gone."""
-    rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n' for rate in range(-60, 61, 10) for k in range(3))
+    rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n'
+                   for rate in range(-60, 61, 10) for k in range(3))
     os.mkfifo(tmp_path / 'log.csv')
-    with subprocess.Popen(['sh', '-c', 'cat > "$0"', tmp_path / 'log.csv'], stdin=subprocess.PIPE, text=True) as writer:
+    with subprocess.Popen(['sh', '-c', 'cat > "$0"', tmp_path / 'log.csv'], stdin=subprocess.PIPE,
+                          text=True) as writer:
         writer.stdin.write(f'gyro_dps,reference_rate_dps\n{rows}')
         writer.stdin.close()
         code, _, error = run('fit', tmp_path / 'log.csv', '--out', tmp_path / 'model.yaml')
-    assert code == 0 and read_model(tmp_path / 'model.yaml').origin['files'] == [{'name': 'log.csv'}], error
+    assert (code == 0 and read_model(tmp_path / 'model.yaml').origin['files']
+            == [{'name': 'log.csv'}]), error

@@ -1,4 +1,4 @@
-"""Compensation: the model, then its self-calibration; what lies outside the calibrated range; and what the rate owes to each value."""
+"""Compensation: model, then self-calibration; outside the valid range; sensitivity to values."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, Channels, polynomial_from_matrix, rate_temperature_polynomial
+from gyro_calibration.effects import (
+    BIAS,
+    CATALOGUE,
+    SCALE_FACTOR_ERROR,
+    Channels,
+    polynomial_from_matrix,
+    rate_temperature_polynomial,
+)
 from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
 from gyro_calibration.log import CACHED
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
@@ -15,7 +22,8 @@ from gyro_calibration.noise import Noise
 
 WARM = Term(*polynomial_from_matrix([[0.1], [0.0]]))  # the bias is 0.1 deg/s a degC
 CALIBRATION = SelfCalibration(0.04, 0.002, ((1e-6, 1e-8), (1e-8, 1e-6)))
-MODEL = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (0.001,))), np.diag([1e-6, 4e-6]), (-2.0, 2.0), (10.0, 40.0))
+MODEL = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (0.001,))), np.diag([1e-6, 4e-6]),
+                  (-2.0, 2.0), (10.0, 40.0))
 
 
 def test_no_model_changes_nothing():
@@ -33,28 +41,36 @@ def test_beyond_the_calibrated_temperatures_their_nearest_end_is_used():
     model = GyroModel((WARM,), temperature_range=(10.0, 40.0))
     degc = np.array([-20.0, 10.0, 25.0, 40.0, 90.0])
     done = compensate(model, np.zeros(5), degc)
-    assert done.rate.tolist() == compensate(model, np.zeros(5), np.clip(degc, 10.0, 40.0)).rate.tolist()
+    assert (done.rate.tolist()
+            == compensate(model, np.zeros(5), np.clip(degc, 10.0, 40.0)).rate.tolist())
     assert done.temperature_clipped.tolist() == [True, False, False, False, True]
-    assert [bool(compensate(model, 0.0, float(one)).temperature_clipped) for one in degc] == done.temperature_clipped.tolist()
+    assert ([bool(compensate(model, 0.0, float(one)).temperature_clipped) for one in degc]
+            == done.temperature_clipped.tolist())
 
 
 def test_without_a_temperature_the_reference_temperature_is_taken():
     model = GyroModel((WARM,), reference_temperature=31.0)
-    assert compensate(model, 0.2).rate == compensate(model, 0.2, 31.0).rate != compensate(model, 0.2, 30.0).rate
+    assert (compensate(model, 0.2).rate == compensate(model, 0.2, 31.0).rate
+            != compensate(model, 0.2, 30.0).rate)
 
 
 def test_outputs_beyond_the_calibrated_rates_are_marked():
-    assert compensate(MODEL, np.array([-2.1, -2.0, 0.0, 2.0, 2.1])).beyond_range.tolist() == [True, False, False, False, True]
-    assert not compensate(GyroModel(), 99.0).beyond_range and compensate(GyroModel(), 101.0).beyond_range
+    assert compensate(MODEL, np.array([-2.1, -2.0, 0.0, 2.0, 2.1])).beyond_range.tolist() == [
+        True, False, False, False, True]
+    assert (not compensate(GyroModel(), 99.0).beyond_range
+            and compensate(GyroModel(), 101.0).beyond_range)
 
 
-@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('calibration', [None, CALIBRATION],
+                         ids=['model alone', 'self-calibrated'])
 @pytest.mark.parametrize('given', [None, 31.0, 'all', 'clipped'])
 def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, given):
-    model = GyroModel((WARM, *MODEL.terms), None, (-0.5, 0.5), (10.0, 40.0), self_calibration=calibration)
+    model = GyroModel((WARM, *MODEL.terms), None, (-0.5, 0.5), (10.0, 40.0),
+                      self_calibration=calibration)
     count, generator = 2 * CACHED + 77, np.random.default_rng(0)
     output = generator.normal(size=count)
-    temperature = {'all': generator.uniform(20.0, 30.0, count), 'clipped': generator.uniform(0.0, 50.0, count)}.get(given, given)
+    temperature = {'all': generator.uniform(20.0, 30.0, count),
+                   'clipped': generator.uniform(0.0, 50.0, count)}.get(given, given)
     whole = compensate(model, output, temperature)
     cuts = [0, 1, 500, CACHED + 3, count]
     for first, end in zip(cuts, cuts[1:]):
@@ -62,31 +78,36 @@ def test_a_log_longer_than_the_cache_is_compensated_as_its_pieces(calibration, g
         piece = compensate(model, output[first:end], here)
         for name in ('modelled', 'rate', 'temperature', 'temperature_clipped', 'beyond_range'):
             of_whole = np.broadcast_to(getattr(whole, name), count)[first:end]
-            assert np.array_equal(of_whole, np.broadcast_to(getattr(piece, name), end - first)), name
+            assert np.array_equal(of_whole,
+                                  np.broadcast_to(getattr(piece, name), end - first)), name
 
 
 @pytest.mark.parametrize('orders', [(0, 0), (0, 2), (1, 0), (1, 1), (3, 2), (5, 3)])
 def test_the_shorter_way_to_a_polynomial_is_the_sum_of_its_columns(orders):
     effect, generator = rate_temperature_polynomial(*orders), np.random.default_rng(0)
     shapes, coefficients = (0.1, 1.7, 35.0, 10.0), generator.normal(size=len(effect.coefficients))
-    channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50), generator.uniform(10.0, 50.0, 50))
+    channels = Channels(np.zeros(50), generator.uniform(-2.0, 2.0, 50),
+                        generator.uniform(10.0, 50.0, 50))
     error = effect.error(channels, (*shapes, *coefficients.tolist()))
-    assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)), rel=1e-12, abs=1e-13)
+    assert error == pytest.approx(coefficients @ np.array(effect.columns(channels, *shapes)),
+                                  rel=1e-12, abs=1e-13)
 
 
 UNCERTAIN = {
     'bias and scale': MODEL,
     'sine response': GyroModel(
-        (Term(CATALOGUE['sine_response'], (0.6, 1.0)), Term(SCALE_FACTOR_ERROR, (0.02,)), Term(BIAS, (0.01,)),
-         Term(CATALOGUE['scale_factor_temperature'], (25.0, 1e-3))),
-        np.array([[4e-6, 1e-7, 0.0, 0.0], [1e-7, 1e-6, 1e-7, 0.0], [0.0, 1e-7, 1e-6, 0.0], [0.0, 0.0, 0.0, 1e-9]])),
+        (Term(CATALOGUE['sine_response'], (0.6, 1.0)), Term(SCALE_FACTOR_ERROR, (0.02,)),
+         Term(BIAS, (0.01,)), Term(CATALOGUE['scale_factor_temperature'], (25.0, 1e-3))),
+        np.array([[4e-6, 1e-7, 0.0, 0.0], [1e-7, 1e-6, 1e-7, 0.0], [0.0, 1e-7, 1e-6, 0.0],
+                  [0.0, 0.0, 0.0, 1e-9]])),
     'polynomial': GyroModel(
-        (Term(*polynomial_from_matrix([[1e-4, 2e-3, 0.1], [1e-5, 4e-3, -0.05]])),), np.diag(np.arange(1.0, 7.0)) * 1e-7),
+        (Term(*polynomial_from_matrix([[1e-4, 2e-3, 0.1], [1e-5, 4e-3, -0.05]])),),
+        np.diag(np.arange(1.0, 7.0)) * 1e-7),
 }
 
 
 def with_values(model, change):
-    """Return the model with its fitted values, and then s and b of its self-calibration, changed by so much."""
+    """Return the model with its fitted values, then s and b, changed by so much."""
     change, terms = list(change), []
     for term in model.terms:
         values = list(term.values)
@@ -96,43 +117,52 @@ def with_values(model, change):
     if model.self_calibration is None:
         return replace(model, terms=tuple(terms))
     s, b = change
-    calibration = SelfCalibration(model.self_calibration.scale_factor_error + s, model.self_calibration.bias + b)
+    calibration = SelfCalibration(model.self_calibration.scale_factor_error + s,
+                                  model.self_calibration.bias + b)
     return replace(model, terms=tuple(terms), self_calibration=calibration)
 
 
-@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('calibration', [None, CALIBRATION],
+                         ids=['model alone', 'self-calibrated'])
 @pytest.mark.parametrize('name', UNCERTAIN)
 def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
     model, step = replace(UNCERTAIN[name], self_calibration=calibration), 1e-6
-    rate, temperature = np.array([-1.4, -0.3, 0.0, 0.7, 1.5]), np.array([22.0, 24.0, 25.0, 30.0, 31.0])
+    rate, temperature = (np.array([-1.4, -0.3, 0.0, 0.7, 1.5]),
+                         np.array([22.0, 24.0, 25.0, 30.0, 31.0]))
     output = model.output(rate, temperature)
     base = compensate(model, output, temperature).rate
     differences = [(compensate(with_values(model, row), output, temperature).rate - base) / step
                    for row in step * np.eye(len(covariance(model)))]
-    assert rate_sensitivity(model, output, base, temperature) == pytest.approx(np.array(differences), rel=1e-4, abs=1e-6)
+    assert rate_sensitivity(model, output, base, temperature) == pytest.approx(
+        np.array(differences), rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize('calibration', [None, CALIBRATION], ids=['model alone', 'self-calibrated'])
+@pytest.mark.parametrize('calibration', [None, CALIBRATION],
+                         ids=['model alone', 'self-calibrated'])
 @pytest.mark.parametrize('name', UNCERTAIN)
 @pytest.mark.parametrize('runs', [400, pytest.param(2000, marks=pytest.mark.evidence)])
 def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(
         name, calibration, runs):
-    """At 1.5 rad/s the sine response has bent so far (k w = 0.9) that a value counts 1.6 times what it adds to the output."""
+    """At 1.5 rad/s (k w = 0.9) a value of the sine response counts 1.6 times what it adds."""
     model = replace(UNCERTAIN[name], self_calibration=calibration)
     generator = np.random.default_rng(0)
     time = np.arange(101) * 0.1
     rate, temperature = 1.5 * np.sin(time), 25.0 + time
     output = model.output(rate, temperature)
     whole = covariance(model)
-    rates = np.array([compensate(with_values(model, drawn), output, temperature).rate
-                      for drawn in generator.multivariate_normal(np.zeros(len(whole)), whole, runs)])
+    rates = np.array(
+        [compensate(with_values(model, drawn), output, temperature).rate
+         for drawn in generator.multivariate_normal(np.zeros(len(whole)), whole, runs)])
     headings = np.array([integrate(time, row) for row in rates])
     rate = compensate(model, output, temperature).rate
     sensitivity = rate_sensitivity(model, output, rate, temperature)
     deviation = BlockIntegrator(Threshold(0.0), Noise(), whole).add(time, rate, sensitivity)[2]
-    scatter = 5.0 * math.sqrt(2.0 / runs)  # of a variance out of so many runs, five sigma for a hundred times
-    assert rates.var(axis=0) / quadratic_form(whole, sensitivity) == pytest.approx(np.ones(101), abs=scatter)
-    assert headings.var(axis=0)[1:] / deviation[1:] ** 2 == pytest.approx(np.ones(100), abs=scatter)
+    # of a variance of so many runs: five sigma, for a hundred times
+    scatter = 5.0 * math.sqrt(2.0 / runs)
+    assert rates.var(axis=0) / quadratic_form(whole, sensitivity) == pytest.approx(
+        np.ones(101), abs=scatter)
+    assert headings.var(axis=0)[1:] / deviation[1:] ** 2 == pytest.approx(
+        np.ones(100), abs=scatter)
 
 
 def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():
@@ -146,7 +176,8 @@ def test_what_a_sine_cannot_answer_has_a_large_but_finite_deviation():
 def test_the_sensitivity_of_one_sample_is_that_of_the_log():
     model, rates = replace(MODEL, self_calibration=CALIBRATION), np.array([-1.0, 0.7])
     at_once = rate_sensitivity(model, rates, rates, np.full(2, 25.0))
-    assert [rate_sensitivity(model, rate, rate, 25.0).tolist() for rate in rates.tolist()] == at_once.T.tolist()
+    assert ([rate_sensitivity(model, rate, rate, 25.0).tolist() for rate in rates.tolist()]
+            == at_once.T.tolist())
 
 
 def test_the_covariance_has_the_order_of_the_sensitivity():
@@ -158,6 +189,7 @@ def test_the_covariance_has_the_order_of_the_sensitivity():
 
 
 def test_the_quadratic_form_serves_one_vector_and_many():
-    matrix, vectors = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 0.0, 2.0], [0.0, 1.0, 1.0]])
+    matrix, vectors = (np.array([[2.0, 1.0], [1.0, 3.0]]),
+                       np.array([[1.0, 0.0, 2.0], [0.0, 1.0, 1.0]]))
     assert quadratic_form(matrix, vectors).tolist() == [2.0, 3.0, 15.0]
     assert quadratic_form(matrix, vectors[:, 2]) == 15.0

@@ -1,4 +1,4 @@
-"""The compensation node as a robot has it: its own process, real messages, parameters, services."""
+"""The compensation node as a robot has it: its own process, messages, parameters, services."""
 
 import math
 import os
@@ -109,7 +109,8 @@ def test_parameters_are_checked_described_and_taken_on_at_once(start, ros):
     _, gyro = start(stationary__threshold=0)
 
     def put(name, value):
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()])
         return ros.call(SetParameters, '/compensation_node/set_parameters', request).results[0]
     names = ros.call(ListParameters, '/compensation_node/list_parameters').result.names
     own = [name for name in names if not name.startswith('qos_overrides') and name not in (

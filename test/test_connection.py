@@ -1,4 +1,4 @@
-"""A gyro on a port that is found, recognized, lost, and found again: by an injected clock, without ROS."""
+"""A gyro on a port that is found, recognized, lost, and found again, by an injected clock."""
 
 import itertools
 import math
@@ -17,7 +17,8 @@ from gyro_calibration.driver.serial_faults import SerialFaults, damaged
 from gyro_calibration.driver.serial_port import PortError
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
-SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None) for name in PROTOCOLS}
+SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
+            for name in PROTOCOLS}
 NOTHING = 'nothing comes on /dev/gyro for 2 s: check the power and the wires of the gyro'
 
 
@@ -38,9 +39,12 @@ def test_samples_come_with_stamps_that_increase():
         chunks = list(itertools.takewhile(lambda _: connection.counts().samples < 100, reading))
         reading.close()
     stamps = [stamp for chunk in chunks for stamp in chunk.stamps]
-    assert [state.name for state in changes] == ['reading'] and connection.path == os.path.realpath(gyro.path)
-    assert (np.diff(stamps) > 0.0).all() and all(chunk.stamps[-1] <= chunk.arrival for chunk in chunks)
-    assert [sample.output for chunk in chunks for sample in chunk.samples] == pytest.approx([0.5] * len(stamps))
+    assert ([state.name for state in changes] == ['reading']
+            and connection.path == os.path.realpath(gyro.path))
+    assert ((np.diff(stamps) > 0.0).all()
+            and all(chunk.stamps[-1] <= chunk.arrival for chunk in chunks))
+    assert [sample.output for chunk in chunks for sample in chunk.samples] == pytest.approx(
+        [0.5] * len(stamps))
 
 
 def test_the_port_is_closed_when_nobody_takes_samples_any_more():
@@ -109,7 +113,8 @@ def test_auto_asks_for_what_the_protocol_needs():
     world, counts = World(5.0), Settings(columns=('gyro_counts',))
     world.gyro('csv', settings=Settings(columns=('gyro_counts',), sensitivity=0.001))
     problem = Reading(world, settings=counts).problems[0]
-    assert problem.startswith('csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
+    assert problem.startswith(
+        'csv comes on /dev/gyro, but columns hold gyro_counts, but sensitivity is not set')
 
 
 def test_another_gyro_in_the_same_place_is_recognized():
@@ -133,7 +138,8 @@ def test_stamps_go_on_when_another_gyro_is_recognized():
 def test_listening_ends_when_told_to():
     stop = threading.Event()
     world = World(60.0)
-    connection = Connection('/dev/gyro', on_change=lambda state: stop.set(), clock=world, make_port=world.port)
+    connection = Connection('/dev/gyro', on_change=lambda state: stop.set(), clock=world,
+                            make_port=world.port)
     assert list(connection.chunks(stop)) == [] and connection.state.name == 'listening'
 
 
@@ -142,7 +148,8 @@ def test_listening_ends_when_told_to():
 
 def test_a_gyro_is_found_again_under_another_name(tmp_path):
     """As in /dev/serial/by-id, where the name holds the serial number of the adapter."""
-    world, names = World(30.0), [tmp_path / f'usb-FTDI_A9003XYZ-if0{number}' for number in range(2)]
+    world, names = (World(30.0),
+                    [tmp_path / f'usb-FTDI_A9003XYZ-if0{number}' for number in range(2)])
     names[0].touch()
     world.gyro('csv', outputs=itertools.chain(itertools.repeat(0.1, 1500), itertools.repeat(0.2)))
 
@@ -152,14 +159,17 @@ def test_a_gyro_is_found_again_under_another_name(tmp_path):
     world.at(10.0, lose)
     world.at(15.0, lambda: names[1].touch() or world.plug())
     reading = Reading(world, 'csv', tmp_path / '*A9003XYZ*')
-    assert reading.connection.path == str(names[1]) and reading.samples[-1].output == pytest.approx(0.2)
-    assert any(f'no port matches {tmp_path}/*A9003XYZ*: plug the gyro in' in problem for problem in reading.problems)
+    assert (reading.connection.path == str(names[1])
+            and reading.samples[-1].output == pytest.approx(0.2))
+    assert any(f'no port matches {tmp_path}/*A9003XYZ*: plug the gyro in' in problem
+               for problem in reading.problems)
 
 
 def test_several_ports_that_match_are_named(tmp_path):
     for name in ('gyro_a', 'gyro_b'):
         (tmp_path / name).touch()
-    with pytest.raises(PortError, match=r'2 ports match .*: .*gyro_a, .*gyro_b; set port to one of them'):
+    with pytest.raises(PortError,
+                       match=r'2 ports match .*: .*gyro_a, .*gyro_b; set port to one of them'):
         resolve(str(tmp_path / 'gyro_?'))
 
 
@@ -198,7 +208,8 @@ def test_waiting_ends_when_told_to():
 
 
 def test_a_protocol_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match="protocol 'bogus' is not known: .*, or auto to find it by listening"):
+    with pytest.raises(ValueError,
+                       match="protocol 'bogus' is not known: .*, or auto to find it by listening"):
         Connection('/dev/null', 'bogus')
 
 
@@ -222,15 +233,19 @@ def test_a_slow_gyro_is_silent_after_three_of_its_periods(period):
     world = World(30.5 * period)
     world.send(b'1.0\r\n', end=20.5 * period, rate=1.0 / period)
     reading = Reading(world, 'csv', settings=settings)
-    assert len(reading.samples) == 20 and reading.names[:2] == ['reading', 'failed']  # the first line is cut off
+    # the first line is cut off
+    assert len(reading.samples) == 20 and reading.names[:2] == ['reading', 'failed']
     assert reading.times[1] == pytest.approx(23.0 * period, abs=1.0)
 
 
 @pytest.mark.parametrize(('protocol', 'line', 'reason'), [
     ('csv', b'', NOTHING),
-    ('csv', b'!ANG:1,2,3,AN:1,2,3,4,5,6,7,8,9\r\n', 'bytes come on /dev/gyro, but no sample of csv for 2 s: check protocol, baud and'),
-    ('kvh_dsp3000', b'       0.015733   0\r\n', 'the gyro on /dev/gyro calls each of its samples invalid for 2 s: turn it off'),
-    ('kvh_dsp3000', b'     999.000000   1\r\n', 'each sample on /dev/gyro is beyond full scale for 2 s: check protocol, sens'),
+    ('csv', b'!ANG:1,2,3,AN:1,2,3,4,5,6,7,8,9\r\n',
+     'bytes come on /dev/gyro, but no sample of csv for 2 s: check protocol, baud and'),
+    ('kvh_dsp3000', b'       0.015733   0\r\n',
+     'the gyro on /dev/gyro calls each of its samples invalid for 2 s: turn it off'),
+    ('kvh_dsp3000', b'     999.000000   1\r\n',
+     'each sample on /dev/gyro is beyond full scale for 2 s: check protocol, sens'),
 ])
 def test_a_gyro_without_samples_is_reported_with_its_reason(protocol, line, reason):
     world = World(30.0)
@@ -244,7 +259,8 @@ def test_a_gyro_without_samples_is_reported_with_its_reason(protocol, line, reas
 @pytest.mark.parametrize('protocol', ['razor', 'auto'])
 def test_a_board_that_restarts_when_it_is_opened_is_asked_until_it_answers(protocol):
     world = World(10.0)
-    world.restart, world.answer = 1.2, b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n'
+    world.restart, world.answer = (
+        1.2, b'#YPRAG=-142.28,-5.38,33.52,12.8,-25.6,256.00,0.01,0.02,-0.03\r\n')
     world.send(b'#YPR=-142.28,-5.38,33.52\r\n')
     reading = Reading(world, protocol)
     assert len(reading.samples) > 500 and reading.connection.openings == 1
@@ -288,7 +304,8 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     world.at(8.0, world.unplug)
     world.at(9.0, world.plug)
     reading = Reading(world, 'csv')
-    assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)  # tried at 8, 8.1, 8.3, 8.7, 9.5
+    # tried at 8, 8.1, 8.3, 8.7, 9.5
+    assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)
     assert reading.connection.counts().lost_samples == 0
 
 
@@ -300,11 +317,13 @@ def test_without_a_gap_there_is_no_longest():
 
 def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():
     generator, encode = random.Random(3), find('kvh_1750').encoder()
-    sent = [b'' if generator.random() < 0.02 else encode(Sample(1e-4 * number, sequence=number)) for number in range(8_000)]
+    sent = [b'' if generator.random() < 0.02 else encode(Sample(1e-4 * number, sequence=number))
+            for number in range(8_000)]
     world = World(8.0)
     world.send(iter(sent), rate=1000.0)
     reading = Reading(world, 'kvh_1750')
-    counts, numbers = reading.connection.counts(), np.round([1e4 * sample.output for sample in reading.samples])
+    counts, numbers = (reading.connection.counts(),
+                       np.round([1e4 * sample.output for sample in reading.samples]))
     assert counts.lost_samples == numbers[-1] - numbers[0] + 1 - counts.samples > 100
     assert reading.steps[5000:] == pytest.approx(1e-3 * np.diff(numbers)[5000:], abs=1e-6)
 
@@ -316,22 +335,26 @@ def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
     reading = Reading(world, 'kvh_dsp3000')
     counts = reading.connection.counts()
     assert (counts.device_faults, counts.refused_samples, counts.discarded_bytes) == (5, 5, 0)
-    assert sum(step == pytest.approx(0.02, abs=1e-3) for step in reading.steps) == counts.lost_samples == 10
+    assert (sum(step == pytest.approx(0.02, abs=1e-3) for step in reading.steps)
+            == counts.lost_samples == 10)
 
 
 @pytest.mark.parametrize('share', [0.001, 0.01, 0.1])
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_bad_line_is_survived_and_counted(name, share):
-    """At a tenth of all bytes long frames hardly ever arrive whole; a good line afterwards shows that decoding is right again."""
+    """Few long frames survive a tenth of faulty bytes; a good line shows right decoding."""
     protocol, generator = find(name), np.random.default_rng(2)
-    bad = SerialFaults(lost_bytes=share / 3.0, doubled_bytes=share / 3.0, flipped_bytes=share / 3.0)
+    bad = SerialFaults(lost_bytes=share / 3.0, doubled_bytes=share / 3.0,
+                       flipped_bytes=share / 3.0)
     encode = protocol.encoder(SETTINGS[name])
     frames = [encode(Sample(0.5, 25.0, number / 100.0, number)) for number in range(3000)]
     world = World(30.0)
-    world.send((damaged(bad, frame, generator) if number < 2000 else frame for number, frame in enumerate(frames)))
+    world.send((damaged(bad, frame, generator) if number < 2000 else frame
+                for number, frame in enumerate(frames)))
     reading = Reading(world, name, settings=SETTINGS[name])
     exact = reading.samples[-1].output
-    last = [sample.output for chunk in reading.chunks for sample in chunk.samples if chunk.arrival > BEGIN + 20.5]
+    last = [sample.output for chunk in reading.chunks for sample in chunk.samples
+            if chunk.arrival > BEGIN + 20.5]
     assert exact == pytest.approx(0.5, abs=0.01) and set(last) == {exact} and len(last) > 900
     assert reading.connection.counts().discarded_bytes > 0 and min(reading.steps) > 0.0
     assert all(math.isfinite(sample.output) for sample in reading.samples)

@@ -1,4 +1,4 @@
-"""The residual along each variable, for people to see: bands of 95 % hold 95 % of it, whatever the noise is."""
+"""The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
 import numpy as np
 import pytest
@@ -11,35 +11,40 @@ from gyro_calibration.log import Log
 from gyro_calibration.noise import Noise, simulate_noise
 
 WHITE = 1e-4
-NOISES = {'white': Noise(WHITE), 'flicker': Noise(WHITE, bias_instability=1e-4), 'walk': Noise(WHITE, rate_random_walk=2e-5)}
+NOISES = {'white': Noise(WHITE), 'flicker': Noise(WHITE, bias_instability=1e-4),
+          'walk': Noise(WHITE, rate_random_walk=2e-5)}
 
 
 def record(noise, generator, duration, interval):
-    """Return a log of nothing but noise, in motion, with a temperature that rises and a specific force that shakes."""
+    """Return a log of noise in motion, with rising temperature and a shaking specific force."""
     time = np.arange(round(duration / interval)) * interval
     rate = np.sin(0.3 * time) + 0.4 * np.sin(0.071 * time + 1.0)
-    return Log(time=time, output=rate + simulate_noise(noise, len(time), interval, generator), reference_rate=rate,
-               temperature=20.0 + time / 60.0 + np.sin(0.05 * time), specific_force=0.1 * generator.standard_normal(len(time)))
+    return Log(time=time, output=rate + simulate_noise(noise, len(time), interval, generator),
+               reference_rate=rate, temperature=20.0 + time / 60.0 + np.sin(0.05 * time),
+               specific_force=0.1 * generator.standard_normal(len(time)))
 
 
 def inside(log, generator):
-    """Return which bins of all curves but the spectrum are within their bands, and how many bins there are."""
+    """Return which bins of all curves but the spectrum are within their bands, and how many."""
     laid = replay(log, np.ones(len(log.time), dtype=bool), generator)
     found = Outcome(work(field([laid]), []), (laid,))
     shown = [each for each in curves(what_is_left(found), found) if each.along != 'frequency']
     off = np.concatenate([np.abs(each.after) / each.deviation for each in shown])
-    assert {'time', 'rate', 'heading', 'temperature', 'specific_force'} <= {each.along for each in shown}
+    assert ({'time', 'rate', 'heading', 'temperature', 'specific_force'}
+            <= {each.along for each in shown})
     return np.count_nonzero(off < 1.96), len(off)
 
 
 @pytest.mark.parametrize('noise', NOISES)
 def test_bands_of_95_percent_hold_about_as_many_bins(noise):
     generator = np.random.default_rng(1)
-    held, count = np.sum([inside(record(NOISES[noise], generator, 600.0, 0.05), generator) for _ in range(8)], axis=0)
+    held, count = np.sum([inside(record(NOISES[noise], generator, 600.0, 0.05), generator)
+                          for _ in range(8)], axis=0)
     assert 0.9 < held / count < 0.99, held / count
 
 
 def test_bands_hold_where_samples_are_averaged_before_the_search():
     generator = np.random.default_rng(2)
-    held, count = np.sum([inside(record(NOISES['flicker'], generator, 600.0, 0.002), generator) for _ in range(2)], axis=0)
+    held, count = np.sum([inside(record(NOISES['flicker'], generator, 600.0, 0.002), generator)
+                          for _ in range(2)], axis=0)
     assert 0.9 < held / count < 0.99, held / count

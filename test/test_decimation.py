@@ -10,16 +10,18 @@ EPOCH = 1.7e9
 
 
 def means(size, numbers):
-    """Return what becomes of samples that hold their numbers, and are as many periods after 1970."""
+    """Return what becomes of samples that hold their numbers, as many periods after 1970."""
     decimation = Decimation(size)
     samples = [Sample(1e-4 * number, 30.0, specific_force=9.81) for number in numbers]
-    complete = list(decimation.add(samples, [EPOCH + PERIOD * number for number in numbers], PERIOD))
+    complete = list(decimation.add(samples,
+                                   [EPOCH + PERIOD * number for number in numbers], PERIOD))
     return complete, list(decimation.flush())
 
 
 def test_one_sample_a_message_stays_as_it_is():
     complete, rest = means(1, range(5))
-    assert [mean.sample.output for mean in complete] == [1e-4 * number for number in range(5)] and not rest
+    assert ([mean.sample.output for mean in complete] == [1e-4 * number for number in range(5)]
+            and not rest)
     assert {mean.size for mean in complete} == {1}
 
 
@@ -27,7 +29,8 @@ def test_a_mean_has_the_mean_time_of_its_samples():
     complete, rest = means(10, range(25))
     assert [mean.sample.output for mean in complete] == pytest.approx([4.5e-4, 14.5e-4])
     assert [mean.stamp - EPOCH for mean in complete] == pytest.approx([4.5e-3, 14.5e-3], abs=1e-6)
-    assert {(mean.sample.temperature, round(mean.sample.specific_force, 9)) for mean in complete} == {(30.0, 9.81)}
+    assert ({(mean.sample.temperature, round(mean.sample.specific_force, 9)) for mean in complete}
+            == {(30.0, 9.81)})
     assert [mean.size for mean in [*complete, *rest]] == [10, 10, 5]
 
 
@@ -44,7 +47,8 @@ def test_stamps_that_are_set_back_end_a_group():
 def test_a_group_that_has_begun_is_given_once():
     decimation = Decimation(1000)
     assert not list(decimation.add([Sample(0.1)], [EPOCH], PERIOD))
-    assert [mean.sample for mean in decimation.flush()] == [Sample(0.1)] and not list(decimation.flush())
+    assert ([mean.sample for mean in decimation.flush()] == [Sample(0.1)]
+            and not list(decimation.flush()))
 
 
 def test_unknown_temperatures_do_not_count():
