@@ -18,7 +18,8 @@ def heard(ros):
 
 
 def test_a_report_has_the_full_name_the_level_and_all_values_as_text(ros, heard, wait_until):
-    made = Diagnostics(ros.node, 'thing', lambda: (OK, 'well', {'number': 1.5, 'none': ''}), 'port 1')
+    made = Diagnostics(ros.node, 'thing',
+                       lambda: (OK, 'well', {'number': 1.5, 'none': ''}), 'port 1')
     wait_until(lambda: ros.node.count_publishers('/diagnostics'))
     wait_until(lambda: made.now() or heard, what='a report')
     status, = heard[-1].status

@@ -1,4 +1,4 @@
-"""What the documents say is so: links lead somewhere, tables agree with the code, commands are understood, models can be read."""
+"""Documents hold: links lead somewhere, tables agree with the code, commands are understood."""
 
 import re
 import shlex
@@ -12,9 +12,11 @@ from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.model_file import POLYNOMIAL, read_model
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst', *sorted((ROOT / 'docs').glob('*.md'))]
+DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst',
+             *sorted((ROOT / 'docs').glob('*.md'))]
 LINK = re.compile(r'\[[^\]]*\]\(([^)\s]+)\)')
-FILE = re.compile(r'`((?:docs|config|launch|test|benchmarks|gyro_calibration)/[\w./]+\.\w+|[A-Z]+\.(?:md|rst)|Makefile|setup\.py)`')
+FILE = re.compile(r'`((?:docs|config|launch|test|benchmarks|gyro_calibration)/[\w./]+\.\w+|'
+                  r'[A-Z]+\.(?:md|rst)|Makefile|setup\.py)`')
 COMMAND = re.compile(r'^ +gyro_calibration (.+?)(?: +#.*)?$', re.MULTILINE)
 each_document = pytest.mark.parametrize('document', DOCUMENTS, ids=lambda path: path.name)
 
@@ -32,12 +34,14 @@ def test_every_relative_link_leads_somewhere(document):
         if '://' in target:
             continue
         assert (document.parent / path).exists(), target
-        assert not anchor or anchor in anchors(document.parent / path if path else document), target
+        assert (not anchor
+                or anchor in anchors(document.parent / path if path else document)), target
 
 
 @each_document
 def test_every_file_that_is_named_exists(document):
-    missing = [name for name in FILE.findall(document.read_text()) if not (ROOT / name).exists() and not (document.parent / name).exists()]
+    missing = [name for name in FILE.findall(document.read_text())
+               if not (ROOT / name).exists() and not (document.parent / name).exists()]
     assert not missing
 
 
@@ -53,7 +57,8 @@ def test_every_command_names_a_verb_and_options_that_exist(document, capsys):
 
 
 def test_every_document_has_no_line_beyond_140_columns_outside_tables():
-    long = [(document.name, line) for document in DOCUMENTS for line in document.read_text().splitlines()
+    long = [(document.name, line) for document in DOCUMENTS
+            for line in document.read_text().splitlines()
             if len(line) > 140 and not line.startswith('|')]
     assert not long
 
@@ -63,7 +68,8 @@ def parameters(request):
     """Return the table of parameters of a node; skip where ROS 2 is missing."""
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
     from gyro_calibration.ros import compensation_node, driver_node
-    return {'driver_node': driver_node, 'compensation_node': compensation_node}[request.param].PARAMETERS
+    return {'driver_node': driver_node,
+            'compensation_node': compensation_node}[request.param].PARAMETERS
 
 
 def number(value):
@@ -83,8 +89,10 @@ def row(parameter):
         text = number(default)
     else:
         text = f'`[{", ".join(default)}]`'
-    limits = ' to '.join(map(number, parameter.range or ())) or ', '.join(map('`{}`'.format, parameter.choices))
-    return f'| `{parameter.name}` | {text} | {parameter.unit} | {limits} | {"yes" if parameter.dynamic else ""} | {parameter.description} |'
+    limits = (' to '.join(map(number, parameter.range or ()))
+              or ', '.join(map('`{}`'.format, parameter.choices)))
+    return (f'| `{parameter.name}` | {text} | {parameter.unit} | {limits} | '
+            f'{"yes" if parameter.dynamic else ""} | {parameter.description} |')
 
 
 def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
@@ -95,14 +103,18 @@ def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
 def flat(values, group=''):
     """Yield the parameters of a file, those of groups with their dots: calibration.drive."""
     for name, value in values.items():
-        yield from flat(value, f'{group}{name}.') if isinstance(value, dict) else [(f'{group}{name}', value)]
+        yield from flat(value, f'{group}{name}.') if isinstance(value, dict) else [
+            (f'{group}{name}', value)]
 
 
 def test_the_configuration_holds_every_parameter_with_its_default(parameters):
     yaml = pytest.importorskip('yaml')
-    files = [yaml.safe_load((ROOT / 'config' / name).read_text()) for name in ('driver.yaml', 'compensation.yaml')]
-    configured = [dict(flat(values['ros__parameters'])) for file in files for values in file.values()]
-    wanted = {parameter.name: list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+    files = [yaml.safe_load((ROOT / 'config' / name).read_text())
+             for name in ('driver.yaml', 'compensation.yaml')]
+    configured = [dict(flat(values['ros__parameters'])) for file in files
+                  for values in file.values()]
+    wanted = {parameter.name: list(parameter.default) if isinstance(parameter.default, tuple)
+              else parameter.default
               for parameter in parameters}
     assert wanted in configured
 
@@ -116,12 +128,14 @@ def test_the_models_in_the_documents_can_be_read(tmp_path):
         models.append(read_model(path))
     assert len(models) >= 3
     full = models[-1]
-    assert full.covariance is not None and full.self_calibration is not None and full.gyro and full.origin and full.noise.rate_random_walk
+    assert (full.covariance is not None and full.self_calibration is not None and full.gyro
+            and full.origin and full.noise.rate_random_walk)
 
 
 def headline(text):
-    """Return the first two sentences of the diagnosis of the example, with # for each number, and the numbers."""
-    said = re.search(r'Simulation and measurement differ because of warm up:.*? parts\.', ' '.join(text.split()))[0]
+    """Return the first two sentences of the example's diagnosis, numbers as #, and the numbers."""
+    said = re.search(r'Simulation and measurement differ because of warm up:.*? parts\.',
+                     ' '.join(text.split()))[0]
     number = r'\d+(?:\.\d+)?'
     return re.sub(number, '#', said), [float(each) for each in re.findall(number, said)]
 
@@ -132,8 +146,9 @@ def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path
     for name in ('gyro.yaml', 'real.yaml', 'profile.csv'):
         block = re.search(rf'`{name}`[^`]*?:\n\n((?:    .*\n)+)', page)[1]
         (tmp_path / name).write_text(block.replace('\n    ', '\n')[4:])
-    simulate, diagnose, compensate = (next(shlex.split(each) for each in COMMAND.findall(page) if each.startswith(start))
-                                      for start in ('simulate', 'diagnose drive.csv --model gyro.yaml', 'compensate'))
+    simulate, diagnose, compensate = (
+        next(shlex.split(each) for each in COMMAND.findall(page) if each.startswith(start))
+        for start in ('simulate', 'diagnose drive.csv --model gyro.yaml', 'compensate'))
     assert run(*simulate)[0] == 0
     code, text, _ = run(*diagnose)
     assert code == 0
@@ -152,4 +167,5 @@ def test_the_error_model_describes_every_effect(effect):
 @pytest.mark.parametrize('document', ['README.md', 'docs/wire_formats.md'])
 def test_every_wire_format_is_in_the_tables(document):
     text = (ROOT / document).read_text()
-    assert not [name for name in PROTOCOLS if not re.search(rf'^\| `{name}` \|', text, re.MULTILINE)]
+    assert not [name for name in PROTOCOLS
+                if not re.search(rf'^\| `{name}` \|', text, re.MULTILINE)]

@@ -1,4 +1,4 @@
-"""The door: of two references the usable one is taken, noise is no motion, and what would only exhaust the memory is refused."""
+"""The door: the usable reference is taken, noise is no motion, huge data are refused."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ TURNED = np.cumsum(np.abs(RATE)) * INTERVAL
 
 
 def gyro(rate, seed=1):
-    """Return the output of a gyro with white noise of 0.057 deg/s a sample, and a scale factor error of 1 %."""
+    """Return the output of a gyro with noise of 0.057 deg/s and a scale factor error of 1 %."""
     return 1.01 * rate + 2e-3 + 1e-3 * np.random.default_rng(seed).standard_normal(len(rate))
 
 
@@ -34,24 +34,27 @@ STILL = Log(output=gyro(np.zeros(COUNT)), time=TIME)
 def test_a_reference_of_nan_alone_is_none():
     """Beside a heading that says all, and at rest."""
     nothing = np.full(COUNT, np.nan)
-    by_heading, by_none = (prepared(replace(log, reference_rate=nothing))[0] for log in (replace(LOG, reference_heading=HEADING), STILL))
+    by_heading, by_none = (prepared(replace(log, reference_rate=nothing))[0]
+                           for log in (replace(LOG, reference_heading=HEADING), STILL))
     assert by_heading.reference_rate is None and by_heading.reference_heading is HEADING
     assert by_none.reference_rate is None and rests(by_none)
-    assert not diagnose([replace(STILL, reference_heading=nothing)], np.random.default_rng(1)).findings
+    assert not diagnose([replace(STILL, reference_heading=nothing)],
+                        np.random.default_rng(1)).findings
 
 
 def test_a_rate_that_is_known_at_times_gives_way_to_the_heading():
     some = np.where(np.arange(COUNT) < 50, RATE, np.nan)
     log = replace(LOG, reference_rate=some, reference_heading=np.round(HEADING / 1e-3) * 1e-3)
     hygiene = inspect(log)
-    assert hygiene.heading_step == pytest.approx(1e-3) and 'known in 50 samples only' in ' '.join(hygiene.remarks)
+    assert (hygiene.heading_step == pytest.approx(1e-3)
+            and 'known in 50 samples only' in ' '.join(hygiene.remarks))
     assert prepared(log)[0].reference_rate is None
 
 
 # noise is no motion
 
 def noisy(kind):
-    """Return a reference at rest as it is measured: of odometry, motion capture, a simulator, or an encoder between two codes."""
+    """Return a reference at rest: odometry, motion capture, a simulator, or an encoder."""
     generator = np.random.default_rng(7)
     noise = generator.standard_normal(COUNT)
     if kind == 'odometry':
@@ -99,10 +102,13 @@ def jumped(seconds):
     return replace(LOG, time=TIME + np.where(np.arange(COUNT) < COUNT // 2, 0.0, seconds))
 
 
-@pytest.mark.parametrize('log', [jumped(12.0 * 86400.0), jumped(1500.0), replace(jumped(12.0 * 86400.0), reference_rate=0.0 * RATE)],
+@pytest.mark.parametrize('log', [jumped(12.0 * 86400.0), jumped(1500.0),
+                                 replace(jumped(12.0 * 86400.0), reference_rate=0.0 * RATE)],
                          ids=['a clock that was set', 'two drives', 'at rest'])
 def test_a_log_that_is_a_gap_for_the_most_part_is_refused_with_where_it_is(log):
-    with pytest.raises(DataRefused, match=r'12000 samples can be used where .*begins at 59\.990 s: cut the log there'):
+    with pytest.raises(
+            DataRefused,
+            match=r'12000 samples can be used where .*begins at 59\.990 s: cut the log there'):
         diagnose([log], np.random.default_rng(1))
 
 
@@ -117,15 +123,18 @@ def test_a_log_of_which_a_limit_leaves_nothing_is_refused_in_a_sentence():
 
 def test_samples_without_time_are_not_taken_for_a_rate_table():
     rows = MOST_ROWS + 1
-    with pytest.raises(DataRefused, match=f'{rows} rows, where a rate table has at most {MOST_ROWS}: .*--rate'):
-        diagnose_table(Log(output=LOG.output[:rows], reference_rate=RATE[:rows]), None, np.random.default_rng(1))
+    with pytest.raises(DataRefused,
+                       match=f'{rows} rows, where a rate table has at most {MOST_ROWS}: .*--rate'):
+        diagnose_table(Log(output=LOG.output[:rows], reference_rate=RATE[:rows]), None,
+                       np.random.default_rng(1))
 
 
 @pytest.mark.parametrize('first', [0.0, -np.pi])
 @pytest.mark.parametrize('use', [refuse, calibrate_encoder])
 def test_a_wrapped_heading_is_refused_with_the_way_out(use, first):
     heading = np.where(TIME % 7.0 < 0.1, np.nan, (TURNED - first) % (2.0 * np.pi) + first)
-    with pytest.raises(DataRefused, match='reference heading jumps by a full turn .*must be continuous'):
+    with pytest.raises(DataRefused,
+                       match='reference heading jumps by a full turn .*must be continuous'):
         use(Log(output=gyro(np.abs(RATE)), time=TIME, reference_heading=heading))
 
 

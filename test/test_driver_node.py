@@ -34,7 +34,8 @@ class Robot:
         """Wait until a diagnostic message with these words comes, and return its status."""
         def found():
             statuses = [array.status[0] for array in self.diagnostics]
-            return [status for status in statuses if words in status.message and status.level == level]
+            return [status for status in statuses
+                    if words in status.message and status.level == level]
         self.wait(found, words)
         return found()[-1]
 
@@ -48,7 +49,7 @@ def robot(ros, start_node, wait_until):
 
 
 def counting(frequency=100.0):
-    """Return the samples of a gyro whose rate is its number in 1e-4 rad/s, so that holes can be seen."""
+    """Return the samples of a gyro whose rate is its number in 1e-4 rad/s, to show holes."""
     return (Sample(1e-4 * number, 31.5, number / frequency) for number in itertools.count())
 
 
@@ -57,12 +58,14 @@ def seconds(message):
 
 
 def test_a_gyro_is_published_end_to_end(robot, ros):
-    """A replay at 1 kHz, which waits for a driver that a busy machine does not let read: not a sample is lost."""
+    """A replay at 1 kHz waits for a driver that a busy machine holds up: no sample is lost."""
     with Emulator(find('csv'), counting(500.0), speed=2.0, wait_for_reader=True) as gyro:
         driver = robot(gyro.path, frame_id='my_gyro')
-        driver.wait(lambda: len(driver.rates) > 3000 and len(driver.temperatures) > 3000, 'samples')
+        driver.wait(lambda: len(driver.rates) > 3000 and len(driver.temperatures) > 3000,
+                    'samples')
         status = driver.reports('samples come', DiagnosticStatus.OK)
-        offered = [ros.node.get_publishers_info_by_topic(topic)[0].qos_profile for topic in ('/imu/data_raw', '/imu/temperature')]
+        offered = [ros.node.get_publishers_info_by_topic(topic)[0].qos_profile
+                   for topic in ('/imu/data_raw', '/imu/temperature')]
         assert driver.node.stop() == 0
     rates, temperatures = list(driver.rates), list(driver.temperatures)
     numbers = [round(1e4 * message.angular_velocity.z) for message in rates]
@@ -70,10 +73,12 @@ def test_a_gyro_is_published_end_to_end(robot, ros):
     stamps = [seconds(message) for message in rates]
     assert all(later > earlier for earlier, later in itertools.pairwise(stamps))
     assert {message.header.frame_id for message in [*rates, *temperatures]} == {'my_gyro'}
-    assert len({*map(seconds, temperatures)} & {*stamps}) > 2900 and {message.temperature for message in temperatures} == {31.5}
+    assert (len({*map(seconds, temperatures)} & {*stamps}) > 2900
+            and {message.temperature for message in temperatures} == {31.5})
     assert all(message.angular_velocity_covariance.any() for message in rates)
     assert (status.name, status.hardware_id) == ('/driver_node: gyro', gyro.path)
-    assert {(each.reliability, each.durability) for each in offered} == {(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)}
+    assert {(each.reliability, each.durability) for each in offered} == {
+        (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)}
 
 
 def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
@@ -84,10 +89,12 @@ def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
         with Emulator(find('csv'), counting(), link=tmp_path / 'gyro'):
             driver.wait(lambda: len(driver.rates) > 20, 'samples')
             driver.diagnostics.clear()
-            values = {pair.key: pair.value for pair in driver.reports('samples come', DiagnosticStatus.OK).values}
+            values = {pair.key: pair.value
+                      for pair in driver.reports('samples come', DiagnosticStatus.OK).values}
             assert int(values['reopened']) >= number and int(values['samples']) > 20
         driver.reports('the device is gone', DiagnosticStatus.ERROR)
-    assert driver.node.output.count('the device is gone') == 2, 'it is logged once, not at each attempt'
+    assert driver.node.output.count('the device is gone') == 2, (
+        'it is logged once, not at each attempt')
 
 
 @pytest.mark.parametrize('is_there', [True, False])
@@ -121,7 +128,8 @@ sys.exit(driver_node.main())
 def test_a_fault_of_the_program_in_the_reader_ends_the_node_and_is_reported(ros_domain):
     """A node that lives on and publishes nothing would look well to whoever started it."""
     with Emulator(find('csv'), counting()) as gyro:
-        command = [sys.executable, '-c', BROKEN, '--ros-args', '-p', f'port:={gyro.path}', '-p', 'protocol:=csv']
+        command = [sys.executable, '-c', BROKEN, '--ros-args', '-p', f'port:={gyro.path}', '-p',
+                   'protocol:=csv']
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
     assert ended.returncode == 1 and 'as if there were a fault in the program' in ended.stderr
     assert 'the thread that reads the port has ended' in ended.stderr

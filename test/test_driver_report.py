@@ -1,4 +1,4 @@
-"""Parameters, messages and diagnostics of the driver, without a node: by an injected clock and port."""
+"""Parameters, messages and diagnostics of the driver, by an injected clock and port."""
 
 import itertools
 import math
@@ -21,9 +21,10 @@ from gyro_calibration.ros.parameters import record
 
 CONFIGURATION = Path(__file__).parents[1] / 'config' / 'driver.yaml'
 KEYS = {
-    'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures', 'device_faults', 'discarded_bytes',
-    'longest_gap_s', 'clock_steps', 'last_event', 'port', 'device', 'state', 'protocol', 'baud', 'detected', 'reopened',
-    'waiting_s', 'waited_s', 'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
+    'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
+    'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',
+    'device', 'state', 'protocol', 'baud', 'detected', 'reopened', 'waiting_s', 'waited_s',
+    'last_error', 'period_ms', 'nominal_period_ms', 'jitter_before_ms', 'jitter_after_ms'}
 
 
 # Parameters
@@ -33,11 +34,13 @@ def test_there_are_twelve_parameters_and_the_configuration_holds_each_with_its_d
     text = CONFIGURATION.read_text()
     given = yaml.safe_load(text)['/**/driver_node']['ros__parameters']
     assert len(PARAMETERS) == 12 and list(given) == [each.name for each in PARAMETERS]
-    assert [tuple(value) if isinstance(value, list) else value for value in given.values()] == [each.default for each in PARAMETERS]
+    assert [tuple(value) if isinstance(value, list) else value for value in given.values()] == [
+        each.default for each in PARAMETERS]
 
 
 @pytest.mark.parametrize(('given', 'sentence'), [
-    ({'protocol': 'bogus'}, r"parameter protocol is 'bogus', but must be kvh_dsp3000, .*csv or auto"),
+    ({'protocol': 'bogus'},
+     r"parameter protocol is 'bogus', but must be kvh_dsp3000, .*csv or auto"),
     ({'invert': 'maybe'}, "parameter invert is 'maybe', but must be default, always or never"),
     ({'increments': True}, 'parameter increments is True, but must be default, always or never'),
     ({'columns': ['time_s'], 'protocol': 'csv'}, 'exactly one must be gyro_dps'),
@@ -54,8 +57,10 @@ def test_an_impossible_parameter_is_refused_in_one_sentence(given, sentence):
 
 
 def test_parameters_become_settings():
-    given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y', 'full_scale': 2, 'columns': ['gyro_counts']}
-    assert settings(record(PARAMETERS, given)) == Settings(0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
+    given = {'sensitivity': 0.002, 'invert': 'always', 'increments': 'never', 'axis': 'y',
+             'full_scale': 2, 'columns': ['gyro_counts']}
+    assert settings(record(PARAMETERS, given)) == Settings(
+        0.002, True, 'y', ('gyro_counts',), 2.0, False, None)
     assert settings(record(PARAMETERS)) == Settings()
 
 
@@ -72,10 +77,12 @@ def filled(sample, size=1, variance=1e-4):
 def test_a_message_holds_the_rate_about_z_and_marks_what_is_not_measured():
     """REP-145: element 0 is -1 for a quantity that is not reported; x and y get no weight."""
     imu = filled(Sample(0.5)).imu
-    assert (imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z) == (0.0, 0.0, 0.5)
+    assert (imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z) == (
+        0.0, 0.0, 0.5)
     assert imu.orientation_covariance[0] == imu.linear_acceleration_covariance[0] == -1.0
     assert list(imu.angular_velocity_covariance) == [1e6, 0, 0, 0, 1e6, 0, 0, 0, 1e-4]
-    assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == ('my_gyro', 1_700_000_000, 250_000_000)
+    assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == (
+        'my_gyro', 1_700_000_000, 250_000_000)
 
 
 def test_the_mean_of_ten_samples_has_a_tenth_of_the_variance():
@@ -91,24 +98,29 @@ def test_the_temperature_has_the_stamp_of_its_rate_and_no_variance_that_nobody_m
 def test_a_specific_force_along_z_is_reported_while_there_is_one():
     messages = filled(Sample(0.5, specific_force=9.81))
     assert messages.imu.linear_acceleration.z == 9.81
-    assert list(messages.imu.linear_acceleration_covariance) == pytest.approx([1e6, 0, 0, 0, 1e6, 0, 0, 0, 0.01])
+    assert list(messages.imu.linear_acceleration_covariance) == pytest.approx(
+        [1e6, 0, 0, 0, 1e6, 0, 0, 0, 0.01])
     messages.fill(Mean(0.0, Sample(0.5), 1))
     assert messages.imu.linear_acceleration.z == 0.0
     assert list(messages.imu.linear_acceleration_covariance) == [-1.0, *8 * [0.0]]
 
 
-@pytest.mark.parametrize(('name', 'deviation'), [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
+@pytest.mark.parametrize(('name', 'deviation'),
+                         [('kvh_dsp3000', 0.0111), ('kvh_1750', 0.0088), ('csv', 0.5)])
 def test_the_assumed_noise_is_that_of_the_data_sheet_or_half_a_degree_a_second(name, deviation):
-    assert math.sqrt(find(name).variance(Settings())) == pytest.approx(math.radians(deviation), rel=0.01)
+    assert math.sqrt(find(name).variance(Settings())) == pytest.approx(
+        math.radians(deviation), rel=0.01)
 
 
 # Diagnostics
 
 
-def reported(world, protocol, given=None, monitored=lambda report, chunk: report.add(chunk.samples)):
+def reported(world, protocol, given=None,
+             monitored=lambda report, chunk: report.add(chunk.samples)):
     """Return the reports of a driver, one a second."""
     given, reports = given or Settings(), []
-    connection = Connection('/dev/gyro', protocol, 0, given, lambda state: state.problem and report.clear(), world, world.port)
+    connection = Connection('/dev/gyro', protocol, 0, given,
+                            lambda state: state.problem and report.clear(), world, world.port)
     report = DriverReport(connection, '/dev/gyro*', given, world)
     for second in range(1, 60):
         world.at(second, lambda: reports.append(report.make()))
@@ -123,9 +135,12 @@ def test_a_good_gyro_is_reported_with_all_its_figures_in_one_vocabulary():
     level, message, values = reported(world, 'csv')[-1]
     assert (level, message) == (OK, 'samples come') and set(values) == {*KEYS, 'temperature_degc'}
     assert all(re.fullmatch('[a-z0-9_]+', key) for key in values)
-    assert values | {'rate_hz': '100.0', 'port': '/dev/gyro*', 'device': '/dev/gyro', 'state': 'reading', 'protocol': 'csv', 'baud': 115200,
-                     'lost_samples': 0, 'temperature_degc': '31.50', 'nominal_period_ms': '10', 'reopened': 0} == values
-    assert float(values['period_ms']) == pytest.approx(10.0, rel=1e-3) and float(values['jitter_after_ms']) < 0.1
+    assert values | {'rate_hz': '100.0', 'port': '/dev/gyro*', 'device': '/dev/gyro',
+                     'state': 'reading', 'protocol': 'csv', 'baud': 115200, 'lost_samples': 0,
+                     'temperature_degc': '31.50', 'nominal_period_ms': '10',
+                     'reopened': 0} == values
+    assert (float(values['period_ms']) == pytest.approx(10.0, rel=1e-3)
+            and float(values['jitter_after_ms']) < 0.1)
 
 
 def test_a_lost_port_is_an_error_and_what_the_gyro_reported_is_dropped():
@@ -136,31 +151,39 @@ def test_a_lost_port_is_an_error_and_what_the_gyro_reported_is_dropped():
     reports = reported(world, 'csv')
     assert reports[3][0] == OK and 'temperature_degc' in reports[3][2]
     level, message, values = reports[10]
-    assert level == ERROR and 'does not exist' in message == values['last_error'] and 'temperature_degc' not in values
+    assert (level == ERROR and 'does not exist' in message == values['last_error']
+            and 'temperature_degc' not in values)
     assert (values['state'], values['waiting_s']) == ('failed', '3.2')
     level, message, values = reports[-1]
-    assert level == OK and values['reopened'] == 1 and float(values['longest_gap_s']) > 9.5 and 'does not exist' in values['last_error']
+    assert (level == OK and values['reopened'] == 1 and float(values['longest_gap_s']) > 9.5
+            and 'does not exist' in values['last_error'])
 
 
 def test_losses_of_the_last_second_are_a_warning_with_their_counts():
     world = World(10.0)
-    lines = {50: b'       0.015733   0\r\n', 60: b'     999.000000   1\r\n', 70: b'       0.015733   x\r\n'}
+    lines = {50: b'       0.015733   0\r\n', 60: b'     999.000000   1\r\n',
+             70: b'       0.015733   x\r\n'}
     world.send(lines.get(number % 300, b'       0.015733   1\r\n') for number in itertools.count())
     reports = reported(world, 'kvh_dsp3000')
     bad = [message for level, message, _ in reports if level == WARN]
-    assert set(bad) == {'samples come, but in the last second there were: lost samples 3, refused samples 1, device faults 1, '
-                        'discarded bytes 19'}
-    assert [level for level, _, _ in reports].count(OK) > 4 and reports[-1][2]['refused_samples'] == 4
+    assert set(bad) == {
+        'samples come, but in the last second there were: lost samples 3, refused samples 1, '
+        'device faults 1, discarded bytes 19'}
+    assert ([level for level, _, _ in reports].count(OK) > 4
+            and reports[-1][2]['refused_samples'] == 4)
 
 
 def test_supply_and_source_current_are_reported_and_judged():
     world, given = World(10.0), Settings(sensitivity=1e-6)
     encode = find('fizoptika').encoder(given)
     health = {'supply_v': 5.0, 'source_current_a': 0.05, 'diagnostic_v': 1.0}
-    world.send((encode(Sample(0.1, 24.0, sequence=number, health=health)) for number in itertools.count()), rate=1000.0)
+    world.send((encode(Sample(0.1, 24.0, sequence=number, health=health))
+                for number in itertools.count()), rate=1000.0)
     level, message, values = reported(world, 'fizoptika', given)[-1]
-    assert level == WARN and 'source_current_a is 0.05, but should be from 0.07 to 0.15: check the supply' in message
-    assert [float(values[name]) for name in health] == pytest.approx(list(health.values()), rel=1e-3)
+    assert (level == WARN and 'source_current_a is 0.05, but should be from 0.07 to 0.15: '
+            'check the supply' in message)
+    assert [float(values[name]) for name in health] == pytest.approx(
+        list(health.values()), rel=1e-3)
     assert float(values['temperature_degc']) == pytest.approx(24.0, abs=0.1)
 
 
@@ -169,14 +192,16 @@ def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of():
     world = World(6.0)
     world.gyro('kvh_1750', rate=250.0)
     level, message, _ = reported(world, 'kvh_1750')[-1]
-    assert level == WARN and '250 samples a second are not the 1000 by which angles are made rates: set sample_rate' in message
+    assert (level == WARN and '250 samples a second are not the 1000 by which angles are made '
+            'rates: set sample_rate' in message)
 
 
 def test_steps_of_the_clock_are_counted():
     world = World(5.0)
     world.gyro('csv')
     steps = iter([3600.0, -7200.0])
-    reports = reported(world, 'csv', monitored=lambda report, _: [report.add_clock_step(step) for step in steps])
+    reports = reported(world, 'csv',
+                       monitored=lambda report, _: [report.add_clock_step(step) for step in steps])
     _, _, values = reports[-1]
     assert values['clock_steps'] == '2, last by -7200.0 s'
     assert values['last_event'].startswith('the clock of this computer was set by -7200.0 s')
@@ -187,7 +212,8 @@ def test_listening_is_a_warning_and_what_was_recognized_is_reported():
     world.gyro('minimu9')
     reports = reported(world, 'auto')
     assert reports[0][:2] == (WARN, 'listening for a protocol')
-    assert reports[-1][2]['protocol'] == 'minimu9' and 'minimu9 explains' in reports[-1][2]['detected']
+    assert (reports[-1][2]['protocol'] == 'minimu9'
+            and 'minimu9 explains' in reports[-1][2]['detected'])
 
 
 def test_all_protocols_are_choices_of_the_parameter():

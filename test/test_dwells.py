@@ -1,4 +1,4 @@
-"""Dwells: what a rate table's file holds, and what is found in a log in time. The truth is simulated, where nothing else is said."""
+"""Dwells: what a rate table's file holds, and what is found in a log, on simulated truth."""
 
 import math
 from dataclasses import replace
@@ -33,12 +33,13 @@ def table(rates, **more):
 
 def run(generator, noise=0.01, rate=RATE, **more):
     """Return the log of a gyro on a rate table; angle random walk in deg/√s."""
-    output = SCALE * rate + BIAS + simulate_noise(Noise(noise * DEGREE), len(TIME), 0.01, generator)
+    output = (SCALE * rate + BIAS
+              + simulate_noise(Noise(noise * DEGREE), len(TIME), 0.01, generator))
     return Log(output=output, time=TIME, **(more or {'reference_rate': RATE}))
 
 
 def encoder(step, generator, heading=HEADING):
-    """Return the heading as an encoder with this step, deg, gives it, that begins anywhere within a step."""
+    """Return the heading by an encoder with this step, deg, that begins anywhere in a step."""
     return np.floor(heading / (step * DEGREE) + generator.random()) * step * DEGREE
 
 
@@ -70,7 +71,8 @@ def test_a_column_names_the_sweeps():
     [0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1))],
     [rate for size in range(10, 101, 10) for rate in (0, size)],
     [rate for size in range(10, 101, 10) for rate in (0, size, 0, -size)],
-], ids=['one direction', 'both signs in turn', 'rests between', 'rests between, both signs in turn'])
+], ids=['one direction', 'both signs in turn', 'rests between',
+        'rests between, both signs in turn'])
 def test_sweeps_are_found_by_the_order_of_the_rates(sweep):
     found = from_table(table(sweep * 3))
     turning = found.rate != 0.0  # a rest is near to both the sweep before and the one after
@@ -109,9 +111,12 @@ def test_a_table_may_say_how_well_its_means_are_known():
     (Log(output=np.ones(3)), 'reference_rate_dps'),
     (Log(output=np.ones(3), time=np.arange(3.0)), 'reference_heading_deg'),
     (Log(output=np.ones(3), reference_rate=np.full(3, np.nan)), 'none of the 3 rows'),
-    (Log(output=np.ones(3), time=np.arange(3.0), reference_rate=np.full(3, np.nan)), 'reference_heading_deg'),
-    (Log(output=np.ones(3), time=np.arange(3.0), reference_heading=np.full(3, np.nan)), '0 of 3 samples'),
-    (Log(output=np.ones(2), reference_rate=np.ones(2), others={'deviation_dps': ('0.1', 'good')}), 'good'),
+    (Log(output=np.ones(3), time=np.arange(3.0), reference_rate=np.full(3, np.nan)),
+     'reference_heading_deg'),
+    (Log(output=np.ones(3), time=np.arange(3.0), reference_heading=np.full(3, np.nan)),
+     '0 of 3 samples'),
+    (Log(output=np.ones(2), reference_rate=np.ones(2), others={'deviation_dps': ('0.1', 'good')}),
+     'good'),
 ])
 def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
     with pytest.raises(DataRefused, match=message):
@@ -119,14 +124,16 @@ def test_a_log_that_lacks_something_is_refused_with_the_remedy(log, message):
 
 
 def test_joined_logs_keep_their_sweeps_and_places_apart():
-    whole = join([dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name) for name in ('a.csv', 'b.csv')])
+    whole = join([dwells(table([33.3, 45.0, 78.0], temperature=np.ones(3)), name)
+                  for name in ('a.csv', 'b.csv')])
     assert list(whole.sweep) == [0, 1, 2, 3, 4, 5]
     assert whole.place[0] == 'a.csv: row 1' and whole.place[3] == 'b.csv: row 1'
     assert len(whole.temperature) == len(whole) == 6
 
 
 def test_a_log_without_temperature_takes_it_from_those_that_it_is_joined_with():
-    whole = join([table_dwells := dwells(table([1, 2, 3])), replace(table_dwells, temperature=np.ones(3))])
+    whole = join([table_dwells := dwells(table([1, 2, 3])),
+                  replace(table_dwells, temperature=np.ones(3))])
     assert whole.temperature is None and '1 of 2 logs hold no temperature' in whole.remarks[-1]
 
 
@@ -149,14 +156,17 @@ def test_every_rate_of_a_table_is_found(reference, generator):
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
 def test_the_means_scatter_as_they_claim_under_white_noise(reference, generator):
-    found = np.concatenate([errors(find_dwells(run(generator, **references(generator)[reference]))) for _ in range(12)])
+    found = np.concatenate([errors(find_dwells(run(generator, **references(generator)[reference])))
+                            for _ in range(12)])
     # 252 errors: the standard deviation of their own is 4.5 %.
     assert np.sqrt(np.mean(found ** 2)) == pytest.approx(1.0, abs=0.15)
     assert 0.91 < np.mean(np.abs(found) < 1.96) < 0.99
 
 
 def test_the_means_claim_the_steps_of_a_coarse_encoder(generator):
-    found = np.concatenate([errors(find_dwells(run(generator, 1e-4, reference_heading=encoder(2.0, generator)))) for _ in range(12)])
+    found = np.concatenate(
+        [errors(find_dwells(run(generator, 1e-4, reference_heading=encoder(2.0, generator))))
+         for _ in range(12)])
     assert np.mean(np.abs(found) < 1.96) > 0.93
 
 
@@ -165,13 +175,15 @@ def test_the_claim_counts_what_is_correlated_within_a_batch(generator):
     scatter = []
     for _ in range(12):
         noise = simulate_noise(Noise(0.01 * DEGREE), len(TIME), 0.01, generator)
-        scatter.append(errors(find_dwells(replace(log, output=log.output + lfilter([0.1], [1.0, -0.9], noise)))))
+        scatter.append(errors(
+            find_dwells(replace(log, output=log.output + lfilter([0.1], [1.0, -0.9], noise)))))
     assert np.sqrt(np.mean(np.square(scatter))) == pytest.approx(1.05, abs=0.15)
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
 @pytest.mark.parametrize(('late', 'lag'), [(2, 0.1), (-5, 0.0), (5, 0.0), (0, 0.3)])
-def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(reference, late, lag, generator):
+def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(
+        reference, late, lag, generator):
     keep = math.exp(-0.01 / lag) if lag else 0.0
     rate = lfilter([1.0 - keep], [1.0, -keep], np.roll(RATE, late))
     found = find_dwells(run(generator, 0.002, rate, **references(generator)[reference]))
@@ -183,9 +195,11 @@ def test_neither_ramps_nor_the_settling_of_the_gyro_get_into_the_means(reference
 def test_a_table_that_vibrates_and_rings_gives_its_dwells_all_the_same(step, generator):
     keep = math.exp(-0.1 * 2.0 * math.pi * 3.0 * 0.01)
     answer = [1.0, -2.0 * keep * math.cos(2.0 * math.pi * 3.0 * 0.01), keep ** 2]
-    rate = lfilter([sum(answer)], answer, RATE) + 20.0 * DEGREE * np.sin(2.0 * math.pi * 8.0 * TIME) * (RATE != 0.0)
+    rate = (lfilter([sum(answer)], answer, RATE)
+            + 20.0 * DEGREE * np.sin(2.0 * math.pi * 8.0 * TIME) * (RATE != 0.0))
     heading = np.concatenate([[0.0], np.cumsum(0.005 * (rate[1:] + rate[:-1]))])
-    given = {'reference_heading': encoder(step, generator, heading)} if step else {'reference_rate': rate}
+    given = {'reference_heading': encoder(step, generator, heading)} if step else {
+        'reference_rate': rate}
     found = find_dwells(run(generator, rate=rate, **given))
     assert np.allclose(found.rate / DEGREE, RATES, atol=0.1)
     assert (np.abs(errors(found)) < 5.0).all()
@@ -194,12 +208,14 @@ def test_a_table_that_vibrates_and_rings_gives_its_dwells_all_the_same(step, gen
 @pytest.mark.parametrize('every', [10, 100])
 def test_slow_samples_are_enough(every, generator):
     log = run(generator)
-    found = find_dwells(Log(output=log.output[::every], time=TIME[::every], reference_rate=RATE[::every]))
+    found = find_dwells(
+        Log(output=log.output[::every], time=TIME[::every], reference_rate=RATE[::every]))
     assert np.allclose(found.rate / DEGREE, RATES) and (np.abs(errors(found)) < 5.0).all()
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
-def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_said(reference, generator):
+def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_said(
+        reference, generator):
     log = run(generator, **references(generator)[reference])
     quantity = 'reference_rate' if reference == 'rate' else 'reference_heading'
     given = np.where(np.arange(len(TIME)) % 5 == 0, getattr(log, quantity), np.nan)
@@ -226,7 +242,8 @@ def test_wild_stuck_and_lost_samples_are_said_and_left_out(reference, generator)
     kept = np.ones(len(TIME), dtype=bool)
     kept[30000:30007] = False
     quantity = 'reference_rate' if reference == 'rate' else 'reference_heading'
-    found = find_dwells(replace(log, **{'output': output[kept], 'time': TIME[kept], quantity: given[kept]}))
+    found = find_dwells(
+        replace(log, **{'output': output[kept], 'time': TIME[kept], quantity: given[kept]}))
     said = ' '.join(found.remarks)
     assert len(found) == len(RATES) and (np.abs(errors(found)) < 5.0).all()
     assert 'wild samples, left out: 3, at 5.00 s, 90.00 s, 90.01 s' in said
@@ -236,33 +253,40 @@ def test_wild_stuck_and_lost_samples_are_said_and_left_out(reference, generator)
 
 
 def test_nothing_is_said_of_a_good_log(generator):
-    said = [remark for _ in range(10) for remark in find_dwells(run(generator)).remarks if 'after each ramp' not in remark]
+    said = [remark for _ in range(10)
+            for remark in find_dwells(run(generator)).remarks if 'after each ramp' not in remark]
     assert not said
 
 
 def test_a_gyro_of_coarse_codes_is_not_stuck(generator):
     log = run(generator)
     for step in (0.05, 0.3):
-        found = find_dwells(replace(log, output=np.round(log.output / (step * DEGREE)) * step * DEGREE))
+        found = find_dwells(
+            replace(log, output=np.round(log.output / (step * DEGREE)) * step * DEGREE))
         assert not [remark for remark in found.remarks if 'stuck' in remark or 'wild' in remark]
 
 
 def test_a_dwell_that_warms_is_divided(generator):
     still = np.zeros(len(TIME))
-    warm = find_dwells(run(generator, rate=still, reference_rate=still, temperature=25.0 + TIME / 60.0))
-    steady = find_dwells(run(generator, rate=still, reference_rate=still, temperature=25.0 + 0.2 * np.sin(TIME / 60.0)))
+    warm = find_dwells(run(generator, rate=still, reference_rate=still,
+                           temperature=25.0 + TIME / 60.0))
+    steady = find_dwells(run(generator, rate=still, reference_rate=still,
+                             temperature=25.0 + 0.2 * np.sin(TIME / 60.0)))
     assert len(steady) == 1
-    assert 5 <= len(warm) <= 7 and np.ptp(warm.temperature) > 4.0 and 'divided' in ' '.join(warm.remarks)
+    assert (5 <= len(warm) <= 7 and np.ptp(warm.temperature) > 4.0
+            and 'divided' in ' '.join(warm.remarks))
 
 
 def test_a_rate_made_of_coarse_steps_gives_way_to_their_heading(generator):
     heading = encoder(2.0, generator)
-    found = find_dwells(run(generator, reference_rate=np.gradient(heading, TIME), reference_heading=heading))
+    found = find_dwells(run(generator, reference_rate=np.gradient(heading, TIME),
+                            reference_heading=heading))
     assert np.allclose(found.rate / DEGREE, RATES, atol=0.02)
 
 
 def test_a_rate_that_was_never_there_gives_way_to_the_heading(generator):
-    found = find_dwells(run(generator, reference_rate=np.full(len(TIME), np.nan), reference_heading=HEADING))
+    found = find_dwells(run(generator, reference_rate=np.full(len(TIME), np.nan),
+                            reference_heading=HEADING))
     assert np.allclose(found.rate / DEGREE, RATES)
 
 
@@ -274,7 +298,8 @@ def test_a_simulation_without_noise_claims_nothing(generator):
 
 def test_stamps_that_come_in_bursts_do_not_hide_dwells(generator):
     bursts = np.floor(TIME / 0.08) * 0.08 + 1e-4 * (np.arange(len(TIME)) % 8)
-    found = find_dwells(replace(run(generator), time=np.maximum.accumulate(bursts) + 1e-9 * np.arange(len(TIME))))
+    found = find_dwells(replace(run(generator),
+                                time=np.maximum.accumulate(bursts) + 1e-9 * np.arange(len(TIME))))
     assert len(found) == len(RATES) and 'missing' not in ' '.join(found.remarks)
 
 
@@ -282,20 +307,23 @@ def test_stamps_that_come_in_bursts_do_not_hide_dwells(generator):
 def test_a_log_that_swings_is_refused_with_the_other_way(rate, generator):
     swing = 45.0 * DEGREE * np.sin(rate * TIME)
     heading = 45.0 * DEGREE / rate * np.cos(rate * TIME)
-    for reference in ({'reference_rate': swing}, {'reference_heading': heading}, {'reference_heading': encoder(2.0, generator, heading)}):
+    for reference in ({'reference_rate': swing}, {'reference_heading': heading},
+                      {'reference_heading': encoder(2.0, generator, heading)}):
         with pytest.raises(DataRefused, match='steady to 0.5 deg/s.*--method likelihood'):
             find_dwells(run(generator, rate=swing, **reference))
 
 
 def test_nothing_is_found_in_a_reference_of_noise(generator):
     noise = generator.standard_normal(len(TIME)) * 10.0 * DEGREE
-    for reference in ({'reference_rate': noise}, {'reference_heading': noise}, {'reference_heading': np.cumsum(noise) / 20.0}):
+    for reference in ({'reference_rate': noise}, {'reference_heading': noise},
+                      {'reference_heading': np.cumsum(noise) / 20.0}):
         with pytest.raises(DataRefused):
             find_dwells(run(generator, **reference))
 
 
 def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
-    assert code_step(np.round(encoder(0.0879, generator) / DEGREE, 2)) == pytest.approx(0.088, abs=0.009)
+    assert code_step(np.round(encoder(0.0879, generator) / DEGREE, 2)) == pytest.approx(
+        0.088, abs=0.009)
     assert code_step(encoder(2.0, generator)) == pytest.approx(2.0 * DEGREE)
     assert code_step(np.sin(TIME)) < 0.01 * DEGREE
 
@@ -311,7 +339,8 @@ def test_variances_that_differ_by_chance_become_one(generator):
 
 def test_variances_that_really_differ_stay_so(generator):
     truth = np.repeat([1.0, 100.0], 20)
-    told = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)], axis=0)
+    told = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
+                    for _ in range(200)], axis=0)
     assert np.allclose(told / truth, 1.0, atol=0.25)
 
 
