@@ -1,4 +1,4 @@
-"""Every effect's formula, and the one recovery test that all of them pass: simulate, compensate, and the rate is back."""
+"""Each effect's formula, and one test for all: simulate, compensate, and the rate is back."""
 
 import math
 from dataclasses import replace
@@ -22,7 +22,8 @@ from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import respond, simulate
 
-#: A matrix C of eq. 11 of Ojeda et al. of the size that their figures 5 and 6 show: errors of a few tenths of a deg/s at 100 deg/s.
+#: A matrix C of eq. 11 of Ojeda et al. of the size in their figures 5 and 6: errors of some tenths
+#: of a deg/s at 100 deg/s.
 C = np.array([[2e-10, -3e-9, 1e-6, -2e-5], [-1e-8, 2e-7, -4e-5, 2e-3], [3e-7, -4e-6, 4e-3, -0.05]])
 
 POLYNOMIAL, POLYNOMIAL_VALUES = polynomial_from_matrix(C)
@@ -38,8 +39,10 @@ GYROS = {
     'bias_temperature_quadratic': [('bias_temperature_quadratic', (25.0, 1e-4))],
     'scale_factor_temperature': [('scale_factor_temperature', (25.0, 2e-3))],
     'sine_response': [('sine_response', (0.5, 1.0))],
-    'sine_response, -10 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (-0.1,)), ('bias', (0.01,))],
-    'sine_response, +20 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (0.2,)), ('bias', (0.01,))],
+    'sine_response, -10 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (-0.1,)),
+                             ('bias', (0.01,))],
+    'sine_response, +20 %': [('sine_response', (0.5, 1.0)), ('scale_factor_error', (0.2,)),
+                             ('bias', (0.01,))],
     'bias_temperature_rate': [('bias_temperature_rate', (10.0, 0.05))],
     'thermal_lag': [('thermal_lag', (120.0, -2e-3))],
     'thermal_hysteresis': [('thermal_hysteresis', (10.0, 2e-3, 0.003))],
@@ -53,26 +56,30 @@ GYROS = {
     'interference_tone': [('interference_tone', (0.7, 0.004, 0.003))],
     'rate_temperature_polynomial': [],
     'all': [('bias', (0.02,)), ('scale_factor_error', (0.0373,)), ('sine_response', (0.1, 1.0)),
-            ('scale_factor_asymmetry', (0.003,)), ('bias_temperature', (30.0, 1e-3)), ('scale_factor_temperature', (30.0, 1e-3))],
+            ('scale_factor_asymmetry', (0.003,)), ('bias_temperature', (30.0, 1e-3)),
+            ('scale_factor_temperature', (30.0, 1e-3))],
 }
 
 
 def gyro(name):
     """Return the model of that name."""
     terms = tuple(Term(CATALOGUE[effect], values) for effect, values in GYROS[name])
-    return GyroModel(terms + ((Term(POLYNOMIAL, POLYNOMIAL_VALUES),) if name in ('rate_temperature_polynomial', 'all') else ()))
+    return GyroModel(terms + ((Term(POLYNOMIAL, POLYNOMIAL_VALUES),)
+                              if name in ('rate_temperature_polynomial', 'all') else ()))
 
 
 def around(time):
-    """Return the surroundings of a gyro that is heated and cooled, shaken, turned and fed unsteadily."""
+    """Return the surroundings of a gyro with varying temperature, force, rate and supply."""
     generator = np.random.default_rng(0)
-    return {'temperature': 30.0 + 20.0 * np.abs(1.0 - time / 20.0), 'specific_force': np.where(time > 10.0, 2.0, 0.3) * np.sin(40.0 * time),
+    return {'temperature': 30.0 + 20.0 * np.abs(1.0 - time / 20.0),
+            'specific_force': np.where(time > 10.0, 2.0, 0.3) * np.sin(40.0 * time),
             'supply': 5.0 + 0.3 * generator.standard_normal(len(time)), 'heading': 0.4 * time}
 
 
 def test_every_effect_is_recovered_or_said_to_be_lost():
     recovered = {name.partition(',')[0] for name in GYROS}
-    assert recovered | {effect.name for effect in CATALOGUE.values() if effect.undone} >= set(CATALOGUE) | {'rate_temperature_polynomial'}
+    assert (recovered | {effect.name for effect in CATALOGUE.values() if effect.undone}
+            >= set(CATALOGUE) | {'rate_temperature_polynomial'})
 
 
 @pytest.mark.parametrize('name', GYROS)
@@ -82,7 +89,8 @@ def test_a_simulated_gyro_is_compensated_to_the_true_rate(name):
     surroundings = History().follow(time, **around(time))
     output = respond(model, time, surroundings.moving(rate, rate))
     assert np.abs(output - rate).max() > 1e-4, 'this gyro has no error, so nothing is shown'
-    assert np.abs(compensate(model, output, surroundings.temperature, surroundings).rate - rate).max() < 1e-9
+    assert np.abs(compensate(model, output, surroundings.temperature, surroundings).rate
+                  - rate).max() < 1e-9
 
 
 @pytest.mark.parametrize('name', GYROS)
@@ -92,31 +100,40 @@ def test_a_log_in_one_call_and_sample_by_sample_gives_the_same_numbers(name):
     follow = {'time': log.time, 'temperature': log.temperature, 'heading': log.reference_heading}
     at_once = compensate(model, log.output, log.temperature, model.history().follow(**follow))
     history, singly = model.history(), []
-    for output, *sample in zip(log.output.tolist(), *(values.tolist() for values in follow.values())):
-        singly.append(compensate(model, output, sample[1], history.follow(**dict(zip(follow, sample)))).rate)
+    for output, *sample in zip(log.output.tolist(),
+                               *(values.tolist() for values in follow.values())):
+        singly.append(
+            compensate(model, output, sample[1], history.follow(**dict(zip(follow, sample)))).rate)
     assert singly == at_once.rate.tolist()
     assert np.abs(at_once.rate - log.reference_rate).max() < 1e-9
 
 
-@pytest.mark.parametrize('name', ['bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis', 'vibration_rectification'])
+@pytest.mark.parametrize('name', ['bias_temperature_rate', 'thermal_lag', 'thermal_hysteresis',
+                                  'vibration_rectification'])
 def test_what_remembers_gives_the_same_numbers_sample_by_sample(name):
     model, time = gyro(name), np.linspace(0.0, 40.0, 401)
     output = respond(model, time, History().follow(time, **around(time)))
-    at_once = compensate(model, output, surroundings=model.history().follow(time, **around(time))).rate
+    at_once = compensate(model, output,
+                         surroundings=model.history().follow(time, **around(time))).rate
     history = model.history()
-    samples = zip(output.tolist(), time.tolist(), *(values.tolist() for values in around(time).values()))
-    singly = [compensate(model, first, surroundings=history.follow(*rest)).rate for first, *rest in samples]
+    samples = zip(output.tolist(), time.tolist(),
+                  *(values.tolist() for values in around(time).values()))
+    singly = [compensate(model, first, surroundings=history.follow(*rest)).rate
+              for first, *rest in samples]
     assert singly == pytest.approx(at_once, rel=0.0, abs=1e-14)
 
 
 def distorted(name, *values, rate_of=lambda time: np.sin(1.7 * time), generator=None):
-    """Return model, time, true rate and output of a gyro with one effect on the signal, at 1 kHz over 10 s."""
-    model, time = GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4)), np.arange(0.0, 10.0, 1e-3)
+    """Return model, time, true rate and output of a gyro with one effect, at 1 kHz over 10 s."""
+    model, time = (GyroModel((Term(CATALOGUE[name], values),), noise=Noise(1e-4)),
+                   np.arange(0.0, 10.0, 1e-3))
     rate = rate_of(time)
-    return model, time, rate, respond(model, time, History().follow(time).moving(rate, rate), generator)
+    return model, time, rate, respond(model, time, History().follow(time).moving(rate, rate),
+                                      generator)
 
 
-@pytest.mark.parametrize('name, value', [('time_offset', 0.02), ('time_offset', -0.013), ('clock_rate', 0.01)])
+@pytest.mark.parametrize('name, value',
+                         [('time_offset', 0.02), ('time_offset', -0.013), ('clock_rate', 0.01)])
 def test_moving_the_stamps_undoes_a_delay_and_a_wrong_clock(name, value):
     model, time, rate, output = distorted(name, value)
     assert np.abs(output - rate).max() > 0.01
@@ -124,10 +141,12 @@ def test_moving_the_stamps_undoes_a_delay_and_a_wrong_clock(name, value):
     assert output[inside] == pytest.approx(np.sin(1.7 * model.true_time(time[inside])), abs=1e-6)
 
 
-@pytest.mark.parametrize('names', [('time_offset', 'clock_rate'), ('clock_rate', 'time_offset')], ids='-'.join)
+@pytest.mark.parametrize('names', [('time_offset', 'clock_rate'), ('clock_rate', 'time_offset')],
+                         ids='-'.join)
 def test_a_delay_and_a_wrong_clock_are_undone_in_the_order_of_the_model(names):
     values = {'time_offset': 0.5, 'clock_rate': 0.05}
-    model, time = GyroModel(tuple(Term(CATALOGUE[name], (values[name],)) for name in names)), np.arange(0.0, 10.0, 1e-3)
+    model, time = (GyroModel(tuple(Term(CATALOGUE[name], (values[name],)) for name in names)),
+                   np.arange(0.0, 10.0, 1e-3))
     output = model.distorted('rate', np.sin(1.7 * time), time)
     inside = (time > 1.0) & (time < 8.0)
     assert output[inside] == pytest.approx(np.sin(1.7 * model.true_time(time[inside])), abs=1e-6)
@@ -136,7 +155,8 @@ def test_a_delay_and_a_wrong_clock_are_undone_in_the_order_of_the_model(names):
 def test_the_output_of_a_band_limited_gyro_is_damped_and_late_as_a_lag_of_first_order():
     _, time, _, output = distorted('bandwidth', 0.05)
     gain = 1.0 / (1.0 + 1.7j * 0.05)
-    assert output[time > 2.0] == pytest.approx((gain * np.exp(1.7j * time)).imag[time > 2.0], abs=1e-5)
+    assert output[time > 2.0] == pytest.approx(
+        (gain * np.exp(1.7j * time)).imag[time > 2.0], abs=1e-5)
 
 
 def test_in_the_dead_zone_nothing_comes_out():
@@ -148,13 +168,15 @@ def test_saturation_and_quantization_come_after_the_noise():
     for name, value in (('saturation', 0.8), ('quantization', 0.05)):
         output = distorted(name, value, generator=np.random.default_rng(0))[-1]
         codes = np.unique(np.round(output / value, 9))
-        assert codes.min() == -codes.max() and (name == 'quantization') == bool((codes == np.round(codes)).all()), name
+        assert (codes.min() == -codes.max()
+                and (name == 'quantization') == bool((codes == np.round(codes)).all())), name
 
 
 @pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items() if effect.undone])
 def test_what_cannot_be_undone_is_passed_over(name):
     effect = CATALOGUE[name]
-    model, _, _, output = distorted(name, *(0.01 if each.default is None else each.default for each in effect.parameters))
+    model, _, _, output = distorted(
+        name, *(0.01 if each.default is None else each.default for each in effect.parameters))
     assert model.rate(output, 25.0).tolist() == output.tolist()
     uncertain = replace(model, covariance=np.eye(1))
     assert not rate_sensitivity(uncertain, output, output, 25.0).any()
@@ -168,7 +190,8 @@ def test_columns_have_the_shape_of_the_rates(name):
     columns = effect.columns(Channels(rate, rate, 25.0), *shapes)
     assert [np.shape(column) for column in columns] == [(5,)] * len(effect.coefficients)
     for index, w in enumerate(rate):
-        assert [column[index] for column in columns] == list(effect.columns(Channels(float(w), float(w), 25.0), *shapes))
+        assert [column[index] for column in columns] == list(
+            effect.columns(Channels(float(w), float(w), 25.0), *shapes))
 
 
 def test_the_sine_response_is_the_sine_of_the_sagnac_phase():
@@ -178,33 +201,44 @@ def test_the_sine_response_is_the_sine_of_the_sagnac_phase():
 
 def test_looking_at_channels_is_honest():
     effects = [*CATALOGUE.values(), POLYNOMIAL, rate_temperature_polynomial(3, 0)]
-    base = {'rate': 0.3, 'output': 0.4, 'temperature': 30.0, 'time': 0.2, 'specific_force': 1.0, 'supply': 4.0, 'heading': 0.3,
-            'lagged': lambda channel, time_constant: 2.0, 'heating': lambda filter_time, threshold: 1.0}
-    other = dict.fromkeys(base, 1.7) | {'lagged': lambda channel, time_constant: 3.0, 'heating': lambda filter_time, threshold: -1.0}
+    base = {'rate': 0.3, 'output': 0.4, 'temperature': 30.0, 'time': 0.2, 'specific_force': 1.0,
+            'supply': 4.0, 'heading': 0.3, 'lagged': lambda channel, time_constant: 2.0,
+            'heating': lambda filter_time, threshold: 1.0}
+    other = dict.fromkeys(base, 1.7) | {'lagged': lambda channel, time_constant: 3.0,
+                                        'heating': lambda filter_time, threshold: -1.0}
     for effect in effects:
         shapes = [shape.default if shape.default is not None else 0.5 for shape in effect.shapes]
         for channel in base:
-            here, there = (np.array(effect.columns(Channels(**(base | {channel: of[channel]})), *shapes)) for of in (base, other))
-            assert (channel in effect.looks_at) or np.array_equal(here, there), (effect.name, channel)
+            here, there = (
+                np.array(effect.columns(Channels(**(base | {channel: of[channel]})), *shapes))
+                for of in (base, other))
+            assert (channel in effect.looks_at) or np.array_equal(here, there), (
+                effect.name, channel)
 
 
 def eq_12(matrix, output, degc):
     """Return the error, deg/s, by eq. 12 of Ojeda et al. as printed, for deg/s and degC."""
-    return np.array([degc ** 2, degc, 1.0]) @ matrix @ np.array([output ** 3, output ** 2, output, 1.0])
+    return np.array([degc ** 2, degc, 1.0]) @ matrix @ np.array(
+        [output ** 3, output ** 2, output, 1.0])
 
 
 @pytest.mark.parametrize('output', [-100.0, -12.5, 0.0, 3.0, 100.0])
 @pytest.mark.parametrize('degc', [0.0, 25.0, 45.0])
-def test_the_matrix_of_eq_11_gives_the_error_of_eq_12_and_one_subtraction_compensates(output, degc):
+def test_the_matrix_of_eq_11_gives_the_error_of_eq_12_and_one_subtraction_compensates(
+        output, degc):
     model = gyro('rate_temperature_polynomial')
     error = model.error(Channels(rate=math.nan, output=output * DEGREE, temperature=degc))
     assert error / DEGREE == pytest.approx(eq_12(C, output, degc), abs=1e-12)
-    assert compensate(model, output * DEGREE, degc).rate / DEGREE == pytest.approx(output - eq_12(C, output, degc), abs=1e-12)  # eq. 13
+    # Eq. 13.
+    assert compensate(model, output * DEGREE, degc).rate / DEGREE == pytest.approx(
+        output - eq_12(C, output, degc), abs=1e-12)
 
 
-@pytest.mark.parametrize('matrix', [C, C[:, 2:], C[2:], [[0.5]], [[1e-4, 0.5]]], ids=['3x4', '3x2', '1x4', '1x1', '1x2'])
+@pytest.mark.parametrize('matrix', [C, C[:, 2:], C[2:], [[0.5]], [[1e-4, 0.5]]],
+                         ids=['3x4', '3x2', '1x4', '1x1', '1x2'])
 def test_the_matrix_of_eq_11_comes_out_as_it_went_in(matrix):
-    assert polynomial_to_matrix(*polynomial_from_matrix(matrix)) == pytest.approx(np.array(matrix), rel=1e-12, abs=0)
+    assert polynomial_to_matrix(*polynomial_from_matrix(matrix)) == pytest.approx(
+        np.array(matrix), rel=1e-12, abs=0)
 
 
 def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
@@ -217,7 +251,7 @@ def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
 
 
 def test_every_product_of_powers_has_a_column_of_its_own():
-    """The index of eq. 10 as printed, i + (j - 1) p, collides: the four columns of one power of temperature overlap the next one's."""
+    """The printed index of eq. 10, i + (j - 1) p, collides: four columns of neighbours overlap."""
     printed = {i + (j - 1) * 3 for i in range(1, 5) for j in range(1, 4)}
     assert len(printed) == 10, 'of 12'
     generator = np.random.default_rng(0)
@@ -227,7 +261,8 @@ def test_every_product_of_powers_has_a_column_of_its_own():
 
 
 @pytest.mark.parametrize('matrix', [
-    [], [[]], 'abc', None, [[1, 2], [3]], [[math.nan]], [[math.inf, 1]], [1, 2], [[[1]]], [['a']], [[10 ** 400]], [[1e308, 0, 0, 0]], {}])
+    [], [[]], 'abc', None, [[1, 2], [3]], [[math.nan]], [[math.inf, 1]], [1, 2], [[[1]]], [['a']],
+    [[10 ** 400]], [[1e308, 0, 0, 0]], {}])
 def test_what_is_no_matrix_of_eq_11_is_refused(matrix):
     with pytest.raises(ValueError, match='rows of finite numbers'):
         polynomial_from_matrix(matrix)

@@ -25,7 +25,7 @@ def samples(count=None, rate=100.0):
 
 
 def read_all(path, protocol, enough=None, settings=None, until=lambda received: True):
-    """Read until the gyro is unplugged, or until there are enough samples and something is true of them."""
+    """Read until the gyro is unplugged, or enough samples are there and a condition holds."""
     port, decoder, received = SerialPort(str(path), 115200), find(protocol).decoder(settings), []
     port.open()
     try:
@@ -41,15 +41,18 @@ def read_all(path, protocol, enough=None, settings=None, until=lambda received: 
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_reader_gets_every_sample(name, tmp_path):
     settings = Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
-    emulator = Emulator(find(name), samples(200), settings, speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
+    emulator = Emulator(find(name), samples(200), settings, speed=math.inf, link=tmp_path / 'gyro',
+                        wait_for_reader=True)
     with emulator:
         received = read_all(emulator.path, name, 200, settings)
     resolution = 1e-6 if name in ('csv', 'kvh_1750', 'fizoptika') else find(name).sensitivity
-    assert [sample.output for sample in received] == pytest.approx([sample.output for sample in samples(200)], abs=resolution)
+    assert [sample.output for sample in received] == pytest.approx(
+        [sample.output for sample in samples(200)], abs=resolution)
 
 
 def test_nothing_is_lost_when_the_samples_end(tmp_path):
-    emulator = Emulator(find('csv'), samples(5000), speed=math.inf, link=tmp_path / 'gyro', wait_for_reader=True)
+    emulator = Emulator(find('csv'), samples(5000), speed=math.inf, link=tmp_path / 'gyro',
+                        wait_for_reader=True)
     thread = threading.Thread(target=emulate, args=[emulator])
     thread.start()
     while not (tmp_path / 'gyro').exists():
@@ -66,7 +69,8 @@ def test_samples_come_at_their_times(speed):
     def is_in_time(received):
         arrivals.append(time.monotonic())
         sent = (received[-1].time - received[0].time) / speed
-        return sent > 0.5 and arrivals[-1] - arrivals[0] == pytest.approx(sent, abs=0.05) or arrivals[-1] - arrivals[0] > 20.0
+        return (sent > 0.5 and arrivals[-1] - arrivals[0] == pytest.approx(sent, abs=0.05)
+                or arrivals[-1] - arrivals[0] > 20.0)
     with Emulator(find('csv'), samples(rate=100.0), speed=speed, wait_for_reader=True) as emulator:
         read_all(emulator.path, 'csv', 1, until=is_in_time)
     assert arrivals[-1] - arrivals[0] < 20.0
@@ -97,7 +101,8 @@ def test_a_replay_waits_for_its_reader():
 
 def test_what_the_driver_sends_is_ignored():
     with Emulator(find('kvh_dsp3000'), samples(rate=100.0), wait_for_reader=True) as emulator:
-        port, decoder, received = SerialPort(emulator.path, 38400), find('kvh_dsp3000').decoder(), []
+        port, decoder, received = (SerialPort(emulator.path, 38400),
+                                   find('kvh_dsp3000').decoder(), [])
         port.open()
         while len(received) < 30:
             port.write(b'RRR' * 100)
@@ -155,8 +160,9 @@ def test_a_sample_without_a_time_is_refused():
 
 
 def received_over(faults, protocol, count, rate):
-    """Return the samples of a short drive over a bad line, as lists of those that came together, and the bytes alike."""
-    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, faults=faults, generator=np.random.default_rng(1))
+    """Return the bursts of samples of a short drive over a bad line, and the bursts of bytes."""
+    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, faults=faults,
+                    generator=np.random.default_rng(1))
     with gyro:
         port, decoder, received = SerialPort(gyro.path, 9600, timeout=0.5), protocol.decoder(), []
         port.open()
@@ -177,21 +183,26 @@ def test_lost_samples_leave_holes():
 
 def test_samples_are_numbered_before_any_is_lost():
     sent = []
-    protocol = replace(find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
-    with Emulator(protocol, samples(100, 1e4), faults=SerialFaults(lost_samples=0.5), generator=np.random.default_rng(1)) as gyro:
+    protocol = replace(
+        find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
+    with Emulator(protocol, samples(100, 1e4), faults=SerialFaults(lost_samples=0.5),
+                  generator=np.random.default_rng(1)) as gyro:
         gyro.join()
     assert set(sent) < set(range(100)) and sent == sorted(sent) and 30 < len(sent) < 70
 
 
 def test_an_adapter_hands_over_in_bursts():
     """Sixteen samples of 1 ms each come together."""
-    received = [len(samples) for samples in received_over(SerialFaults(burst=0.016), find('csv'), 320, 1000.0)[0]]
+    received = [len(samples) for samples in received_over(
+        SerialFaults(burst=0.016), find('csv'), 320, 1000.0)[0]]
     assert sum(received) == 320
-    assert sum(count for count in received if count % 16 == 0) > 160  # a busy machine may take several bursts at once
+    # a busy machine may take several bursts at once
+    assert sum(count for count in received if count % 16 == 0) > 160
 
 
 def test_a_slow_line_gives_single_bytes():
-    received, chunks = received_over(SerialFaults(piece=1), replace(find('kvh_ecore'), baud=600), 10, 5.0)
+    received, chunks = received_over(SerialFaults(piece=1),
+                                     replace(find('kvh_ecore'), baud=600), 10, 5.0)
     assert sum(len(samples) for samples in received) == 10
     sizes = [len(chunk) for chunk in chunks if chunk]
     assert sizes.count(1) > 0.5 * len(sizes)
@@ -203,10 +214,12 @@ def test_a_line_with_faults_needs_a_generator():
 
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():
-    """As fizoptika sends them. It waits for its reader, as replays do: the buffer of a pseudo-terminal holds no more than 40 ms of them."""
+    """As fast as fizoptika sends. It waits for its reader: the buffer holds 40 ms at most."""
     gyro = Emulator(find('kvh_ecore'), samples(11500, 5750.0), speed=2.0, wait_for_reader=True)
     with gyro:
-        port, decoder, count, begin, used = SerialPort(gyro.path, 921600), find('kvh_ecore').decoder(), 0, math.inf, time.process_time()
+        port, decoder, count, begin, used = (SerialPort(gyro.path, 921600),
+                                             find('kvh_ecore').decoder(),
+                                             0, math.inf, time.process_time())
         port.open()
         while count < 11500 and time.monotonic() < begin + 20.0:
             count += len(decoder.feed(port.read()))
@@ -214,11 +227,13 @@ def test_eleven_thousand_samples_a_second_are_sent_in_time():
         elapsed, used = time.monotonic() - begin, time.process_time() - used
         port.close()
     assert count == 11500
-    assert elapsed > 0.9 and used < 1.5  # a busy machine is late, but what it has to do must not last longer than the samples
+    # A busy machine is late, but its work must not last longer than the samples.
+    assert elapsed > 0.9 and used < 1.5
 
 
-@pytest.mark.parametrize('words, sentence', [(['--lose', '3'], 'lost_bytes is 3.0, but must be a probability'),
-                                             (['--burst', '-1'], 'burst is -0.001 s'), (['--piece', 'x'], 'invalid int value')])
+@pytest.mark.parametrize('words, sentence', [
+    (['--lose', '3'], 'lost_bytes is 3.0, but must be a probability'),
+    (['--burst', '-1'], 'burst is -0.001 s'), (['--piece', 'x'], 'invalid int value')])
 def test_a_line_that_is_not_possible_is_refused_by_the_verb(run, tmp_path, words, sentence):
     (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
     code, _, said = run('emulate', '--protocol', 'csv', '--model', tmp_path / 'model.yaml', *words)
@@ -228,8 +243,9 @@ def test_a_line_that_is_not_possible_is_refused_by_the_verb(run, tmp_path, words
 def test_the_verb_sends_over_a_bad_line(tmp_path):
     """Three samples in ten are lost, and the same ones with the same seed."""
     (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
-    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv', '--model', tmp_path / 'model.yaml', '--wait',
-               '--link', tmp_path / 'gyro', '--speed', '50', '--lose-samples', '0.3', '--seed', '7']
+    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv', '--model',
+               tmp_path / 'model.yaml', '--wait', '--link', tmp_path / 'gyro', '--speed', '50',
+               '--lose-samples', '0.3', '--seed', '7']
     times = []
     for _ in range(2):
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:

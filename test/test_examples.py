@@ -22,7 +22,8 @@ def run(tmp_path):
         paths = [str(FOLDER.parents[1]), *filter(None, [os.environ.get('PYTHONPATH')])]
         environment = os.environ | {'PYTHONPATH': os.pathsep.join(paths)}
         command = [sys.executable, FOLDER / name, *QUICK.get(name, [])]
-        result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+        result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True,
+                                text=True, timeout=60)
         assert result.returncode == 0 and not result.stderr, result.stderr
         return result.stdout
     return run
@@ -57,17 +58,21 @@ def test_the_rate_table_gives_a_model_that_knows_the_true_rate(run, tmp_path):
 
 def test_record_player_and_encoder_find_the_gyro(run):
     found = [line.split() for line in run('turntable.py').splitlines() if '+-' in line]
-    wrong = [line for line in found if abs(float(line[-4]) - (1.3 if line[-1] == '%' else 0.2)) > 4.0 * float(line[-2])]
+    wrong = [line for line in found
+             if abs(float(line[-4]) - (1.3 if line[-1] == '%' else 0.2)) > 4.0 * float(line[-2])]
     assert len(found) == 4 and not wrong
 
 
 def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(run, tmp_path):
-    off = [float(line.split()[-6]) for line in run('diagnose_a_log.py').splitlines() if line.startswith('Another drive')]
-    lag, = (term.values for term in read_model(tmp_path / 'model.yaml').terms if term.effect.name == 'thermal_lag')
+    off = [float(line.split()[-6]) for line in run('diagnose_a_log.py').splitlines()
+           if line.startswith('Another drive')]
+    lag, = (term.values for term in read_model(tmp_path / 'model.yaml').terms
+            if term.effect.name == 'thermal_lag')
     assert abs(lag[0] / 120.0 - 1.0) < 0.2 and abs(lag[1] / 2e-4 - 1.0) < 0.2
     assert off[1] < 0.3 * off[0] and (tmp_path / 'report.html').exists()
 
 
 def test_the_compensated_log_has_a_heading(run, tmp_path):
     run('compensate_a_log.py')
-    assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(read_log(tmp_path / 'compensated.csv').others)
+    assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(
+        read_log(tmp_path / 'compensated.csv').others)

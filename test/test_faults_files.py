@@ -1,7 +1,4 @@
-"""
-What a robot keeps in files, through kills at any moment and a full disk: the old file or the new one, and nothing half written for long.
-
-"""
+"""Files of a robot, through kills at any moment and a full disk: the old file or the new one."""
 
 import json
 import os
@@ -21,11 +18,13 @@ from gyro_calibration.ros.calibration_session import REST
 
 @pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])
 def test_kills_leave_the_old_files_or_the_new_ones(tmp_path, kills):
-    """A process that writes what the node writes, with the same code; the whole node is killed below."""
+    """A process writes what the node writes, with the same code; the node is killed below."""
     command = [sys.executable, Path(__file__).parent / 'killed_writer.py', tmp_path, str(kills)]
-    found = json.loads(subprocess.run(command, check=True, capture_output=True, timeout=300).stdout)
+    found = json.loads(
+        subprocess.run(command, check=True, capture_output=True, timeout=300).stdout)
     assert found['torn'] == 0 and found['hints'] == ''
-    assert min(*found['old'], *found['new'], found['half_written']) > kills / 50, f'kills too early or too late: {found}'
+    assert min(*found['old'], *found['new'], found['half_written']) > kills / 50, (
+        f'kills too early or too late: {found}')
     assert found['left'] == ['biases.yaml', 'calibration.yaml']
 
 
@@ -39,15 +38,18 @@ def test_what_a_killed_writer_left_is_removed_and_what_is_being_written_is_not(t
         write_atomically(path, b'of another process, in between')
         remove_leftovers(path)
     assert path.read_bytes() == b'new'
-    assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234', 'model.yaml']
+    assert sorted(os.listdir(tmp_path)) == ['.model.yaml.swp', '.other.yaml.abcd1234',
+                                            'model.yaml']
 
 
 class Disk:
-    """A small disk that can be filled, or, where nobody may mount one, a limit to the files that a process writes."""
+    """A small disk that can be filled, or, without one, a limit to the files of a process."""
 
     def __init__(self, folder):
         self.folder, self.process = folder, None
-        self.is_mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs', folder], capture_output=True).returncode == 0
+        self.is_mounted = subprocess.run(
+            ['mount', '-t', 'tmpfs', '-o', 'size=64k', 'tmpfs', folder],
+            capture_output=True).returncode == 0
 
     def fill(self):
         """Leave no room."""
@@ -66,7 +68,8 @@ class Disk:
         if self.is_mounted:
             (self.folder / 'ballast').unlink()
         else:
-            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE,
+                             (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
 @pytest.fixture
@@ -76,7 +79,8 @@ def disk(tmp_path):
     folder.mkdir()
     disk = Disk(folder)
     if not disk.is_mounted and not hasattr(resource, 'prlimit'):
-        pytest.skip('a disk can be filled neither by mounting a small one (that takes root) nor by prlimit (Linux has it)')
+        pytest.skip('a disk can be filled neither by mounting a small one (that takes root) nor '
+                    'by prlimit (Linux has it)')
     yield disk
     if disk.is_mounted:
         subprocess.run(['umount', '-l', folder], check=True)
