@@ -1,4 +1,4 @@
-"""A file is complete or not there: also after a kill at any moment, and after a write that fails."""
+"""A file is complete or not there, also after a kill at any moment and after a failed write."""
 
 import os
 import random
@@ -29,7 +29,8 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
         writer.send_signal(signal.SIGKILL)
         writer.communicate()
         content = path.read_bytes()
-        assert content in (b'a' * 500_000, b'b' * 500_000), f'{len(content)} bytes of {set(content)}'
+        assert content in (b'a' * 500_000, b'b' * 500_000), (
+            f'{len(content)} bytes of {set(content)}')
         found.add(content[:1])
     assert found == {b'a', b'b'}, 'no kill came between two writes, so this test shows nothing'
 

@@ -18,7 +18,8 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
 
 #: Numerator and denominator.
-FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]), 'low pass': butter(2, 0.3)}
+FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]),
+           'low pass': butter(2, 0.3)}
 ANGLE_RANDOM_WALK = 1e-4
 SHORT = {'duration': 600.0, 'sample_rate': 25.0}
 
@@ -41,14 +42,17 @@ def test_noise_behind_a_filter_is_no_cause(filter):
 def test_the_angle_random_walk_behind_a_filter_is_that_of_low_frequencies():
     hidden, log = behind('exponential smoothing')
     found = diagnose([log], np.random.default_rng(0))
-    assert found.noise.angle_random_walk == pytest.approx(hidden.truth.expected['angle_random_walk'], rel=0.05)
+    assert found.noise.angle_random_walk == pytest.approx(
+        hidden.truth.expected['angle_random_walk'], rel=0.05)
 
 
-@pytest.mark.parametrize('filter, name', list(zip(FILTERS, ['time_offset', 'interference_tone', 'time_offset'])))
+@pytest.mark.parametrize('filter, name',
+                         list(zip(FILTERS, ['time_offset', 'interference_tone', 'time_offset'])))
 def test_what_is_hidden_in_noise_behind_a_filter_is_found(filter, name):
     hidden, log = behind(filter, [name], 8.0, 1)
     found = diagnose([log], np.random.default_rng(0))
-    assert [each.effect for each in found.findings] == [name] and not found.unexplained, told(hidden, found)
+    assert [each.effect for each in found.findings] == [name] and not found.unexplained, (
+        told(hidden, found))
 
 
 @pytest.mark.parametrize('seconds', [20.0, 120.0, 900.0])
@@ -64,13 +68,15 @@ def test_white_noise_has_been_through_no_filter(seconds):
 # rounding
 
 def rounded(step, known):
-    """Return a log of a gyro whose output comes in steps, so many standard deviations wide, and what is found beside its model."""
+    """Return a log with steps of so many standard deviations, and what is found in it."""
     generator = np.random.default_rng(3)
     time = np.arange(20_000) / 50.0
     white = ANGLE_RANDOM_WALK / np.sqrt(0.02)
     rate = 0.8 * np.sin(0.3 * time) * np.sin(0.041 * time)
-    output = np.round((rate + white * generator.standard_normal(len(time))) / (step * white)) * step * white
-    model = GyroModel((Term(QUANTIZATION, (step * white,)),) if known else (), noise=Noise(ANGLE_RANDOM_WALK))
+    output = (np.round((rate + white * generator.standard_normal(len(time))) / (step * white))
+              * step * white)
+    model = GyroModel((Term(QUANTIZATION, (step * white,)),) if known else (),
+                      noise=Noise(ANGLE_RANDOM_WALK))
     return diagnose([Log(time=time, output=output, reference_rate=rate)], generator, model)
 
 

@@ -1,4 +1,4 @@
-"""Measured gyros calibrated on some seconds of motion and followed for minutes: what was stated covers the error, or it is refused."""
+"""Recordings of gyros: calibrated on seconds, followed for minutes, and the errors as stated."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import quadratic_form
-from gyro_calibration.doubt import ASYMMETRY, allow_asymmetry, look_slower, refuse_repeating, refuse_useless
+from gyro_calibration.doubt import (
+    ASYMMETRY,
+    allow_asymmetry,
+    look_slower,
+    refuse_repeating,
+    refuse_useless,
+)
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
 from gyro_calibration.log import DEGREE, DataRefused, read_log
@@ -26,21 +32,24 @@ SENSES = {'yaw_slow': -1.0, 'yaw_fast': -1.0, 'pitch_slow': 1.0}
 
 @pytest.fixture(params=sorted(SENSES))
 def recording(request, data):
-    """Return the name of a recording, and a function that gives time, s, output, rad/s, and heading, rad, of a part of it."""
+    """Return a recording's name, and a function of time, s, output, rad/s, and heading, rad."""
     log = read_log(data / 'mems_encoder_turntable' / f'{request.param}.csv.gz')
 
     def part(start):
         chosen = (log.time >= start) & (log.time < start + FOLLOWED)
-        time, output, heading = (values[chosen] for values in (log.time, log.output, log.reference_heading))
+        time, output, heading = (values[chosen]
+                                 for values in (log.time, log.output, log.reference_heading))
         return time - time[0], SENSES[request.param] * output, heading - heading[0]
     return request.param, part
 
 
 def follow(fit, time, output, heading):
-    """Return the error of the heading, rad, and its stated standard deviation, rad, without the last second."""
+    """Return error of the heading and its stated deviation, rad, without the last second."""
     turned = integrate(time, (output - fit.bias) / (1.0 + fit.scale_factor_error))
-    turned = np.interp(time + fit.time_offset, time, turned) - np.interp(max(fit.time_offset, 0.0), time, turned)
-    known = quadratic_form(fit.covariance, np.array([heading, time])) / (1.0 + fit.scale_factor_error) ** 2
+    turned = (np.interp(time + fit.time_offset, time, turned)
+              - np.interp(max(fit.time_offset, 0.0), time, turned))
+    known = (quadratic_form(fit.covariance, np.array([heading, time]))
+             / (1.0 + fit.scale_factor_error) ** 2)
     variance = known + NOISE.heading_variance(time) + fit.start_heading_deviation ** 2
     kept = time < FOLLOWED - 1.0
     return (turned + fit.start_heading - heading)[kept], np.sqrt(variance)[kept]
@@ -51,43 +60,49 @@ def rms(error):
 
 
 def calibrated(part, seconds, limits=None, noise=None):
-    """Return a fit, or None where it was refused, with the rest of the recording, for every start."""
+    """Return a fit, or None if refused, and the rest of the recording, for every start."""
     for start in STARTS:
         time, output, heading = part(start)
         run = time <= seconds
         try:
-            fit = self_calibrate(time[run], output[run], from_headings(time[run], heading[run]), limits=limits, noise=noise)
+            fit = self_calibrate(time[run], output[run], from_headings(time[run], heading[run]),
+                                 limits=limits, noise=noise)
         except DataRefused:
             fit = None
         yield fit, time, output, heading
 
 
 def test_a_gyro_that_shakes_on_its_mount_is_not_refused_for_being_louder_than_at_rest(recording):
-    """What repeats with the motion does not add up; the noise at rest is a tenth of what the half seconds of the swing show."""
+    """Errors that repeat with the motion do not add up; rest has a tenth of the swing's noise."""
     name, part = recording
     if name != 'yaw_fast':
-        assert sum(fit is not None for fit, *_ in calibrated(part, 60.0, noise=NOISE)) >= len(STARTS) - 1
+        assert (sum(fit is not None for fit, *_ in calibrated(part, 60.0, noise=NOISE))
+                >= len(STARTS) - 1)
 
 
 @pytest.mark.parametrize('seconds', [20.0, 30.0, 60.0])
-def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(recording, seconds):
+def test_the_error_over_five_minutes_is_inside_what_was_stated_or_the_calibration_is_refused(
+        recording, seconds):
     name, part = recording
     found = list(calibrated(part, seconds, Limits(repeating=math.inf)))
-    errors = [(*follow(*run), rms(integrate(run[1], run[2]) - run[3])) for run in found if run[0] is not None]
+    errors = [(*follow(*run), rms(integrate(run[1], run[2]) - run[3]))
+              for run in found if run[0] is not None]
     for error, deviation, raw in errors:
         inside = np.mean(np.abs(error) <= 1.96 * deviation)
-        print(f'{name} {seconds:g} s: rms {rms(error) / DEGREE:.2f} deg, raw {raw / DEGREE:.2f} deg, inside 95 %: {100 * inside:.1f} %')
+        print(f'{name} {seconds:g} s: rms {rms(error) / DEGREE:.2f} deg, raw '
+              f'{raw / DEGREE:.2f} deg, inside 95 %: {100 * inside:.1f} %')
         assert inside >= 0.9
     print(f'{name} {seconds:g} s: {len(STARTS) - len(errors)} of {len(STARTS)} refused')
     if name == 'yaw_fast':
         assert len(errors) >= {20.0: 0, 30.0: 1, 60.0: 3}[seconds]
     else:
-        assert len(errors) >= len(STARTS) - 1 and all(rms(error) < 0.6 * raw for error, _, raw in errors)
+        assert (len(errors) >= len(STARTS) - 1
+                and all(rms(error) < 0.6 * raw for error, _, raw in errors))
 
 
 @pytest.mark.parametrize('seconds', [20.0, 60.0])
 def test_on_the_stamps_as_they_are_too(recording, seconds):
-    """The gyro is 12 ms later than the encoder, which is 0.5 deg at 45 deg/s, and 4 deg at 330 deg/s."""
+    """The gyro is 12 ms later than the encoder: 0.5 deg at 45 deg/s, and 4 deg at 330 deg/s."""
     name, part = recording
     found = [run for run in calibrated(part, seconds) if run[0] is not None]
     inside = []
@@ -96,23 +111,27 @@ def test_on_the_stamps_as_they_are_too(recording, seconds):
         error, deviation = follow(on_stamps, time, output, heading)
         inside.append(np.mean(np.abs(error) <= 1.96 * deviation))
     print(f'{name} {seconds:g} s: inside 95 % in {100.0 * np.array(inside)} % of the time')
-    assert not found if name == 'yaw_fast' else len(found) >= len(STARTS) - 1 and np.mean(inside) >= 0.9
+    assert (not found if name == 'yaw_fast'
+            else len(found) >= len(STARTS) - 1 and np.mean(inside) >= 0.9)
 
 
 @pytest.mark.parametrize('name, change', [('slow', 0.3), ('fast', 0.1)])
 def test_one_axis_that_tilts_has_another_bias_about_the_vertical_than_at_rest(data, name, change):
     log = read_log(data / 'mems_motion_capture' / f'{name}.csv.gz')
     known = np.isfinite(log.output) & np.isfinite(log.reference_rate)
-    resting, moving = (known & (log.time > begin) & (log.time < end) for begin, end in ((10.0, 30.0), (45.0, 150.0)))
+    resting, moving = (known & (log.time > begin) & (log.time < end)
+                       for begin, end in ((10.0, 30.0), (45.0, 150.0)))
     bias, deviation = calibrate_bias(log.time[resting], log.output[resting])
     in_motion = np.mean(log.output[moving] - log.reference_rate[moving])
-    print(f'{name}: at rest {bias / DEGREE:.3f} +- {deviation / DEGREE:.4f} deg/s, in motion {in_motion / DEGREE:.3f} deg/s')
+    print(f'{name}: at rest {bias / DEGREE:.3f} +- {deviation / DEGREE:.4f} deg/s, in motion '
+          f'{in_motion / DEGREE:.3f} deg/s')
     assert bias - in_motion > max(change * DEGREE, 30.0 * deviation)
 
 
 def test_a_heading_that_is_off_again_and_again_is_refused():
     fit = Fit(0.0, 0.0, np.zeros((2, 2)), repeating=1.6 * DEGREE)
-    with pytest.raises(DataRefused, match=r'off by 1\.6 deg \(rms\) again and again.*at most 1 deg.*slowly'):
+    with pytest.raises(DataRefused,
+                       match=r'off by 1\.6 deg \(rms\) again and again.*at most 1 deg.*slowly'):
         refuse_repeating(fit, 1.0 * DEGREE)
     refuse_repeating(fit, 2.0 * DEGREE)
 
@@ -163,16 +182,20 @@ def test_stamps_that_jitter_become_even_and_others_stay():
 def test_a_gyro_that_samples_unevenly_is_believed_its_stamps():
     generator = np.random.default_rng(3)
     time = np.cumsum(generator.uniform(0.002, 0.018, 2000))
-    output = 1.02 * CALIBRATION.rate_at(time) + 0.05 * DEGREE * generator.standard_normal(len(time))
+    output = (1.02 * CALIBRATION.rate_at(time)
+              + 0.05 * DEGREE * generator.standard_normal(len(time)))
     assert np.abs(even_times(time) - time).max() > 0.01
-    fit = self_calibrate(time, output, from_headings(np.arange(2001) * 0.01, CALIBRATION.heading_at(np.arange(2001) * 0.01)))
+    fit = self_calibrate(
+        time, output, from_headings(np.arange(2001) * 0.01,
+                                    CALIBRATION.heading_at(np.arange(2001) * 0.01)))
     assert fit.scale_factor_error == pytest.approx(0.02, abs=3e-4)
 
 
 def test_a_calibration_that_makes_a_heading_worse_is_refused_and_a_good_one_is_not():
     limit = 15.0 * DEGREE
     poor, good = (np.diag([1e-6, (deviation * DEGREE) ** 2]) for deviation in (0.3, 0.01))
-    with pytest.raises(DataRefused, match=r'0\.300 deg/s only.*drift by 90 deg.*without the calibration it is 15 deg.*slowly'):
+    with pytest.raises(DataRefused, match=r'0\.300 deg/s only.*drift by 90 deg.*'
+                       r'without the calibration it is 15 deg.*slowly'):
         refuse_useless(Fit(0.0, 0.05 * DEGREE, poor), limit)
     refuse_useless(Fit(0.0, 0.0, good), limit)
     refuse_useless(Fit(0.0, 1.0 * DEGREE, poor), limit)

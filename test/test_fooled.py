@@ -1,5 +1,5 @@
 """
-A self-calibration is not fooled: what went wrong is refused by its name, good runs are accepted, and the rest after a run checks it.
+Self-calibration: bad runs are refused by name, good ones accepted, and rests check them.
 
 `benchmarks/fooled.py` does the first two with 200 runs of each kind at each noise level.
 
@@ -61,12 +61,14 @@ def test_good_runs_are_accepted_and_their_intervals_hold_the_truth(level):
 def output(seed=0, motion=CALIBRATION, time=TIME, level=1.0):
     """Return what an XV3500 with so many times its noise says of a motion."""
     noise = Noise(level * XV3500.noise.angle_random_walk, level * XV3500.noise.bias_instability)
-    return (1 + S) * motion.rate_at(time) + B + simulate_noise(noise, len(time), 0.01, np.random.default_rng(seed))
+    return ((1 + S) * motion.rate_at(time) + B
+            + simulate_noise(noise, len(time), 0.01, np.random.default_rng(seed)))
 
 
 def test_the_goodness_of_fit_has_the_probability_that_it_says():
-    """The probability is even between 0 and 1 if the noise is what it is said to be: 4 standard errors about the mean."""
-    probabilities = [self_calibrate(TIME, output(seed), CALIBRATION, noise=XV3500.noise).goodness.probability for seed in range(40)]
+    """The probability is uniform where the noise is as stated: mean to 4 standard errors."""
+    probabilities = [self_calibrate(TIME, output(seed), CALIBRATION,
+                                    noise=XV3500.noise).goodness.probability for seed in range(40)]
     assert np.mean(probabilities) == pytest.approx(0.5, abs=4.0 / math.sqrt(12.0 * 40))
 
 
@@ -75,12 +77,14 @@ def test_noise_beyond_the_models_is_said_and_more_of_it_refused():
     assert goodness.probability < UNLIKELY and goodness.noise_ratio == pytest.approx(3.0, rel=0.4)
     assert 'more than the noise explains' in str(goodness)
     with pytest.raises(DataRefused, match='times as noisy as the model says'):
-        self_calibrate(TIME, output(level=15.0), CALIBRATION, noise=XV3500.noise, limits=Limits(scale_standard_deviation=1.0))
+        self_calibrate(TIME, output(level=15.0), CALIBRATION, noise=XV3500.noise,
+                       limits=Limits(scale_standard_deviation=1.0))
 
 
 def test_an_early_end_is_told_by_when():
     motion = turns([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])
-    with pytest.raises(DataRefused, match=r'stopped at about (7\.[5-9]|8\.[0-5]) s of the profile\'s 20\.0 s'):
+    with pytest.raises(DataRefused,
+                       match=r'stopped at about (7\.[5-9]|8\.[0-5]) s of the profile\'s 20\.0 s'):
         self_calibrate(TIME, output(motion=motion), CALIBRATION, noise=XV3500.noise)
 
 
@@ -93,13 +97,16 @@ def test_a_robot_that_begins_too_late_is_told_by_how_much():
 def test_a_slip_in_a_run_of_ten_minutes_is_found_while_the_robot_waits():
     time = np.arange(59000) / 100.0
     motion = from_rates(time, 0.5 * np.sin(0.5 * time))
-    rate = (1.0 + S) * motion.rate_at(time) + B + 1e-3 * np.random.default_rng(0).standard_normal(len(time))
+    rate = ((1.0 + S) * motion.rate_at(time) + B
+            + 1e-3 * np.random.default_rng(0).standard_normal(len(time)))
     begin = clock.process_time()
-    with pytest.raises(DataRefused, match='turned 1[0-9.]+ deg otherwise .* at about [789].* a slip or a bump'):
+    with pytest.raises(DataRefused,
+                       match='turned 1[0-9.]+ deg otherwise .* at about [789].* a slip or a bump'):
         self_calibrate(time, rate + 0.3 * ((time > 9.0) & (time < 9.7)), motion, noise=Noise(1e-4))
     assert clock.process_time() - begin < 5.0, 'nothing else is served meanwhile'
     assert len(pieces(time, rate).turned) <= 650
-    assert np.diff(pieces(time[:6000], rate[:6000]).edges) == pytest.approx(0.1), 'a minute keeps its short pieces'
+    assert np.diff(pieces(time[:6000], rate[:6000]).edges) == pytest.approx(0.1), (
+        'a minute keeps its short pieces')
 
 
 def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
@@ -109,18 +116,21 @@ def test_a_limit_hidden_by_the_model_is_seen_in_the_output():
         self_calibrate(TIME, drifting, CALIBRATION, output=clipped)
 
 
-LONG_RAMPS = from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]), np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
+LONG_RAMPS = from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
+                        np.array([0, 0, 45, 45, -45, -45, 0, 0]) * DEGREE)
 
 
 @pytest.mark.parametrize('motion', [CALIBRATION, LONG_RAMPS], ids=['short ramps', 'long ramps'])
 def test_coarse_codes_are_no_limit(motion):
     code, time = 0.2 * DEGREE, np.arange(0.0, motion.duration, 0.01)
-    fit = self_calibrate(time, np.round(((1 + S) * motion.rate_at(time - 0.1) + B) / code) * code, motion)
+    fit = self_calibrate(
+        time, np.round(((1 + S) * motion.rate_at(time - 0.1) + B) / code) * code, motion)
     assert fit.scale_factor_error == pytest.approx(S, abs=0.02)
 
 
-@pytest.mark.parametrize('scale, words', [(1.0, ''), (1.05, ''), (0.7, ''), (-57.0, 'turns the other way'), (0.0, ''),
-                                          (1030.0, 'thousandths'), (0.164, 'revolutions'), (3700.0, 'deg/h')])
+@pytest.mark.parametrize(
+    'scale, words', [(1.0, ''), (1.05, ''), (0.7, ''), (-57.0, 'turns the other way'), (0.0, ''),
+                     (1030.0, 'thousandths'), (0.164, 'revolutions'), (3700.0, 'deg/h')])
 def test_a_unit_is_named_where_there_is_one(scale, words):
     assert (words in unit_error(scale)) if words else not unit_error(scale)
 
@@ -132,7 +142,8 @@ def calibrated(seed):
 
 def rested(seed, change=0.0):
     time = 20.0 + np.arange(201) / 100.0
-    return time, B + change + simulate_noise(XV3500.noise, 201, 0.01, np.random.default_rng([seed, 1]))
+    return time, (
+        B + change + simulate_noise(XV3500.noise, 201, 0.01, np.random.default_rng([seed, 1])))
 
 
 def test_a_rest_after_the_run_refuses_no_more_good_calibrations_than_it_says():
@@ -140,13 +151,15 @@ def test_a_rest_after_the_run_refuses_no_more_good_calibrations_than_it_says():
     refused = 0
     for seed in range(200):
         try:
-            check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise, Limits(drift=0.0), false_refusals=0.1)
+            check_rest(*rested(seed), calibrated(seed % 20), XV3500.noise, Limits(drift=0.0),
+                       false_refusals=0.1)
         except DataRefused:
             refused += 1
     assert refused / 200 == pytest.approx(0.1, abs=0.08)
 
 
-@pytest.mark.parametrize('change, words', [(0.3 * DEGREE, 'the corrected rate is 0.'), (-1.0 * DEGREE, 'the corrected rate is -'),
+@pytest.mark.parametrize('change, words', [(0.3 * DEGREE, 'the corrected rate is 0.'),
+                                           (-1.0 * DEGREE, 'the corrected rate is -'),
                                            (np.linspace(0.0, 10.0 * DEGREE, 201), 'still moved')])
 def test_a_rest_after_the_run_refuses_a_drift_and_a_motion(change, words):
     with pytest.raises(DataRefused, match=words):
@@ -163,30 +176,37 @@ def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
     time = np.arange(2600) / 100.0
     rate = output(0, time=time)
     rest = rest_after(time, rate, calibrated(0), CALIBRATION)
-    assert time[rest][0] == pytest.approx(21.0, abs=0.02) and time[rest][-1] == pytest.approx(23.0, abs=0.02)
-    assert rest_after(time, rate + np.where(time > 20.5, 0.2, 0.0), calibrated(0), CALIBRATION) is None
+    assert (time[rest][0] == pytest.approx(21.0, abs=0.02)
+            and time[rest][-1] == pytest.approx(23.0, abs=0.02))
+    assert rest_after(time, rate + np.where(time > 20.5, 0.2, 0.0), calibrated(0),
+                      CALIBRATION) is None
     assert rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION) is None
 
 
 def odometry(seed, deviation, drift):
-    """Return wheels' heading at 50 Hz, whose scale and drift are off, and whose slip adds up while they turn."""
+    """Return the heading of wheels at 50 Hz with errors of scale and drift, and with slip."""
     generator = np.random.default_rng([seed, 2])
     fine = np.arange(20001) / 1000.0
-    rate = (1 + deviation * generator.standard_normal()) * CALIBRATION.rate_at(fine) + drift * generator.standard_normal()
-    slip = 0.3 * DEGREE * np.sqrt(np.abs(rate) / (90 * DEGREE) / 1000.0) * generator.standard_normal(len(fine))
+    rate = ((1 + deviation * generator.standard_normal()) * CALIBRATION.rate_at(fine)
+            + drift * generator.standard_normal())
+    slip = (0.3 * DEGREE * np.sqrt(np.abs(rate) / (90 * DEGREE) / 1000.0)
+            * generator.standard_normal(len(fine)))
     heading = np.concatenate([[0.0], np.cumsum(rate / 1000.0 + slip)[:-1]])
     return from_headings(fine[::20], heading[::20])
 
 
 def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations():
-    """Measured over 60 runs at 10 and 50 Hz: 93 to 98 % within 1.96 standard deviations; 25 runs are more than 18 of them, by 4 errors."""
+    """Of 60 runs, 93 to 98 % were within 1.96 standard deviations; of 25 more than 18 must be."""
     reference, sizes = Reference(0.0075, 0.01 * DEGREE), []
     for seed in range(25):
         late = np.random.default_rng([seed, 3]).uniform(-0.3, 0.3)
-        fit = self_calibrate(TIME, output(seed, time=TIME - late), odometry(seed, 0.0075, 0.01 * DEGREE), reference=reference)
+        fit = self_calibrate(TIME, output(seed, time=TIME - late),
+                             odometry(seed, 0.0075, 0.01 * DEGREE), reference=reference)
         sizes.append(np.abs([fit.scale_factor_error - S, fit.bias - B, fit.time_offset - late])
-                     / [math.sqrt(fit.covariance[0, 0]), math.sqrt(fit.covariance[1, 1]), fit.time_offset_deviation])
-    assert ((np.array(sizes) < 1.96).sum(axis=0) > 18).all(), np.mean(np.array(sizes) < 1.96, axis=0)
+                     / [math.sqrt(fit.covariance[0, 0]), math.sqrt(fit.covariance[1, 1]),
+                        fit.time_offset_deviation])
+    assert ((np.array(sizes) < 1.96).sum(axis=0) > 18).all(), (
+        np.mean(np.array(sizes) < 1.96, axis=0))
 
 
 def test_the_start_heading_is_found_with_its_deviation():
@@ -194,7 +214,8 @@ def test_the_start_heading_is_found_with_its_deviation():
     sizes, readings = [], np.arange(401) / 20.0
     for seed in range(25):
         errors = 0.5 * DEGREE * np.random.default_rng([seed, 4]).standard_normal(401)
-        fit = fit_likelihood(TIME, output(seed), from_headings(readings, CALIBRATION.heading_at(readings) + errors))
+        fit = fit_likelihood(TIME, output(seed),
+                             from_headings(readings, CALIBRATION.heading_at(readings) + errors))
         sizes.append(abs(fit.start_heading + errors[0]) / fit.start_heading_deviation)
         assert fit.start_heading_deviation < 0.25 * DEGREE
     assert np.sum(np.array(sizes) < 1.96) > 18, np.sort(sizes)
@@ -204,9 +225,11 @@ def turned(number, seed=0, s=S, before=3.0, after=3.0, speed=45.0):
     """Return time and output of whole turns that are closed to a degree or so."""
     generator = np.random.default_rng([seed, 5])
     angle = 360.0 * number + generator.standard_normal()
-    motion = turns([(before, 0), (abs(angle) / speed, math.copysign(speed, angle)), (after + 0.5, 0)])
+    motion = turns([(before, 0), (abs(angle) / speed, math.copysign(speed, angle)),
+                    (after + 0.5, 0)])
     time = np.arange(int(100 * motion.duration) + 1) / 100.0
-    return time, (1 + s) * motion.rate_at(time) + B + simulate_noise(XV3500.noise, len(time), 0.01, generator)
+    return time, ((1 + s) * motion.rate_at(time) + B
+                  + simulate_noise(XV3500.noise, len(time), 0.01, generator))
 
 
 @pytest.mark.parametrize('number', [1, 2, 5, -5])
@@ -216,7 +239,8 @@ def test_whole_turns_give_scale_and_bias_with_their_deviations(number):
     for seed in range(40):
         found = calibrate_turns(*turned(number, seed), number, noise=XV3500.noise)
         assert found.turns == number
-        sizes.append(np.abs([found.fit.scale_factor_error - S, found.fit.bias - B]) / np.sqrt(np.diag(found.fit.covariance)))
+        sizes.append(np.abs([found.fit.scale_factor_error - S, found.fit.bias - B])
+                     / np.sqrt(np.diag(found.fit.covariance)))
     assert ((np.array(sizes) < 1.96).sum(axis=0) > 32).all()
 
 
@@ -226,11 +250,16 @@ def test_turns_are_counted_where_that_can_be():
 
 
 NO_TURNS = {
-    'half a turn too much': (turned(2.5), 2, 'counts 2.5'), 'half a turn, uncounted': (turned(2.5), None, 'counts 2.5'),
-    'one more': (turned(3), 2, 'and 2 were said'), 'too many to count': (turned(12, speed=90.0), None, 'too many to count'),
-    'the other way': (turned(2), -2, 'the other way'), 'not at all': (turned(2), 0, 'turn once at least'),
-    'no rest before': (turned(2, before=0.6), 2, 's before the turns'), 'no rest after': (turned(2, after=0.2), 2, 's after the turns'),
-    'scale and count': (turned(5, s=0.1), 5, 'no whole number'), 'a large scale': (turned(1, s=0.33), 1, 'beyond 30 %'),
+    'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
+    'half a turn, uncounted': (turned(2.5), None, 'counts 2.5'),
+    'one more': (turned(3), 2, 'and 2 were said'),
+    'too many to count': (turned(12, speed=90.0), None, 'too many to count'),
+    'the other way': (turned(2), -2, 'the other way'),
+    'not at all': (turned(2), 0, 'turn once at least'),
+    'no rest before': (turned(2, before=0.6), 2, 's before the turns'),
+    'no rest after': (turned(2, after=0.2), 2, 's after the turns'),
+    'scale and count': (turned(5, s=0.1), 5, 'no whole number'),
+    'a large scale': (turned(1, s=0.33), 1, 'beyond 30 %'),
 }
 
 
@@ -242,15 +271,19 @@ def test_what_cannot_be_whole_turns_is_refused(log, number, words):
 
 def test_turns_are_refused_that_other_causes_spoil():
     time, rate = turned(2)
-    for spoiled, words in ((rate / DEGREE, 'is in deg/s and read as rad/s'), (np.clip(rate, -0.6, 0.6), 'saturated'),
-                           (rate + np.where(time > 15.0, 0.02, 0.0), 'rests before and after'), (B + 0.0 * rate, 'same value'),
-                           (rate - (1 + S) * rate + 1e-3 * np.sin(97.0 * time), 'did the robot move')):
+    for spoiled, words in ((rate / DEGREE, 'is in deg/s and read as rad/s'),
+                           (np.clip(rate, -0.6, 0.6), 'saturated'),
+                           (rate + np.where(time > 15.0, 0.02, 0.0), 'rests before and after'),
+                           (B + 0.0 * rate, 'same value'),
+                           (rate - (1 + S) * rate + 1e-3 * np.sin(97.0 * time),
+                            'did the robot move')):
         with pytest.raises(DataRefused, match=words):
             calibrate_turns(time, spoiled, 2, noise=XV3500.noise)
 
 
 def write_log(path, time, rate, name='gyro_rad_s'):
-    path.write_text(f'time_s,{name}\n' + ''.join(f'{t:.4f},{r:.9f}\n' for t, r in zip(time.tolist(), rate.tolist())))
+    path.write_text(f'time_s,{name}\n'
+                    + ''.join(f'{t:.4f},{r:.9f}\n' for t, r in zip(time.tolist(), rate.tolist())))
     return path
 
 
@@ -263,39 +296,52 @@ def answer(capsys, *words):
 def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, capsys):
     write_model(tmp_path / 'model.yaml', GyroModel(noise=XV3500.noise))
     profile = tmp_path / 'profile.csv'
-    profile.write_text('time_s,rate_rad_s\n' + ''.join(f'{t},{r}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
+    profile.write_text('time_s,rate_rad_s\n'
+                       + ''.join(f'{t},{r}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
     time = np.arange(2500) / 100.0
     log = write_log(tmp_path / 'log.csv', time, output(0, time=time))
-    words = ('self-calibrate', log, '--profile', profile, '--model', tmp_path / 'model.yaml', '--reference-scale-deviation', '0.5')
+    words = ('self-calibrate', log, '--profile', profile, '--model', tmp_path / 'model.yaml',
+             '--reference-scale-deviation', '0.5')
     code, text, _ = answer(capsys, *words, '--json')
     found = json.loads(text)
-    assert code == 0 and found['scale_factor_error_standard_deviation'] == pytest.approx(0.0052, abs=0.0003)
-    assert abs(found['rest_rate_rad_s']) < found['rest_limit_rad_s'] and found['degrees_of_freedom'] > 20
-    assert found['time_offset_standard_deviation_s'] < 0.01 and 0.0 < found['probability'] < 1.0 and found['noise_ratio'] < 2.0
+    assert (code == 0 and found['scale_factor_error_standard_deviation'] == pytest.approx(
+        0.0052, abs=0.0003))
+    assert (abs(found['rest_rate_rad_s']) < found['rest_limit_rad_s']
+            and found['degrees_of_freedom'] > 20)
+    assert (found['time_offset_standard_deviation_s'] < 0.01 and 0.0 < found['probability'] < 1.0
+            and found['noise_ratio'] < 2.0)
     assert found['start_heading_rad'] is None
     said = answer(capsys, *words)[1]
     assert 'chi-square' in said and 'At rest after the run' in said and '+-' in said
-    spoiled = write_log(tmp_path / 'spoiled.csv', time, output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
+    spoiled = write_log(tmp_path / 'spoiled.csv', time,
+                        output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
     code, _, error = answer(capsys, 'self-calibrate', spoiled, *words[2:])
     assert code == 1 and 'after the run, at rest' in error and error.count('\n') == 1
 
 
 def test_the_verb_calibrates_by_turns(tmp_path, capsys):
     log = write_log(tmp_path / 'turns.csv', *turned(5))
-    code, text, _ = answer(capsys, 'self-calibrate', log, '--turns', '5', '--marking', '2', '--out', tmp_path / 'new.yaml', '--json')
+    code, text, _ = answer(capsys, 'self-calibrate', log, '--turns', '5', '--marking', '2',
+                           '--out', tmp_path / 'new.yaml', '--json')
     found = json.loads(text)
     assert code == 0 and found['turns'] == 5 and found['method'] == 'turns'
-    assert abs(found['scale_factor_error'] - S) < 3.0 * found['scale_factor_error_standard_deviation'] < 0.006
-    code, text, _ = answer(capsys, 'self-calibrate', write_log(tmp_path / 'two.csv', *turned(-2)), '--turns', 'nearest')
+    assert (abs(found['scale_factor_error'] - S)
+            < 3.0 * found['scale_factor_error_standard_deviation'] < 0.006)
+    code, text, _ = answer(capsys, 'self-calibrate', write_log(tmp_path / 'two.csv', *turned(-2)),
+                           '--turns', 'nearest')
     assert code == 0 and '2 whole turns clockwise' in text
 
 
-@pytest.mark.parametrize('words, said', [(['--turns', '3', '--profile', 'p.csv'], 'were both given'), (['--marking', '2'], 'leave it out')])
+@pytest.mark.parametrize('words, said',
+                         [(['--turns', '3', '--profile', 'p.csv'], 'were both given'),
+                          (['--marking', '2'], 'leave it out')])
 def test_the_verb_says_what_does_not_go_together(tmp_path, capsys, words, said):
-    code, _, error = answer(capsys, 'self-calibrate', write_log(tmp_path / 'log.csv', *turned(1)), *words)
+    code, _, error = answer(capsys, 'self-calibrate',
+                            write_log(tmp_path / 'log.csv', *turned(1)), *words)
     assert code == 2 and said in error
 
 
 def test_a_fit_without_figures_claims_no_goodness():
     assert Fit(0.0, 0.0, np.zeros((2, 2))).goodness is None
-    assert self_calibrate(TIME, output(), from_rates(CALIBRATION.time, CALIBRATION.rate)).goodness is None
+    assert self_calibrate(TIME, output(),
+                          from_rates(CALIBRATION.time, CALIBRATION.rate)).goodness is None

@@ -1,8 +1,9 @@
 """
-Any bytes, and what people and launch files may give: nothing raises but what is documented, nothing hangs, memory is bounded.
+Any bytes or arguments: only documented errors are raised, nothing hangs, memory is bounded.
 
-The claims are in `fuzzed`: hypothesis tries them on what the project writes, damaged at random, and atheris for 10 s, or 10 minutes
-as evidence, guided by coverage. What they once found is tried again.
+The claims are in `fuzzed`: hypothesis tries them on what the project writes, damaged at random,
+and atheris for 10 s, or 10 minutes as evidence, guided by coverage. What they once found is tried
+again.
 
 """
 
@@ -25,19 +26,21 @@ from gyro_calibration.cli.main import _parser
 
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.
-EXAMPLES = {'model': 25, 'bias table': 20, 'motion limits': 40, 'arguments': 40, 'recording .db3': 40}
+EXAMPLES = {'model': 25, 'bias table': 20, 'motion limits': 40, 'arguments': 40,
+            'recording .db3': 40}
 
 #: What the fuzzers found: target, input.
 FOUND = {
     'a clock of the device that hardly goes on': ('sample clock', (
-        '020000006000000100600000020060000003006000000400600000050060000006006000000700600000080060000009006000000a006000000b0060'
-        '0000020400006000000100600000020060000003006000000400600000050060000006006000000700600000080060000009006000000a006000000b'
-        '006000000c006000000d006000000e006000000f00600000100060000011006000001200600000130060000014006000001500600000160060000017'
-        '0060000018006000001900600c006000000d006000000e006000000f006000000000')),
+        '0200000060000001006000000200600000030060000004006000000500600000060060000007006000000800'
+        '60000009006000000a006000000b006000000204000060000001006000000200600000030060000004006000'
+        '00050060000006006000000700600000080060000009006000000a006000000b006000000c006000000d0060'
+        '00000e006000000f006000001000600000110060000012006000001300600000140060000015006000001600'
+        '600000170060000018006000001900600c006000000d006000000e006000000f006000000000')),
     'a zero byte in the name of a file': ('parameters', '30040000000000000000000000'),
     'a column whose name has two lines, as some systems end them': ('log', (
-        '6779726f5f636f756e74732c655f647073302e302c227265666572656e63655f726174655f647073610d0a6e2c610a312e302c6e616e2c620a322e300a220a2e30'
-        '2c6e616e2c6b0a31312e302c6e616e2c6c0a')),
+        '6779726f5f636f756e74732c655f647073302e302c227265666572656e63655f726174655f647073610d0a6e'
+        '2c610a312e302c6e616e2c620a322e300a220a2e302c6e616e2c6b0a31312e302c6e616e2c6c0a')),
     'an integer beyond all floats': ('parameters', '0c02' + '7f' * 40),
 }
 
@@ -65,24 +68,27 @@ def target(name):
 def try_out(hypothesis, strategy, claim, examples=60):
     """Let hypothesis look for an input for which a claim does not hold."""
     quietly = [hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.data_too_large]
-    hypothesis.settings(max_examples=examples, deadline=1000.0 * SECONDS, database=None, suppress_health_check=quietly)(
-        hypothesis.given(strategy)(claim))()
+    hypothesis.settings(max_examples=examples, deadline=1000.0 * SECONDS, database=None,
+                        suppress_health_check=quietly)(hypothesis.given(strategy)(claim))()
 
 
 def damaged(hypothesis, seeds):
-    """Return a strategy for bytes: any, or those of a seed with some cut out, put in, doubled or replaced."""
+    """Return a strategy for bytes: any, or a seed with parts cut, added, doubled, replaced."""
     some = hypothesis.strategies
-    edits = some.lists(some.tuples(some.floats(0.0, 1.0), some.integers(0, 40), some.binary(max_size=20), some.integers(1, 3)), max_size=4)
+    edits = some.lists(some.tuples(some.floats(0.0, 1.0), some.integers(0, 40),
+                                   some.binary(max_size=20), some.integers(1, 3)), max_size=4)
 
     def damage(seed, edits):
         for place, length, data, times in edits:
             begin = round(place * len(seed))
             seed = seed[:begin] + data * times + seed[begin + length:]
         return seed
-    return some.one_of(some.builds(damage, some.sampled_from(seeds), edits), some.binary(max_size=300))
+    return some.one_of(some.builds(damage, some.sampled_from(seeds), edits),
+                       some.binary(max_size=300))
 
 
-@pytest.mark.parametrize('name', [*TARGETS, *(['parameters'] if 'parameters' not in TARGETS else [])])
+@pytest.mark.parametrize('name',
+                         [*TARGETS, *(['parameters'] if 'parameters' not in TARGETS else [])])
 def test_any_bytes_are_survived(hypothesis, target, name):
     def survived(data):
         target.check(data)
@@ -104,7 +110,8 @@ def test_what_was_found_once_is_survived(target, name, data):
 @pytest.mark.parametrize('what', ['noise', 'beginnings', 'zeros', 'digits'])
 def test_a_decoder_holds_no_memory_whatever_comes(name, what):
     wire, generator = WIRES[name], random.Random(0)
-    pieces = {'noise': generator.randbytes(4096), 'beginnings': wire.frames[0][:3] * 1365, 'zeros': bytes(4096), 'digits': b' 1' * 2048}
+    pieces = {'noise': generator.randbytes(4096), 'beginnings': wire.frames[0][:3] * 1365,
+              'zeros': bytes(4096), 'digits': b' 1' * 2048}
     decoder = wire.protocol.decoder(wire.settings)
     decoder.feed(pieces[what])
     tracemalloc.start()
@@ -117,11 +124,13 @@ def test_a_decoder_holds_no_memory_whatever_comes(name, what):
     assert held < 20_000 and peak < 1_000_000
 
 
-WILD = ['', ' ', 'nan', 'inf', '-inf', '1e999', '-1', '0', '1e-999', '9' * 5000, '0x10', '1_0', '\n', '\x1b[2J', '٣', '\udcff', '%s', '{}',
-        '../../etc/passwd', '/dev/zero', '--', '-', '--out', 'x' * 100_000]
+WILD = ['', ' ', 'nan', 'inf', '-inf', '1e999', '-1', '0', '1e-999', '9' * 5000, '0x10', '1_0',
+        '\n', '\x1b[2J', '٣', '\udcff', '%s', '{}', '../../etc/passwd', '/dev/zero', '--', '-',
+        '--out', 'x' * 100_000]
 
 
-@pytest.mark.parametrize('verb', [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS])
+@pytest.mark.parametrize(
+    'verb', [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS])
 def test_wild_arguments_end_with_2_or_are_taken(verb):
     """Each option of each verb with each wild value, as far as they are parsed; nothing is run."""
     parser = _parser()
@@ -137,11 +146,14 @@ def test_wild_arguments_end_with_2_or_are_taken(verb):
 @pytest.mark.parametrize('seconds', [10, pytest.param(600, marks=pytest.mark.evidence)])
 def test_fuzzing_guided_by_coverage_finds_nothing(atheris, seconds):
     environment = {**os.environ, 'OPENBLAS_NUM_THREADS': '1'}
-    process = subprocess.run([sys.executable, FUZZER, '--seconds', str(seconds), '--json'], capture_output=True,
-                             text=True, timeout=2 * seconds + 180, env=environment)
+    process = subprocess.run([sys.executable, FUZZER, '--seconds', str(seconds), '--json'],
+                             capture_output=True, text=True, timeout=2 * seconds + 180,
+                             env=environment)
     assert process.stdout, process.stderr
     outcomes = json.loads(process.stdout)
-    faults = [f'{each["target"]}: repeat it with python benchmarks/fuzz.py --repeat {each["target"]!r} {each["fault"]}\n{each["said"]}'
+    faults = [f'{each["target"]}: repeat it with python benchmarks/fuzz.py --repeat '
+              f'{each["target"]!r} {each["fault"]}\n{each["said"]}'
               for each in outcomes if each['fault']]
     assert not faults and process.returncode == 0, '\n\n'.join(faults) + process.stderr
-    assert {each['target'] for each in outcomes} == set(TARGETS) and all(each['inputs'] for each in outcomes)
+    assert ({each['target'] for each in outcomes} == set(TARGETS)
+            and all(each['inputs'] for each in outcomes))

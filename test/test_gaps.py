@@ -1,7 +1,8 @@
 """
-Lost samples: how many, what they leave unknown of the heading, and that a rest goes on over them.
+Lost samples: how many, what they leave unknown of the heading, and rests across them.
 
-What is said of the heading is compared with the difference to the heading with all samples, over many drives.
+The stated variance of the heading is compared with the difference to the heading with all
+samples, over many drives.
 
 """
 
@@ -27,7 +28,7 @@ INTERVAL = 0.01
 
 
 def kept(count, share, longest, generator):
-    """Return which samples come: a share is lost, in runs of 1 to `longest`; the first ones and the last come all."""
+    """Return which samples come: a share is lost, in runs of 1 to `longest`, none at the ends."""
     begins = np.flatnonzero(generator.random(count) < 2.0 * share / (1 + longest))
     comes = np.ones(count, bool)
     for begin, length in zip(begins, generator.integers(1, longest + 1, len(begins))):
@@ -41,12 +42,13 @@ def driven(duration, generator):
     rates = np.zeros(0)
     while len(rates) < duration / INTERVAL:
         stretch = round(generator.uniform(0.5, 5.0) / INTERVAL)
-        rates = np.append(rates, np.full(stretch, generator.choice([0.0, 1.0]) * generator.uniform(-1.0, 1.0)))
+        rates = np.append(
+            rates, np.full(stretch, generator.choice([0.0, 1.0]) * generator.uniform(-1.0, 1.0)))
     return np.convolve(rates, np.ones(30) / 30.0, 'same')[:round(duration / INTERVAL)]
 
 
 def lost_heading(true, comes, generator, noise=WHITE):
-    """Return by how much lost samples change the heading, rad, and the variance that is said of it, rad²."""
+    """Return the heading change by lost samples, rad, and the variance stated for it, rad²."""
     time = np.arange(len(true)) * INTERVAL
     rate = true + simulate_noise(noise, len(true), INTERVAL, generator)
     gaps, said = Gaps(noise), 0.0
@@ -69,14 +71,16 @@ def test_lost_samples_are_counted_where_stamps_are_even_or_jitter(interval, jitt
     intervals = Intervals()
     for step in np.diff(stamps).tolist():
         intervals.add(step)
-    assert intervals.lost == (~comes).sum() and intervals.usual == pytest.approx(interval, rel=0.05 + jitter)
+    assert (intervals.lost == (~comes).sum()
+            and intervals.usual == pytest.approx(interval, rel=0.05 + jitter))
     assert intervals.longest == pytest.approx(np.diff(stamps).max())
 
 
 def test_samples_that_come_late_or_in_bursts_are_not_lost():
     late = np.arange(0.0, 10.0, 0.01)
     late[500:510] = late[509] - np.arange(9, -1, -1) * 2e-4
-    bursts = np.ceil(np.arange(0.0, 10.0, 0.001) / 0.016 + 1e-9) * 0.016 + np.arange(10000) % 16 * 1e-5
+    bursts = (np.ceil(np.arange(0.0, 10.0, 0.001) / 0.016 + 1e-9) * 0.016
+              + np.arange(10000) % 16 * 1e-5)
     for stamps in (late, bursts):
         intervals = Intervals()
         for step in np.diff(stamps).tolist():
@@ -107,7 +111,8 @@ def test_what_may_have_been_turned_in_gaps_is_said_and_not_much_more(share, long
     squares, said_squares = [], []
     for seed in range(24):
         generator = np.random.default_rng(seed)
-        off, said = lost_heading(driven(60.0, generator), kept(6000, share, longest, generator), generator)
+        off, said = lost_heading(driven(60.0, generator), kept(6000, share, longest, generator),
+                                 generator)
         squares.append(off * off / said)
         said_squares.append((off * off, said))
     actual, said = np.sqrt(np.mean(said_squares, axis=0))
@@ -137,29 +142,34 @@ KNOWN = np.diag([1e-10, 1e-10])
 def test_a_rest_goes_on_over_gaps_and_what_begins_in_one_is_followed():
     generator, time = np.random.default_rng(3), np.arange(0.0, 60.0, INTERVAL)
     true = np.where(time > 50.3, 0.5, 0.0)
-    rate, comes = true + simulate_noise(WHITE, len(time), INTERVAL, generator), np.ones(len(time), bool)
+    rate, comes = (true + simulate_noise(WHITE, len(time), INTERVAL, generator),
+                   np.ones(len(time), bool))
     for begin, gap in ((10.0, 0.2), (20.0, 0.45), (30.0, 0.6), (40.0, 0.9), (50.0, 0.8)):
         comes[(time > begin) & (time < begin + gap)] = False
     found = track(time[comes], rate[comes], sensitivity_of(rate[comes]), WHITE, KNOWN, Settings())
     resting = found.resting[(time[comes] > 2.0) & (time[comes] < 50.0)]
     assert resting.all() and not found.resting[time[comes] > 51.0].any()
     assert abs(found.heading[-1] - 0.5 * 9.7) < 3.0 * math.sqrt(found.variance[-1]) < 0.5
-    assert found.intervals.lost == (~comes).sum() and found.intervals.longest == pytest.approx(0.9, abs=0.02)
+    assert (found.intervals.lost == (~comes).sum()
+            and found.intervals.longest == pytest.approx(0.9, abs=0.02))
 
 
 @pytest.mark.parametrize('false_alarms', [0.0, 0.1])
 @pytest.mark.parametrize('gap', [0.5, 0.99, 1.01, 30.0, 86400.0])
 def test_samples_are_counted_as_lost_whether_or_not_a_gap_is_integrated_over(gap, false_alarms):
-    tracker, lost, losses = HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms)), round(gap / INTERVAL), 3
+    tracker, lost, losses = (HeadingTracker(WHITE, KNOWN, Settings(false_alarms=false_alarms)),
+                             round(gap / INTERVAL), 3)
     for index in range(400 * (losses + 1)):
         said = tracker.add(INTERVAL * index + gap * (index // 400), 0.0, np.array([0.0, -1.0]))
         assert bool(said) == (gap > 1.0 and index % 400 == 0 < index)
-    assert tracker.intervals.lost == losses * lost and tracker.intervals.longest == pytest.approx(gap + INTERVAL)
+    assert (tracker.intervals.lost == losses * lost
+            and tracker.intervals.longest == pytest.approx(gap + INTERVAL))
     assert tracker.intervals.usual == pytest.approx(INTERVAL)
 
 
 def test_a_rest_that_goes_on_after_a_gap_takes_over_nothing_of_a_correction_that_waits():
-    tracker, still = HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings()), np.array([0.0, -1.0])
+    tracker, still = (HeadingTracker(WHITE, np.diag([1e-10, (0.5 * DEGREE) ** 2]), Settings()),
+                      np.array([0.0, -1.0]))
     generator, headings = np.random.default_rng(4), []
     outputs = np.concatenate([np.full(1000, 0.1), np.zeros(3000)]) + 0.3 * DEGREE
     outputs += simulate_noise(WHITE, len(outputs), INTERVAL, generator)
@@ -178,30 +188,37 @@ def test_a_log_in_blocks_says_the_same_as_sample_by_sample():
     generator = np.random.default_rng(5)
     true = driven(30.0, generator)
     comes = kept(len(true), 0.05, 20, generator)
-    time, rate = (np.arange(len(true)) * INTERVAL)[comes], (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
+    time, rate = ((np.arange(len(true)) * INTERVAL)[comes],
+                  (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes])
     tracked = track(time, rate, sensitivity_of(rate), WHITE, KNOWN, Settings(false_alarms=0.0))
     integrator, cuts = BlockIntegrator(Threshold(0.0), WHITE, KNOWN), np.array([100, 101, 900])
-    split = np.split(time, cuts), np.split(rate, cuts), np.split(sensitivity_of(rate), cuts, axis=1)
+    split = (np.split(time, cuts), np.split(rate, cuts),
+             np.split(sensitivity_of(rate), cuts, axis=1))
     parts = [integrator.add(*part) for part in zip(*split)]
     heading, deviation = (np.concatenate([part[place] for part in parts]) for place in (1, 2))
     assert heading == pytest.approx(tracked.heading, abs=1e-9)
     # sample by sample the calibration's part is counted once a second
-    assert deviation ** 2 == pytest.approx(tracked.variance, rel=1e-3) and integrator.intervals.lost == tracked.intervals.lost > 0
-    whole = track(np.arange(len(true)) * INTERVAL, true, sensitivity_of(true), WHITE, KNOWN, Settings(false_alarms=0.0))
+    assert (deviation ** 2 == pytest.approx(tracked.variance, rel=1e-3)
+            and integrator.intervals.lost == tracked.intervals.lost > 0)
+    whole = track(np.arange(len(true)) * INTERVAL, true, sensitivity_of(true), WHITE, KNOWN,
+                  Settings(false_alarms=0.0))
     assert whole.variance[-1] < 0.7 * tracked.variance[-1]
 
 
 @pytest.mark.parametrize('option', [(), ('--rest',)])
 def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp_path):
-    write_model(tmp_path / 'model.yaml', GyroModel(noise=WHITE, self_calibration=SelfCalibration(0.0, 0.0, ((1e-10, 0.0), (0.0, 1e-10)))))
+    write_model(tmp_path / 'model.yaml', GyroModel(
+        noise=WHITE, self_calibration=SelfCalibration(0.0, 0.0, ((1e-10, 0.0), (0.0, 1e-10)))))
     deviations = []
     for lost in (False, True):
         generator = np.random.default_rng(6)
         true = driven(30.0, generator)
         comes = kept(len(true), 0.05, 20, generator) if lost else np.ones(len(true), bool)
         output = (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
-        write_log(tmp_path / f'{lost}.csv', Log(time=(np.arange(len(true)) * INTERVAL)[comes], output=output))
-        files = tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv'
+        write_log(tmp_path / f'{lost}.csv',
+                  Log(time=(np.arange(len(true)) * INTERVAL)[comes], output=output))
+        files = (tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml', '--out',
+                 tmp_path / 'out.csv')
         code, said, _ = run('compensate', *files, *option)
         assert code == 0 and (f'{(~comes).sum()} samples are lost' in said) == lost
         deviations.append(float(said.partition('+-')[2].split()[0]))
@@ -215,5 +232,6 @@ def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is(monkeypat
     one = runpy.run_path(str(folder / 'faulty_heading.py'))['one']
     faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'
     drives = [one(('RD2100', INTERVAL, 120.0, seed, faults)) for seed in range(2)]
-    clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives])) for fault in faults)
+    clean, stamped, bridged = (math.sqrt(np.mean([drive[fault][0] ** 2 for drive in drives]))
+                               for fault in faults)
     assert stamped < 1.3 * clean < 0.1 * bridged
