@@ -126,5 +126,3 @@ def of_log(log, distribution='ROS2_JAZZY'):
 def file_of(path):
     """Return the one file of messages in the folder of a recording."""
     return next(file for file in path.iterdir() if file.name != 'metadata.yaml')
-
-

@@ -263,4 +263,3 @@ def rested(*arguments, seconds=3.0, **parameters):
     rig = Rig(*arguments, **parameters)
     rig.go(seconds)
     return rig
-

@@ -242,8 +242,8 @@ def bursts(count):
 
 
 def test_stamps_in_bursts_give_the_interval_of_the_gyro():
-    time, rate = np.sort(bursts(50_000)), simulate_noise(WHITE, 50_000, INTERVAL,
-                                                         np.random.default_rng(13))
+    time, rate = (np.sort(bursts(50_000)),
+                  simulate_noise(WHITE, 50_000, INTERVAL, np.random.default_rng(13)))
     record = even_record(time, rate)
     assert record.interval == pytest.approx(INTERVAL, rel=1e-4) and 'bursts' in record.remarks[0]
     np.testing.assert_array_equal(record.rate, rate)
@@ -294,8 +294,9 @@ def test_a_wild_sample_is_left_out_and_a_walking_bias_is_no_motion():
     record = even_record(stamps(50_000), rate)
     assert (np.nonzero(np.isnan(record.rate))[0].tolist() == [700, 30_000]
             and 'left out: 2 single samples' in record.remarks[0])
-    assert not even_record(stamps(50_000), simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL,
-                                                          np.random.default_rng(20))).remarks
+    assert not even_record(
+        stamps(50_000),
+        simulate_noise(Noise(0.0, 0.0, 1e-3), 50_000, INTERVAL, np.random.default_rng(20))).remarks
 
 
 def test_what_the_log_says_was_moved_is_left_out():
@@ -376,8 +377,8 @@ def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_
     assert after.noise == alone.noise and after.noise.rate_random_walk == 0.0
     assert (after.noise.angle_random_walk == pytest.approx(1e-3, rel=0.03)
             and after.noise.bias_instability == pytest.approx(1e-3, rel=0.3))
-    assert {**vars(after), 'noise': 0, 'covariance': 0} == {**vars(before), 'noise': 0,
-                                                            'covariance': 0}
+    assert ({**vars(after), 'noise': 0, 'covariance': 0}
+            == {**vars(before), 'noise': 0, 'covariance': 0})
     assert (after.covariance == before.covariance).all() and not alone.terms
 
 

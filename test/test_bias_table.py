@@ -419,8 +419,8 @@ def test_a_clock_that_is_set_moves_all_dates_since_the_table_began_and_no_others
     write_bias_table(tmp_path / 'table.yaml', table, begin + 360.0)
     assert [each.run for each in table.entries] == [0, 1, 2, 3] and not table.due(begin + 1e4)
     table.clock_was_set(step)
-    assert [each.time for each in table.entries] == [1.6e9, begin + step, begin + step + 60.0,
-                                                     begin + step + 240.0]
+    assert [each.time for each in table.entries] == [
+        1.6e9, begin + step, begin + step + 60.0, begin + step + 240.0]
     assert [each.time for each in table.jumps] == [1.6e9, begin + step + 120.0]
     assert table.due(begin + step + 1e4), 'what is in the file has the old dates'
     table.add(20.0, 2.0 * DEGREE, WHITE, begin + step + 420.0)

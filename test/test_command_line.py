@@ -48,8 +48,8 @@ def test_every_verb_has_help_with_an_example(run, verb):
 
 
 def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, tmp_path):
-    code, text, _ = run('compensate', log, '--model', model, '--out',
-                        tmp_path / 'out.csv', '--json')
+    code, text, _ = run('compensate', log, '--model', model,
+                        '--out', tmp_path / 'out.csv', '--json')
     assert code == 0
     answer = json.loads(text)
     assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
@@ -62,8 +62,8 @@ def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, t
 
 def test_compensate_says_how_sure_it_is(run, log, tmp_path):
     (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
-    code, text, _ = run('compensate', log, '--model', tmp_path / 'noisy.yaml', '--out',
-                        tmp_path / 'out.csv')
+    code, text, _ = run('compensate', log, '--model', tmp_path / 'noisy.yaml',
+                        '--out', tmp_path / 'out.csv')
     deviation = np.array(read_log(tmp_path / 'out.csv').others['heading_std_rad'], dtype=float)
     assert code == 0 and 'deg' in text
     assert deviation[-1] == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
@@ -83,8 +83,8 @@ def test_rows_of_others_between_the_samples_make_no_rate_noisier(run, tmp_path):
     time = np.arange(2000) / 100.0
     output = np.where(np.arange(2000) % 10 == 0, 0.0, np.nan)
     write_log(tmp_path / 'log.csv', Log(output=output, time=time))
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml', '--out',
-               tmp_path / 'out.csv')[0] == 0
+    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'noisy.yaml',
+               '--out', tmp_path / 'out.csv')[0] == 0
     assert float(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'][0]) == pytest.approx(
         7.3e-4 / math.sqrt(0.1), rel=1e-6)
 
@@ -97,10 +97,10 @@ def test_compensate_looks_for_rests(run, tmp_path, words, resting):
     (tmp_path / 'gyro.yaml').write_text('effects: {bias: {bias: 0.002}}' + noise)
     known = '{scale_factor_error: 0.0, bias: 0.0017, covariance: [[1.0e-8, 0.0], [0.0, 1.2e-7]]}'
     (tmp_path / 'model.yaml').write_text(f'effects: {{}}\nself_calibration: {known}{noise}')
-    assert run('simulate', '--model', tmp_path / 'gyro.yaml', '--motion', 'robot', '--out',
-               tmp_path / 'log.csv', '--seed', 1)[0] == 0
-    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out',
-               tmp_path / 'out.csv', *words)[0] == 0
+    assert run('simulate', '--model', tmp_path / 'gyro.yaml', '--motion', 'robot',
+               '--out', tmp_path / 'log.csv', '--seed', 1)[0] == 0
+    assert run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+               '--out', tmp_path / 'out.csv', *words)[0] == 0
     found = read_log(tmp_path / 'out.csv')
     columns = {name: np.array(values, float) for name, values in found.others.items()}
     error, deviation = (columns['heading_rad'] - found.reference_heading,
@@ -112,15 +112,15 @@ def test_compensate_looks_for_rests(run, tmp_path, words, resting):
 
 
 def test_compensate_looks_for_no_rests_where_the_noise_is_not_known(run, model, log, tmp_path):
-    code, _, text = run('compensate', log, '--model', model, '--out',
-                        tmp_path / 'out.csv', '--rest')
+    code, _, text = run('compensate', log, '--model', model,
+                        '--out', tmp_path / 'out.csv', '--rest')
     assert code == 2 and 'allan' in text and not (tmp_path / 'out.csv').exists()
 
 
 def test_compensate_gives_rates_alone_for_a_rate_table(run, model, tmp_path):
     (tmp_path / 'table.csv').write_text('reference_rate_dps,gyro_dps\n0,0\n10,9.1\n')
-    assert run('compensate', tmp_path / 'table.csv', '--model', model, '--out',
-               tmp_path / 'out.csv')[0] == 0
+    assert run('compensate', tmp_path / 'table.csv', '--model', model,
+               '--out', tmp_path / 'out.csv')[0] == 0
     columns = read_log(tmp_path / 'out.csv').others
     assert 'rate_rad_s' in columns and 'heading_rad' not in columns
 
@@ -131,8 +131,8 @@ def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tol
     profile = tmp_path / 'profile.csv'
     profile.write_text('time_s,rate_dps\n' + ''.join(
         f'{t},{r / DEGREE}\n' for t, r in zip(CALIBRATION.time, CALIBRATION.rate)))
-    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method, '--out',
-                        tmp_path / 'new.yaml', '--json')
+    code, text, _ = run('self-calibrate', log, '--profile', profile, '--method', method,
+                        '--out', tmp_path / 'new.yaml', '--json')
     answer = json.loads(text)
     assert code == 0 and answer['scale_factor_error'] == pytest.approx(-0.1, rel=tolerance)
     assert read_model(tmp_path / 'new.yaml').self_calibration.bias == pytest.approx(
@@ -168,8 +168,8 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
             + np.sin(np.arange(3000)) * 1e-9)
     write_log(tmp_path / 'log.csv', Log(output=rate + 0.00981, time=np.arange(3000) / 100.0,
                                         specific_force=np.full(3000, 9.81), reference_rate=rate))
-    code, text, error = run('self-calibrate', tmp_path / 'log.csv', '--model',
-                            tmp_path / 'model.yaml', '--json', *words)
+    code, text, error = run('self-calibrate', tmp_path / 'log.csv',
+                            '--model', tmp_path / 'model.yaml', '--json', *words)
     assert code == 0, error
     assert abs(json.loads(text)['bias']) < 1e-5
 
@@ -178,8 +178,8 @@ def test_what_the_data_do_not_allow_ends_with_1_and_one_sentence(run, tmp_path):
     (tmp_path / 'dead.csv').write_text('time_s,gyro_dps\n'
                                        + ''.join(f'{i / 100},0\n' for i in range(2000)))
     (tmp_path / 'profile.csv').write_text('time_s,rate_dps\n0,0\n5,30\n10,-30\n20,0\n')
-    code, text, error = run('self-calibrate', tmp_path / 'dead.csv', '--profile',
-                            tmp_path / 'profile.csv')
+    code, text, error = run('self-calibrate', tmp_path / 'dead.csv',
+                            '--profile', tmp_path / 'profile.csv')
     assert code == 1 and not text and 'same value' in error and error.count('\n') == 1
 
 
@@ -202,8 +202,8 @@ def test_wrong_use_ends_with_2_and_says_why(run, model, log, words, said):
 
 def test_a_log_of_counts_wants_its_sensitivity(run, model, tmp_path):
     (tmp_path / 'counts.csv').write_text('gyro_counts\n' + '100\n' * 10)
-    words = ['compensate', tmp_path / 'counts.csv', '--model', model, '--out',
-             tmp_path / 'out.csv', '--rate', 10]
+    words = ['compensate', tmp_path / 'counts.csv', '--model', model,
+             '--out', tmp_path / 'out.csv', '--rate', 10]
     code, _, error = run(*words)
     assert code == 2 and '--sensitivity' in error
     assert run(*words, '--sensitivity', 0.07)[0] == 0
@@ -252,8 +252,8 @@ def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
 def demo(ros_domain, tmp_path):
     """Run the demonstration as a person would, and return its folder, time and process."""
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo', '--out',
-                           tmp_path / 'demo', '--seed', '2', '--json'],
+    return subprocess.run([sys.executable, '-m', 'gyro_calibration', 'demo',
+                           '--out', tmp_path / 'demo', '--seed', '2', '--json'],
                           capture_output=True, text=True, timeout=240), tmp_path / 'demo'
 
 
@@ -293,8 +293,8 @@ def test_rows_without_output_are_said_and_do_not_spoil_the_heading(run, model, t
     rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]
     (tmp_path / 'log.csv').write_text(
         'time_s,gyro_dps\n' + ''.join(f'{i / 100},{row}\n' for i, row in enumerate(rows)))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model, '--out',
-                        tmp_path / 'out.csv', '--json')
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model,
+                        '--out', tmp_path / 'out.csv', '--json')
     answer = json.loads(text)
     assert code == 0 and answer['rows_without_output'] == 5 and abs(answer['heading_rad']) < 1e-12
     assert read_log(tmp_path / 'out.csv').others['rate_rad_s'][22] == 'nan'
@@ -304,8 +304,8 @@ def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_pat
     code, text, _ = run('self-calibrate', log, '--method', 'rate', '--out', tmp_path / 'new.yaml')
     assert code == 0 and '+-' not in text
     assert read_model(tmp_path / 'new.yaml').self_calibration.covariance is None
-    assert run('compensate', log, '--model', tmp_path / 'new.yaml', '--out',
-               tmp_path / 'out.csv')[0] == 0
+    assert run('compensate', log, '--model', tmp_path / 'new.yaml',
+               '--out', tmp_path / 'out.csv')[0] == 0
     assert read_log(tmp_path / 'out.csv').others['heading_std_rad'][-1] == 'nan'
 
 
@@ -347,15 +347,15 @@ def test_an_empty_option_is_wrong_use(run, model, log, words):
     ('--sample-rate', '1e-300'), ('--sample-rate', '1e300'), ('--temperature', 'nan'),
     ('--temperature', '1e9'), ('--sample-rate', '1e9')])
 def test_a_simulation_beyond_all_bounds_is_wrong_use(run, model, tmp_path, words):
-    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out',
-                            tmp_path / 'out.csv', *words)
+    code, text, error = run('simulate', '--model', model, '--motion', 'rest',
+                            '--out', tmp_path / 'out.csv', *words)
     assert (code == 2 and not text and 'Traceback' not in error
             and not (tmp_path / 'out.csv').exists())
 
 
 def test_a_simulation_of_a_single_sample_is_wrong_use(run, model, tmp_path):
-    code, text, error = run('simulate', '--model', model, '--motion', 'rest', '--out',
-                            tmp_path / 'out.csv', '--sample-rate', 0.001)
+    code, text, error = run('simulate', '--model', model, '--motion', 'rest',
+                            '--out', tmp_path / 'out.csv', '--sample-rate', 0.001)
     assert (code == 2 and not text and 'less than two samples; give a higher rate' in error
             and not (tmp_path / 'out.csv').exists())
 

@@ -103,8 +103,8 @@ def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
 def flat(values, group=''):
     """Yield the parameters of a file, those of groups with their dots: calibration.drive."""
     for name, value in values.items():
-        yield from flat(value, f'{group}{name}.') if isinstance(value, dict) else [
-            (f'{group}{name}', value)]
+        yield from (flat(value, f'{group}{name}.') if isinstance(value, dict)
+                    else [(f'{group}{name}', value)])
 
 
 def test_the_configuration_holds_every_parameter_with_its_default(parameters):

@@ -128,8 +128,8 @@ sys.exit(driver_node.main())
 def test_a_fault_of_the_program_in_the_reader_ends_the_node_and_is_reported(ros_domain):
     """A node that lives on and publishes nothing would look well to whoever started it."""
     with Emulator(find('csv'), counting()) as gyro:
-        command = [sys.executable, '-c', BROKEN, '--ros-args', '-p', f'port:={gyro.path}', '-p',
-                   'protocol:=csv']
+        command = [sys.executable, '-c', BROKEN, '--ros-args', '-p', f'port:={gyro.path}',
+                   '-p', 'protocol:=csv']
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
     assert ended.returncode == 1 and 'as if there were a fault in the program' in ended.stderr
     assert 'the thread that reads the port has ended' in ended.stderr

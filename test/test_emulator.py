@@ -243,9 +243,9 @@ def test_a_line_that_is_not_possible_is_refused_by_the_verb(run, tmp_path, words
 def test_the_verb_sends_over_a_bad_line(tmp_path):
     """Three samples in ten are lost, and the same ones with the same seed."""
     (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
-    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv', '--model',
-               tmp_path / 'model.yaml', '--wait', '--link', tmp_path / 'gyro', '--speed', '50',
-               '--lose-samples', '0.3', '--seed', '7']
+    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv',
+               '--model', tmp_path / 'model.yaml', '--wait', '--link', tmp_path / 'gyro',
+               '--speed', '50', '--lose-samples', '0.3', '--seed', '7']
     times = []
     for _ in range(2):
         with subprocess.Popen(command, stdout=subprocess.PIPE) as process:

@@ -217,8 +217,8 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp
         output = (true + simulate_noise(WHITE, len(true), INTERVAL, generator))[comes]
         write_log(tmp_path / f'{lost}.csv',
                   Log(time=(np.arange(len(true)) * INTERVAL)[comes], output=output))
-        files = (tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml', '--out',
-                 tmp_path / 'out.csv')
+        files = (tmp_path / f'{lost}.csv', '--model', tmp_path / 'model.yaml',
+                 '--out', tmp_path / 'out.csv')
         code, said, _ = run('compensate', *files, *option)
         assert code == 0 and (f'{(~comes).sum()} samples are lost' in said) == lost
         deviations.append(float(said.partition('+-')[2].split()[0]))
