@@ -21,8 +21,7 @@ from gyro_calibration.noise import Noise
 SAME = {'reference_scale': 'scale_factor_error'}
 #: An answer with more names is no answer.
 LARGEST_SET = 3
-#: What has no size that an interval could hold: what is counted, steps that are read off, and what
-#: has none.
+#: Without a size that an interval could hold: what is counted, steps, and what has no size.
 WITHOUT_SIZE = {*COUNTED, *STEPPED, 'unit_error', 'bias_instability'}
 #: A diagnosis holds out one of so many blocks, of so many s.
 EVERY, BLOCK = 3, 60.0

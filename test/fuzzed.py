@@ -49,8 +49,7 @@ from gyro_calibration.recording import Topics, read_recording
 #: Longest message of an error, in characters without the path; s that an input may take; bytes
 #: that a decoder may hold back.
 MESSAGE, SECONDS, HELD = 1000, 5.0, 1024
-#: In memory, where the machine has such a folder: a fuzzer writes a file thousands of times a
-#: second.
+#: In memory, where the machine can: a fuzzer writes a file thousands of times a second.
 _FOLDER = tempfile.TemporaryDirectory(prefix='gyro_calibration_fuzz_',
                                       dir='/dev/shm' if os.access('/dev/shm', os.W_OK) else None)
 HAS_ROS = importlib.util.find_spec('rclpy') is not None

@@ -123,7 +123,7 @@ def test_the_bounds_hold_in_95_of_100_records(case):
 def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
     for symbol, (truth, records) in case.items():
         seen = [figure for figure in records if figure.value and truth]
-        # One record has one ramp: it scatters by the white noise alone, within its bounds.
+        # One record has one ramp: it scatters by white noise alone, far less than its bounds.
         if seen and symbol != 'R':
             ratio = (np.std([figure.value for figure in seen])
                      / np.median([figure.standard_deviation for figure in seen]))

@@ -73,7 +73,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
                      for each in zip(*(run(terms, table, generator) for _ in range(runs))))
     for errors in (values, rates):
         held = (np.abs(errors) <= 1.96).sum(axis=0)
-        # Wandering sweeps take up to 3 % off (docs/rate_table.md), of all values and rates.
+        # Wandering sweeps take up to 3 % off (docs/rate_table.md); all columns share RARE.
         assert held.min() >= binom.ppf(RARE / errors.shape[1], runs, 0.92)
         # Nor are they too wide: the values of a run hang together, so a run counts once.
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
@@ -175,7 +175,7 @@ def test_as_many_values_as_dwells_have_no_covariance():
 def test_the_scatter_of_sweeps_is_found():
     wander = 0.05 * DEGREE
     found = find_scatter(measured(SINE, sweeps=24, sweep_bias=wander)).sweep_bias / wander
-    # One value is fitted to the biases of the sweeps, three more with the temperature.
+    # One value is fitted to the biases of the sweeps, three to what they share with temperature.
     assert math.sqrt(chi2.ppf(RARE, 20) / 20) < found < math.sqrt(chi2.ppf(1 - RARE, 20) / 20)
 
 

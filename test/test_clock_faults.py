@@ -17,7 +17,7 @@ try:
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
-# The variant for programs with threads: the other one gives wrong times where threads read it.
+# The variant for threads: the other gives a wrong time now and then if threads read at once.
 FAKETIME = [Path(f'/usr/lib/{machine}-linux-gnu/faketime/libfaketimeMT.so.1')
             for machine in ('x86_64', 'aarch64')]
 HOUR = 3600.0
