@@ -37,7 +37,7 @@ class Candidate:
     shapes : their values, in the order of the effect
     columns : of a log
     run : the log that it is in, where it happens once; None where it is in all
-    amplitude : the value that its column must have, where there is nothing but shapes to find; None where it is free
+    amplitude : the value that its column must have, where only shapes are fitted; None if free
 
     """
 
@@ -49,12 +49,13 @@ class Candidate:
 
 
 def columns_of(candidate: Candidate, replays: Sequence[Replay]) -> Array:
-    """Return the cosine transforms of the columns of a candidate over all logs, shape (columns, m)."""
+    """Return the cosine transforms of a candidate's columns over all logs, shape (columns, m)."""
     parts = []
     for run, each in enumerate(replays):
         values = candidate.columns(each)
         absent = candidate.run is not None and candidate.run != run
-        parts.append(np.array([np.zeros(each.points - 1) if absent else each.coefficients(value) for value in values]))
+        parts.append(np.array([np.zeros(each.points - 1) if absent else each.coefficients(value)
+                               for value in values]))
     return np.concatenate(parts, axis=1)
 
 
@@ -67,7 +68,8 @@ def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
     if known.distortion is not None:
         return Candidate(name, shapes, lambda each: (_distorted(each, name, *shapes),), run, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
-    return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), run, amplitude)
+    return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), run,
+                     amplitude)
 
 
 def _distorted(each: Replay, name: str, *shapes: float) -> Array:
@@ -110,21 +112,25 @@ def with_shape(candidate: Candidate, place: int, value: float) -> Candidate:
     """Return a candidate with another shape, within the bounds that a model has for it."""
     if candidate.cause in CATALOGUE:
         value = float(np.clip(value, *CATALOGUE[candidate.cause].parameters[place].bounds))
-    return effect(candidate.cause, *candidate.shapes[:place], value, *candidate.shapes[place + 1:], run=candidate.run)
+    return effect(candidate.cause, *candidate.shapes[:place], value,
+                  *candidate.shapes[place + 1:], run=candidate.run)
 
 
 def constant(replays: Sequence[Replay]) -> frozenset[str]:
-    """Return the channels that hardly change in any of the logs that have them, and so are as good as none."""
-    known = {name: [getattr(each.channels, name) for each in replays if name in each.has] for name in LEAST_CHANGE}
-    return frozenset(name for name, values in known.items()
-                     if values and max(float(np.ptp(value)) for value in values) < LEAST_CHANGE[name])
+    """Return the channels that hardly change in any log that has them: as good as none."""
+    known = {name: [getattr(each.channels, name) for each in replays if name in each.has]
+             for name in LEAST_CHANGE}
+    return frozenset(
+        name for name, values in known.items()
+        if values and max(float(np.ptp(value)) for value in values) < LEAST_CHANGE[name])
 
 
 def candidates(replays: Sequence[Replay]) -> list[Candidate]:
     """Return all causes that these logs may show, each with the shapes to begin with."""
     has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
-    found = [*_of_time(replays), *(_of_temperature(replays) if 'temperature' in has else []), *_of_surroundings(has)]
+    found = [*_of_time(replays), *(_of_temperature(replays) if 'temperature' in has else []),
+             *_of_surroundings(has)]
     return [*found, *(_of_rate(replays, has) if moves else [])]
 
 
@@ -134,7 +140,8 @@ def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
     for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
         yield effect('warm_up', time_constant)
     for run, each in enumerate(replays):
-        begin, spacing = float(each.channels.time[each.kept][0]), spacing_of_steps(each, len(replays))
+        begin, spacing = (float(each.channels.time[each.kept][0]),
+                          spacing_of_steps(each, len(replays)))
         for number in range(1, _steps(len(replays)) + 1):
             yield effect('bias_step', begin + number * spacing, run=run)
 
@@ -150,7 +157,7 @@ def spacing_of_steps(each: Replay, logs: int) -> float:
 
 
 def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
-    """Return the temperatures from which a parabola may count: the usual ones, the first, and the mean."""
+    """Return the temperatures that a parabola may count from: the usual, the first, the mean."""
     known = np.concatenate([each.channels.temperature for each in replays])
     return [25.0, 20.0, float(known.mean()), float(known[0])]
 

@@ -1,7 +1,8 @@
 """
-Every cause that a diagnosis can name: the effects of a gyro, what can be wrong with the reference or the record, and the noise.
+Every cause that a diagnosis can name: effects of the gyro, faults of reference or record, noise.
 
-What an effect is, and in which units, stands in `effects`; here stands what it is taken for, and what would part the two.
+What an effect is, and in which units, stands in `effects`. Here stands what it is taken for, and
+what would tell the two apart.
 
 """
 
@@ -53,7 +54,8 @@ class _Likeness:
     separate_by: str = ''
 
 
-_ACCELERATIONS = 'swing fast with quick reversals: a delay keeps the size of what it delays, a lag does not'
+_ACCELERATIONS = ('swing fast with quick reversals: a delay keeps the size of what it delays, '
+                  'a lag does not')
 _TEMPERATURE_CORNERS = 'heat and cool with corners, at two speeds, while the gyro rests'
 _UP_AND_DOWN = 'heat and cool the gyro within one log, and start it both cold and warm'
 
@@ -62,48 +64,67 @@ _OF_THE_GYRO: Mapping[str, _Likeness] = {
                       'turn the axis over within one power-on, with all motors off'),
     'scale_factor_error': _Likeness('rate', ('clock_rate', 'reference_scale', 'unit_error'),
                                     'close whole turns on a mark, or take a second reference'),
-    'scale_factor_asymmetry': _Likeness('rate', ('quadratic_nonlinearity',), 'turn both ways at many speeds, slow ones too'),
+    'scale_factor_asymmetry': _Likeness('rate', ('quadratic_nonlinearity',),
+                                        'turn both ways at many speeds, slow ones too'),
     'quadratic_nonlinearity': _Likeness('rate', ('scale_factor_asymmetry',),
-                                        'turn both ways at many speeds, slow ones too, with the sensor on the axis of the table'),
-    'cubic_nonlinearity': _Likeness('rate', ('sine_response', 'saturation'), 'turn at many speeds up to full scale'),
-    'sine_response': _Likeness('rate', ('cubic_nonlinearity',), 'turn at many speeds up to full scale'),
-    'bias_temperature': _Likeness('temperature', ('rate_ramp', 'warm_up', 'supply_sensitivity'), _UP_AND_DOWN),
+                                        'turn both ways at many speeds, slow ones too, '
+                                        'with the sensor on the axis of the table'),
+    'cubic_nonlinearity': _Likeness('rate', ('sine_response', 'saturation'),
+                                    'turn at many speeds up to full scale'),
+    'sine_response': _Likeness('rate', ('cubic_nonlinearity',),
+                               'turn at many speeds up to full scale'),
+    'bias_temperature': _Likeness('temperature', ('rate_ramp', 'warm_up', 'supply_sensitivity'),
+                                  _UP_AND_DOWN),
     'bias_temperature_quadratic': _Likeness('temperature'),
     'scale_factor_temperature': _Likeness('temperature'),
-    'bias_temperature_rate': _Likeness('temperature_rate', ('thermal_lag', 'thermal_hysteresis', 'bias_step'), _TEMPERATURE_CORNERS),
+    'bias_temperature_rate': _Likeness('temperature_rate',
+                                       ('thermal_lag', 'thermal_hysteresis', 'bias_step'),
+                                       _TEMPERATURE_CORNERS),
     'thermal_lag': _Likeness('temperature_rate', ('bias_temperature_rate',), _TEMPERATURE_CORNERS),
     'thermal_hysteresis': _Likeness('temperature_rate', ('bias_temperature_rate', 'bias_step'),
-                                    'go through the same cycle of temperature twice, at two speeds'),
-    'warm_up': _Likeness('time', ('rate_ramp', 'bias_temperature'), 'start the gyro both cold and warm, and let it rest'),
+                                    'go through the same cycle of temperature twice, '
+                                    'at two speeds'),
+    'warm_up': _Likeness('time', ('rate_ramp', 'bias_temperature'),
+                         'start the gyro both cold and warm, and let it rest'),
     'rate_ramp': _Likeness('time', ('bias_temperature', 'warm_up', 'rate_random_walk'),
-                           'record it again, from a power-on at another temperature: what is no ramp does not repeat'),
-    'bias_step': _Likeness('time', ('bias_temperature_rate', 'thermal_hysteresis'), 'record it again: a step happens once'),
-    'heading_sensitivity': _Likeness('heading', ('reference_once_per_rev', 'acceleration_sensitivity'),
+                           'record it again, from a power-on at another temperature: '
+                           'what is no ramp does not repeat'),
+    'bias_step': _Likeness('time', ('bias_temperature_rate', 'thermal_hysteresis'),
+                           'record it again: a step happens once'),
+    'heading_sensitivity': _Likeness('heading',
+                                     ('reference_once_per_rev', 'acceleration_sensitivity'),
                                      'turn at several speeds, and stop at eight headings'),
     'acceleration_sensitivity': _Likeness('specific_force', ('bias', 'heading_sensitivity'),
                                           'rest in several poses within one power-on'),
     'vibration_rectification': _Likeness('vibration', ('bias',), 'rest with the motor on and off'),
-    'supply_sensitivity': _Likeness('supply', ('bias_temperature',), 'step the supply voltage at one temperature'),
+    'supply_sensitivity': _Likeness('supply', ('bias_temperature',),
+                                    'step the supply voltage at one temperature'),
     'interference_tone': _Likeness('frequency'),
     'bandwidth': _Likeness('rate_change', ('time_offset',), _ACCELERATIONS),
     'time_offset': _Likeness('rate_change', ('bandwidth', 'unit_error'), _ACCELERATIONS),
-    'clock_rate': _Likeness('time', ('scale_factor_error',), 'record long, with sharp reversals at both ends'),
+    'clock_rate': _Likeness('time', ('scale_factor_error',),
+                            'record long, with sharp reversals at both ends'),
     'dead_zone': _Likeness('rate', ('quantization',), 'sweep slowly through zero'),
-    'saturation': _Likeness('rate', ('cubic_nonlinearity',), 'turn faster than the limit: its code is repeated there'),
-    'quantization': _Likeness('output', ('dead_zone', 'stuck_samples'), 'turn slowly: the set of codes shows it'),
+    'saturation': _Likeness('rate', ('cubic_nonlinearity',),
+                            'turn faster than the limit: its code is repeated there'),
+    'quantization': _Likeness('output', ('dead_zone', 'stuck_samples'),
+                              'turn slowly: the set of codes shows it'),
 }
 
 
 def _of_an_effect(name: str, likeness: _Likeness) -> Cause:
     effect = CATALOGUE[name]
-    units = {parameter.name: parameter.unit for parameter in effect.parameters if parameter.default is None}
+    units = {parameter.name: parameter.unit
+             for parameter in effect.parameters if parameter.default is None}
     needs = effect.looks_at & {'temperature', 'specific_force', 'supply'}
     turned = likeness.along in {'rate', 'heading', 'rate_change'} and name != 'bias'
     needs = needs | {'time'} | ({'reference'} if turned or 'rate' in effect.looks_at else set())
-    return Cause(name, effect.cause, units, frozenset(needs), likeness.twins, likeness.separate_by, likeness.along, 'gyro')
+    return Cause(name, effect.cause, units, frozenset(needs), likeness.twins,
+                 likeness.separate_by, likeness.along, 'gyro')
 
 
-def _other(name: str, sentence: str, unit: str, of: str, along: str, needs: tuple[str, ...] = ('time',), twins: tuple[str, ...] = (),
+def _other(name: str, sentence: str, unit: str, of: str, along: str,
+           needs: tuple[str, ...] = ('time',), twins: tuple[str, ...] = (),
            separate_by: str = '') -> Cause:
     return Cause(name, sentence, {name: unit}, frozenset(needs), twins, separate_by, along, of)
 
@@ -111,25 +132,36 @@ def _other(name: str, sentence: str, unit: str, of: str, along: str, needs: tupl
 _WITH_REFERENCE = ('time', 'reference')
 
 _OTHERS = (
-    _other('outliers', 'Single samples are wild, as from a disturbed line or a mended checksum.', '1', 'record', 'time'),
-    _other('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record', 'time', twins=('quantization',),
+    _other('outliers', 'Single samples are wild, as from a disturbed line or a mended checksum.',
+           '1', 'record', 'time'),
+    _other('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record',
+           'time', twins=('quantization',),
            separate_by='turn without rest: an honest code does not stay then'),
     _other('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time'),
-    _other('reference_once_per_rev', 'The reference errs once in a revolution, as an eccentric encoder or a wobbling table does.', '1',
-           'reference', 'heading', _WITH_REFERENCE, ('heading_sensitivity',), 'turn at several speeds, and stop at eight headings'),
-    _other('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference', 'rate', _WITH_REFERENCE,
-           ('scale_factor_error',), 'close whole turns on a mark, or take a second reference'),
-    _other('reference_slip', 'The motion slipped: the reference tells of a turn that the gyro did not make.', 'rad', 'reference',
-           'rate_change', _WITH_REFERENCE, (), ''),
-    _other('reference_quantization', 'The reference counts in steps, and its rate between samples is as coarse.', 'rad', 'reference',
-           'heading', ('time', 'reference_heading')),
-    _other('unit_error', 'The output is in another unit, or of the other sign, than its name says.', '1', 'record', 'rate',
-           ('reference',), ('scale_factor_error', 'time_offset'), 'look up what the wire carries: the number itself is the evidence'),
-    _other('angle_random_walk', 'The white noise of the rate is not the one simulated.', 'rad/√s', 'noise', 'frequency'),
-    _other('bias_instability', 'The bias flickers otherwise than simulated.', 'rad/s', 'noise', 'frequency', twins=('rate_random_walk',),
-           separate_by='record at rest for hours'),
-    _other('rate_random_walk', 'The bias walks otherwise than simulated.', 'rad/s/√s', 'noise', 'frequency',
-           twins=('bias_instability', 'rate_ramp'), separate_by='record at rest for hours, and again: a walk does not repeat'),
+    _other('reference_once_per_rev',
+           'The reference errs once in a revolution, as an eccentric encoder or a wobbling table '
+           'does.', '1', 'reference', 'heading', _WITH_REFERENCE, ('heading_sensitivity',),
+           'turn at several speeds, and stop at eight headings'),
+    _other('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
+           'rate', _WITH_REFERENCE, ('scale_factor_error',),
+           'close whole turns on a mark, or take a second reference'),
+    _other('reference_slip',
+           'The motion slipped: the reference tells of a turn that the gyro did not make.', 'rad',
+           'reference', 'rate_change', _WITH_REFERENCE, (), ''),
+    _other('reference_quantization',
+           'The reference counts in steps, and its rate between samples is as coarse.', 'rad',
+           'reference', 'heading', ('time', 'reference_heading')),
+    _other('unit_error',
+           'The output is in another unit, or of the other sign, than its name says.', '1',
+           'record', 'rate', ('reference',), ('scale_factor_error', 'time_offset'),
+           'look up what the wire carries: the number itself is the evidence'),
+    _other('angle_random_walk', 'The white noise of the rate is not the one simulated.',
+           'rad/√s', 'noise', 'frequency'),
+    _other('bias_instability', 'The bias flickers otherwise than simulated.', 'rad/s', 'noise',
+           'frequency', twins=('rate_random_walk',), separate_by='record at rest for hours'),
+    _other('rate_random_walk', 'The bias walks otherwise than simulated.', 'rad/s/√s', 'noise',
+           'frequency', twins=('bias_instability', 'rate_ramp'),
+           separate_by='record at rest for hours, and again: a walk does not repeat'),
 )
 
 CAUSES: Mapping[str, Cause] = {

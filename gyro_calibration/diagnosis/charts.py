@@ -1,4 +1,4 @@
-"""Charts as SVG inside a page, with the table of their values, which the script of the page reads to show them on pointing."""
+"""Charts as SVG in a page, with the table of their values that the script of the page shows."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ class _Axis:
     def place(self, values: Array) -> Array:
         """Return places in the drawing."""
         with np.errstate(divide='ignore', invalid='ignore'):
-            scaled, low, high = (np.log10(each) if self.logarithmic else each for each in (values, self.low, self.high))
+            scaled, low, high = (np.log10(each) if self.logarithmic else each
+                                 for each in (values, self.low, self.high))
         return np.asarray(self.begin + (scaled - low) / (high - low) * (self.end - self.begin))
 
     def ticks(self, count: int) -> list[tuple[float, str]]:
@@ -91,16 +92,19 @@ class _Axis:
             return _logarithmic_ticks(self.low, self.high, count)
         step = _step((self.high - self.low) / count, self.unit)
         decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-        values = step * np.arange(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
-        return [(float(value), f'{value + 0.0:.{decimals}f}'.replace('-', '−')) for value in values]
+        values = step * np.arange(math.ceil(self.low / step - 1e-9),
+                                  math.floor(self.high / step + 1e-9) + 1)
+        return [(float(value), f'{value + 0.0:.{decimals}f}'.replace('-', '−'))
+                for value in values]
 
 
 def _logarithmic_ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
-    """Return powers of ten with their labels, and what lies between them where there are less than three."""
+    """Return labelled powers of ten, and values between them where they are less than three."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     every = max(1, math.ceil((len(powers) - 2) / count))
     parts = (1, 2, 5) if len(powers) < 4 else (1,)
-    ticks = [(part * 10.0 ** power, _logarithmic_label(part, power)) for power in powers if power % every == 0 for part in parts]
+    ticks = [(part * 10.0 ** power, _logarithmic_label(part, power))
+             for power in powers if power % every == 0 for part in parts]
     return [tick for tick in ticks if low <= tick[0] <= high]
 
 
@@ -114,12 +118,13 @@ def _step(least: float, unit: str) -> float:
     """Return a round step that is not smaller; of degrees, a round part of a turn."""
     power = 10.0 ** math.floor(math.log10(least))
     of_a_turn = unit == 'deg' and 20.0 < least <= 360.0
-    steps = (30.0, 45.0, 90.0, 180.0, 360.0) if of_a_turn else (power, 2.0 * power, 5.0 * power, 10.0 * power)
+    steps = ((30.0, 45.0, 90.0, 180.0, 360.0) if of_a_turn
+             else (power, 2.0 * power, 5.0 * power, 10.0 * power))
     return next(step for step in steps if step >= least * (1.0 - 1e-9))
 
 
 def draw(chart: Chart) -> Markup:
-    """Return a chart with its legend, its table of values, and a line that shows the values pointed at."""
+    """Return a chart with its legend, its table of values, and a cursor for the values."""
     if not any(_shown(chart, line).any() for line in chart.lines):
         return element('p', f'{chart.title}: there is nothing to draw.', class_='quiet')
     return element('figure', element('figcaption', chart.title), _picture(chart), _legend(chart),
@@ -135,8 +140,10 @@ def _shown(chart: Chart, line: Line) -> Mask:
 def _axes(chart: Chart) -> tuple[_Axis, _Axis]:
     at = np.concatenate([chart.at[_shown(chart, line)] for line in chart.lines])
     ends = np.concatenate([_ends(chart, line) for line in chart.lines])
-    return (_Axis(*_room(at, chart.logarithmic, 0.0), _LEFT, _RIGHT, chart.logarithmic, chart.across_unit),
-            _Axis(*_room(ends, chart.logarithmic, 0.06), _BOTTOM, _TOP, chart.logarithmic, chart.up_unit))
+    return (_Axis(*_room(at, chart.logarithmic, 0.0), _LEFT, _RIGHT,
+                  chart.logarithmic, chart.across_unit),
+            _Axis(*_room(ends, chart.logarithmic, 0.06), _BOTTOM, _TOP,
+                  chart.logarithmic, chart.up_unit))
 
 
 def _ends(chart: Chart, line: Line) -> Array:
@@ -144,8 +151,10 @@ def _ends(chart: Chart, line: Line) -> Array:
     shown = _shown(chart, line)
     if chart.logarithmic:
         return line.values[shown]
-    deviation = np.zeros(len(shown)) if line.deviation is None else _BAND * np.nan_to_num(line.deviation)
-    return np.concatenate([[0.0], (line.values - deviation)[shown], (line.values + deviation)[shown]])
+    deviation = (np.zeros(len(shown)) if line.deviation is None
+                 else _BAND * np.nan_to_num(line.deviation))
+    return np.concatenate([[0.0], (line.values - deviation)[shown],
+                           (line.values + deviation)[shown]])
 
 
 def _room(values: Array, logarithmic: bool, margin: float) -> tuple[float, float]:
@@ -166,7 +175,8 @@ def _picture(chart: Chart) -> Markup:
     return element('svg', element('title', chart.title, id=f'{chart.name}-title'),
                    element('desc', chart.description, id=f'{chart.name}-description'),
                    *_grid(chart, across, up), *marks, _cursor(chart, at, up),
-                   viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0', aria_labelledby=named, data_at=_places(at))
+                   viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
+                   aria_labelledby=named, data_at=_places(at))
 
 
 def _places(values: Array) -> str:
@@ -180,10 +190,11 @@ def _grid(chart: Chart, across: _Axis, up: _Axis) -> Iterator[Markup]:
         yield element('text', label, x=x, y=_BOTTOM + 15.0, text_anchor='middle')
     for value, label in up.ticks(5):
         y = float(up.place(np.array(value)))
-        yield element('line', x1=_LEFT, x2=_RIGHT, y1=y, y2=y, class_='zero' if value == 0.0 else 'grid')
+        yield element('line', x1=_LEFT, x2=_RIGHT, y1=y, y2=y,
+                      class_='zero' if value == 0.0 else 'grid')
         yield element('text', label, x=_LEFT - 5.0, y=y + 4.0, text_anchor='end')
-    yield element('text', _labelled(chart.across, chart.across_unit), x=0.5 * (_LEFT + _RIGHT), y=_HEIGHT - 6.0, text_anchor='middle',
-                  class_='label')
+    yield element('text', _labelled(chart.across, chart.across_unit), x=0.5 * (_LEFT + _RIGHT),
+                  y=_HEIGHT - 6.0, text_anchor='middle', class_='label')
     yield element('text', _labelled(chart.up, chart.up_unit), x=4.0, y=13.0, class_='label')
 
 
@@ -194,14 +205,19 @@ def _labelled(name: str, unit: str) -> str:
 def _line(line: Line, at: Array, up: _Axis, shown: Mask) -> Markup:
     y = up.place(line.values)
     deviation = None if line.deviation is None else np.nan_to_num(line.deviation)
-    spread = [] if deviation is None else [up.place(line.values + sign * _BAND * deviation) for sign in (1.0, -1.0)]
+    spread = [] if deviation is None else [up.place(line.values + sign * _BAND * deviation)
+                                           for sign in (1.0, -1.0)]
     if line.dots:
-        bars = [element('path', d=''.join(f'M{x:.1f} {a:.1f}V{b:.1f}' for x, a, b in zip(at[shown], *(each[shown] for each in spread))),
+        bars = [element('path', d=''.join(f'M{x:.1f} {a:.1f}V{b:.1f}' for x, a, b in
+                                          zip(at[shown], *(each[shown] for each in spread))),
                         class_='bars')] if spread else []
-        dots = [element('circle', cx=float(x), cy=float(value), r=2.6) for x, value in zip(at[shown], y[shown])]
+        dots = [element('circle', cx=float(x), cy=float(value), r=2.6)
+                for x, value in zip(at[shown], y[shown])]
         return element('g', *bars, *dots, class_=line.style)
-    band = [element('path', d=_band(at[shown], *(each[shown] for each in spread)), class_='band')] if spread else []
-    return element('g', *band, element('path', d=_path(at, y, shown), class_='stroke'), class_=line.style)
+    band = [element('path', d=_band(at[shown], *(each[shown] for each in spread)),
+                    class_='band')] if spread else []
+    return element('g', *band, element('path', d=_path(at, y, shown), class_='stroke'),
+                   class_=line.style)
 
 
 def _band(at: Array, above: Array, below: Array) -> str:
@@ -212,12 +228,14 @@ def _band(at: Array, above: Array, below: Array) -> str:
 def _path(at: Array, y: Array, shown: Mask) -> str:
     """Return a line that breaks where there is no value."""
     begins = shown & ~np.concatenate([[False], shown[:-1]])
-    return ''.join(f'{"M" if begin else "L"}{x:.1f} {value:.1f}' for x, value, begin in zip(at[shown], y[shown], begins[shown]))
+    return ''.join(f'{"M" if begin else "L"}{x:.1f} {value:.1f}'
+                   for x, value, begin in zip(at[shown], y[shown], begins[shown]))
 
 
 def _cursor(chart: Chart, at: Array, up: _Axis) -> Markup:
     """Return what the script moves to the values pointed at; hidden without it."""
-    dots = [element('circle', r=4.5, class_=line.style, data_up=_places(np.where(_shown(chart, line), up.place(line.values), np.nan)))
+    dots = [element('circle', r=4.5, class_=line.style,
+                    data_up=_places(np.where(_shown(chart, line), up.place(line.values), np.nan)))
             for line in chart.lines]
     return element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor')
 
@@ -227,19 +245,26 @@ def _legend(chart: Chart) -> Markup:
 
 
 def _entry(line: Line) -> Markup:
-    mark = element('circle', cx=12.0, cy=6.0, r=3.0) if line.dots else element('path', d='M1 6H23', class_='stroke')
-    spread = [] if line.deviation is None else [element('path', d='M12 0V12', class_='bars') if line.dots else
-                                                element('rect', x=1.0, y=1.0, width=22.0, height=10.0, class_='band')]
-    swatch = element('svg', element('g', *spread, mark, class_=line.style), viewBox='0 0 24 12', class_='swatch', aria_hidden='true')
+    mark = (element('circle', cx=12.0, cy=6.0, r=3.0) if line.dots
+            else element('path', d='M1 6H23', class_='stroke'))
+    spread = [] if line.deviation is None else [
+        element('path', d='M12 0V12', class_='bars') if line.dots
+        else element('rect', x=1.0, y=1.0, width=22.0, height=10.0, class_='band')]
+    swatch = element('svg', element('g', *spread, mark, class_=line.style),
+                     viewBox='0 0 24 12', class_='swatch', aria_hidden='true')
     return element('li', swatch, line.name + ('' if line.deviation is None else ', 95 %'))
 
 
 def _table(chart: Chart) -> Markup:
-    head = element('tr', _head(chart.across, chart.across_unit), *(_head(line.name, chart.up_unit) for line in chart.lines))
-    rows = [element('tr', element('td', number(float(at), 4)), *(element('td', _value(line, row)) for line in chart.lines))
+    head = element('tr', _head(chart.across, chart.across_unit),
+                   *(_head(line.name, chart.up_unit) for line in chart.lines))
+    rows = [element('tr', element('td', number(float(at), 4)),
+                    *(element('td', _value(line, row)) for line in chart.lines))
             for row, at in enumerate(chart.at)]
-    table = element('table', element('caption', joined(chart.title, ', ', chart.up)), element('thead', head), element('tbody', *rows))
-    return element('details', element('summary', 'Values'), element('div', table, class_='scroll', tabindex='0'))
+    table = element('table', element('caption', joined(chart.title, ', ', chart.up)),
+                    element('thead', head), element('tbody', *rows))
+    return element('details', element('summary', 'Values'),
+                   element('div', table, class_='scroll', tabindex='0'))
 
 
 def _head(name: str, unit: str) -> Markup:
@@ -249,5 +274,6 @@ def _head(name: str, unit: str) -> Markup:
 def _value(line: Line, row: int) -> str:
     if not math.isfinite(line.values[row]):
         return '–'
-    spread = '' if line.deviation is None else f' ± {number(_BAND * float(line.deviation[row]), 2)}'
+    spread = ('' if line.deviation is None
+              else f' ± {number(_BAND * float(line.deviation[row]), 2)}')
     return number(float(line.values[row])) + spread

@@ -1,4 +1,4 @@
-"""Codes: the values that a digital output takes, the step between them, the band about zero that none lies in, and the limit."""
+"""Codes: the values of a digital output, their step, the dead band about zero, and the limit."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from gyro_calibration.log import Array, Mask
 
 #: Values closer than this, relative to the largest, are one: a change of units rounds them.
 _SAME = 1e-12
-#: How well codes must lie on a lattice: the length of their mean phase, which is 1 for exact ones and 0 for any values.
+#: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
 _ALIGNED = 0.7
-#: Where among the gaps between codes the step is looked for: where codes are left out, only few gaps are as small.
+#: Quantiles of the gaps between codes where the step is looked for: where codes are left out, only
+#: few gaps are as small.
 _STARTS = (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)
 #: Codes on each side that a step is found among before it is carried further.
 _SOME = 8
-#: The count of the extreme code is compared with that of so many next to it, or of those within a part of the white noise.
+#: The count of the extreme code is compared with that of so many next to it, or of those within
+#: this part of the white noise.
 _NEIGHBOURS, _WITHIN = 4, 0.05
 #: Codes finer than this part of the white noise hardly ever repeat by chance.
 _FINE = 0.1
 #: A code that is reached in so many separate runs is none that was stuck.
 _SEPARATE = 3
-#: Smaller than this part of the fastest output is that of a rest: no limit is as low, and a dead band is about one.
+#: An output below this part of the fastest is that of a rest: no limit is as low, and a dead band
+#: is about a rest.
 _REST = 0.1
 #: Values of as many digits have steps of as many parts of them, up to this factor.
 _DIGIT = 10.0
@@ -56,7 +59,7 @@ class Codes:
 
 
 def codes_of(values: Array) -> Codes:
-    """Return the codes of some values, none of them nan: the coarsest lattice that they lie on, up to rounding in print."""
+    """Return the codes of values without nan: the coarsest lattice, up to rounding in print."""
     found, counts = np.unique(values, return_counts=True)
     apart = np.concatenate([[True], np.diff(found) > _SAME * np.abs(found[[0, -1]]).max()])
     first = np.flatnonzero(apart)
@@ -72,7 +75,7 @@ def codes_of(values: Array) -> Codes:
 
 
 def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
-    """Refine a step from codes near each other to codes far apart; return it, how well they lie on it, and its standard deviation."""
+    """Refine a step from near to far codes; return it, the alignment, and its deviation."""
     gaps = np.diff(codes.values)
     near = gaps < 8.5 * step
     step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
@@ -92,7 +95,7 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
 
 
 def _about_the_densest(values: Array) -> tuple[Array, float]:
-    """Return how far values are from where they stand closest, and how far to go for the next ones: neighbours give the step at first."""
+    """Return distances from where values are densest, and a first reach, where the step shows."""
     width = min(2 * _SOME, len(values) - 1)
     span = values[width:] - values[:-width]
     first = int(np.argmin(span))
@@ -101,18 +104,20 @@ def _about_the_densest(values: Array) -> tuple[Array, float]:
 
 def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
     """
-    Return the length of the mean phase of some places on a lattice, and by how much the lattice is moved.
+    Return the length of the mean phase of places on a lattice, and the shift of the lattice.
 
-    The place that occurs most is left out: beside a value that comes at every rest, all others would count for nothing.
+    The place that occurs most is left out: beside a value that comes at every rest, all others
+    would count for nothing.
 
     """
-    counts = np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts) if len(counts) > 1 else counts
+    counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
+              if len(counts) > 1 else counts)
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
 
 
 def _slope(number: Array, place: Array) -> tuple[float, float]:
-    """Return the slope of a line through places over whole numbers, and its standard deviation; wild places do not count."""
+    """Return the slope of places over whole numbers, without outliers, and its deviation."""
     slope, off, spread = _line(number, place)
     good = np.abs(off) <= 0.3 * abs(slope)
     if np.ptp(number[good]) > 0.0:
@@ -121,7 +126,7 @@ def _slope(number: Array, place: Array) -> tuple[float, float]:
 
 
 def _line(number: Array, place: Array) -> tuple[float, Array, float]:
-    """Return the slope of a line, how far places are off it, and the root of the sum of squares of the numbers about their mean."""
+    """Return a slope, the residuals of places, and the root of the sum of squares of numbers."""
     centred, apart = number - number.mean(), place - place.mean()
     squares = float(centred @ centred)
     slope = float(centred @ apart) / squares
@@ -132,19 +137,24 @@ def steps_about(codes: Codes, output: Array) -> Array:
     """
     Return the most that codes about each value may be apart, shape (n,).
 
-    Steps grow with the values in floats of 32 bits, and in what is printed with so many digits; or they are too fine to be seen. They are
-    no larger than the closest two among values as large or larger are apart, and than is usual for the digits of the finest.
+    Steps grow with the values in floats of 32 bits, and in what is printed with so many digits; or
+    they are too fine to be seen. They are no larger than the smallest gap between values as large
+    or larger, and than is usual for the digits of the finest.
 
     """
-    steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min()) if len(codes.values) > 1 else 1.0))
-    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0]) for sign in (1.0, -1.0)}
-    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf)) for sizes in sides.values())
+    steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min())
+                                     if len(codes.values) > 1 else 1.0))
+    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0])
+             for sign in (1.0, -1.0)}
+    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf))
+                 for sizes in sides.values())
     for sign, sizes in sides.items():
         if len(sizes) > 1:
             side = sign * output >= 0.0
             closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
             place = np.minimum(np.searchsorted(sizes, sign * output[side]), len(closest) - 1)
-            steps[side] = np.maximum(steps[side], np.minimum(closest[place], _DIGIT * finest * np.abs(output[side])))
+            steps[side] = np.maximum(
+                steps[side], np.minimum(closest[place], _DIGIT * finest * np.abs(output[side])))
     return steps
 
 
@@ -168,8 +178,9 @@ class DeadBand:
         return np.abs(output - self.value) < 0.5 * self.half
 
     def chances(self, seen: Compared) -> Array:
-        """Return the chance of each sample to be in it, by what is expected of it; without expectation it rests."""
-        rest = np.full(len(seen.output), np.median(seen.output)) if seen.expected is None else seen.expected
+        """Return the chance of each sample to be in it, by its expected output, or by a rest."""
+        rest = (np.full(len(seen.output), np.median(seen.output)) if seen.expected is None
+                else seen.expected)
         off, doubt = np.nan_to_num(rest - self.value), max(doubt_of(seen), 1e-9 * self.half)
         reach = self.half + _EDGE * doubt
         return ndtr((reach - off) / doubt) - ndtr((-reach - off) / doubt)
@@ -191,7 +202,7 @@ def _slow(output: Array) -> float:
 
 
 def doubt_of(seen: Compared) -> float:
-    """Return what a sample may be off what is expected of it, rad/s: beside its noise by all that is no straight line."""
+    """Return the deviation of samples from the expected output, rad/s: noise and nonlinearity."""
     return seen.white if seen.expected is None else max(seen.white, seen.scatter)
 
 
@@ -226,9 +237,10 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
     """
     Return the limit of an output, or None where it shows none.
 
-    An extreme code is one if it is beyond what comes at rests; if it stands more often than its neighbours further in, where an output
-    that is free to go beyond has fewer; and if the output would have gone beyond by what is expected of it, which a coarse code at a
-    constant rate would not.
+    An extreme code is one if it is beyond what comes at rests; if it stands more often than its
+    neighbours further in, where an output that is free to go beyond has fewer; and if the output
+    would have gone beyond by what is expected of it, which a coarse code at a constant rate would
+    not.
 
     Parameters
     ----------
@@ -239,17 +251,21 @@ def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
     """
     chances = {}
     for sign in (1.0, -1.0):
-        values, counts = (codes.values, codes.counts) if sign > 0.0 else (-codes.values[::-1], codes.counts[::-1])
-        chance = _chance(values, counts, float(steps_about(codes, sign * values[-1:])[0]), seen.white)
-        if chance < level and values[-1] > _slow(seen.output) and _held_back(seen, sign, values[-1], codes.step):
+        values, counts = ((codes.values, codes.counts) if sign > 0.0
+                          else (-codes.values[::-1], codes.counts[::-1]))
+        chance = _chance(values, counts, float(steps_about(codes, sign * values[-1:])[0]),
+                         seen.white)
+        if (chance < level and values[-1] > _slow(seen.output)
+                and _held_back(seen, sign, values[-1], codes.step)):
             chances[sign] = (sign * values[-1], chance)
     if not chances:
         return None
-    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0], min(chance for _, chance in chances.values()))
+    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
+                 min(chance for _, chance in chances.values()))
 
 
 def _chance(values: Array, counts: Array, step: float, white: float) -> float:
-    """Return the chance of as many samples at the last code as the first of them has company, if the density falls towards it."""
+    """Return the chance of as many samples at the last code, if the density falls towards it."""
     reach = max(_NEIGHBOURS * step, _WITHIN * white)
     neighbours = min(reach / step, 1e6)
     before = int(counts[:-1][values[:-1] > values[-1] - reach - 0.5 * step].sum())
@@ -257,14 +273,17 @@ def _chance(values: Array, counts: Array, step: float, white: float) -> float:
 
 
 def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
-    """Tell whether samples at their largest value, in one sense of rotation, would have gone beyond it."""
+    """Tell whether samples at the largest value in one sense would have gone beyond it."""
     at = sign * seen.output >= top - 1e-9 * abs(top)
     runs = int(np.count_nonzero(np.diff(at.astype(np.int8), prepend=0) > 0))
     fine = step < _FINE * seen.white
-    beyond = np.array([]) if seen.expected is None else sign * seen.expected[at & np.isfinite(seen.expected)] - top
+    beyond = (np.array([]) if seen.expected is None
+              else sign * seen.expected[at & np.isfinite(seen.expected)] - top)
     if not beyond.size:
         return fine and runs >= _SEPARATE
     middle = float(np.median(beyond))
-    # What is expected errs by the wander of the bias and by all that is no straight line, which is alike in all these samples.
+    # The expected output errs by bias wander and nonlinearity, which these samples share.
     doubt = doubt_of(seen)
-    return middle > 0.5 * step + 2.0 * doubt or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt))
+    return (middle > 0.5 * step + 2.0 * doubt
+            or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt)))
+

@@ -1,4 +1,4 @@
-"""The output beside what the reference lets expect of it, sample by sample, as far as a straight line between the two tells."""
+"""The output beside what a straight line over the reference expects of it, sample by sample."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from scipy.signal import savgol_filter
 from gyro_calibration.log import Array, Log, Mask
 from gyro_calibration.model import GyroModel
 
-#: A rate is taken from a heading by parabolas over so long, s, for its steps would hide it over one sample.
+#: Length of the parabolas that give a rate from a heading, s: over one sample its steps hide it.
 _SMOOTHING = 0.15
-#: Lengths of the blocks in which output and reference are compared, s; the shorter where the motion averages out in the longer.
+#: Lengths of the blocks in which output and reference are compared, s; the shorter one where the
+#: motion averages out in the longer one.
 _BLOCKS = (0.5, 0.1)
-#: Part of the range of the output at each end that a first line leaves out, and how often a line is fitted to what is near the one before.
+#: Part of the range of the output at each end that a first line leaves out, and the number of
+#: times that a line is fitted to what is near the one before.
 _ENDS, _FITS = 0.05, 4
 
 
 @dataclass(frozen=True)
 class Line:
-    """Output = factor * rate + offset: what regression finds, with the standard deviation of the factor from the scatter between parts."""
+    """Output = factor * rate + offset, with the deviation of the factor by scatter of parts."""
 
     factor: float
     offset: float
@@ -70,21 +72,24 @@ def bridged(values: Array) -> Array:
 
 
 def white_noise(values: Array) -> float:
-    """Return the standard deviation of the white part of a signal, by third differences: a smooth motion has next to none."""
+    """Return the standard deviation of the white part of a signal, by third differences."""
     off = np.abs(np.diff(values, 3))
     off = off[np.isfinite(off)]
     # Not by the median: an output of few codes has differences of zero mostly.
-    return float(np.quantile(off, 0.9)) / (stats.norm.isf(0.05) * math.sqrt(20.0)) if off.size else math.inf
+    return (float(np.quantile(off, 0.9)) / (stats.norm.isf(0.05) * math.sqrt(20.0))
+            if off.size else math.inf)
 
 
 def reference_rate(log: Log) -> Array | None:
     """Return the rate by the reference, rad/s, nan where it was lost; None without reference."""
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         return log.reference_rate
-    if log.reference_heading is None or log.time is None or np.isfinite(log.reference_heading).sum() < 2:
+    if (log.reference_heading is None or log.time is None
+            or np.isfinite(log.reference_heading).sum() < 2):
         return None
     known = np.isfinite(log.reference_heading)
-    length = min(max(5, 2 * round(0.5 * _SMOOTHING / float(np.median(np.diff(log.time)))) + 1), (len(known) - 1) // 2 * 2 + 1)
+    length = min(max(5, 2 * round(0.5 * _SMOOTHING / float(np.median(np.diff(log.time)))) + 1),
+                 (len(known) - 1) // 2 * 2 + 1)
     if length < 3:
         return None
     smooth = savgol_filter(bridged(log.reference_heading), length, 2)
@@ -92,7 +97,7 @@ def reference_rate(log: Log) -> Array | None:
 
 
 def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
-    """Return the line of the output over the rate by means over blocks, or None where there is no motion to find it from."""
+    """Return the line of the output over the rate by block means, or None without motion."""
     known = np.isfinite(rate) & np.isfinite(output)
     if np.count_nonzero(known) < 8 or not np.ptp(rate[known]) > 0.0:
         return None
@@ -103,12 +108,13 @@ def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
 
 
 def scale_of(model: GyroModel, rate: Array) -> float:
-    """Return by what the output of a model grows with a rate, between the two senses of a speed that is usual in a log."""
+    """Return the slope of a model's output over the rate, between both senses of a usual speed."""
     speeds = np.abs(rate[np.isfinite(rate)])
     speed = float(np.quantile(speeds, 0.9)) if speeds.size else 0.0
     if speed == 0.0:
         return 1.0
-    forth, back = (float(model.output(sign * speed, model.reference_temperature)) for sign in (1.0, -1.0))
+    forth, back = (float(model.output(sign * speed, model.reference_temperature))
+                   for sign in (1.0, -1.0))
     return (forth - back) / (2.0 * speed)
 
 
@@ -137,7 +143,7 @@ def _line(rate: Array, output: Array) -> Line | None:
 
 
 def _within(rate: Array, output: Array) -> Mask:
-    """Mark what is not near the ends of the output, to begin with, for it may be cut there; all where nearly all is at the ends."""
+    """Mark outputs away from the ends, where they may be cut; all if nearly all are there."""
     low, high = output.min(), output.max()
     within = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
     enough = np.count_nonzero(within) >= 8 and np.ptp(rate[within]) > 0.3 * np.ptp(rate)
@@ -145,7 +151,7 @@ def _within(rate: Array, output: Array) -> Mask:
 
 
 def _scatter(columns: Array, off: Array) -> float:
-    """Return the standard deviation of the slope, by what up to 20 parts of the record would change it by: their noise has a colour."""
+    """Return the standard deviation of the slope, by up to 20 parts, for the noise has colour."""
     pieces = np.minimum(np.arange(len(off)) * min(20, len(off) // 2) // len(off), 19)
     scores = np.array([np.bincount(pieces, column * off) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)

@@ -4,9 +4,9 @@ Which causes a regression on spans establishes: robust evidence, confirmed by cr
 The score of a candidate is summed over stretches. Its variance is what the noise predicts or what
 the stretches scatter by, whichever is larger, and its distribution Student's, with the effective
 number of stretches less one as the degrees of freedom. The chance of the best of all candidates is
-that of one times their number; those that happen once are counted apart. A cause is established if,
-besides, it is chosen again without each fold, and predicts the stretches of the folds better than no
-cause does; else it is suspected.
+that of one times their number; those that happen once are counted apart. A cause is established
+if, besides, it is chosen again without each fold, and predicts the stretches of the folds better
+than no cause does; else it is suspected.
 
 """
 
@@ -64,7 +64,7 @@ class Confirmed:
 
 @dataclass(frozen=True)
 class _Whitened:
-    """Observations, plain and candidate columns, whitened, with the prior as rows of stretch -1."""
+    """Whitened observations, plain and candidate columns; the prior is rows of stretch -1."""
 
     observed: Array
     plain: Array
@@ -72,7 +72,7 @@ class _Whitened:
     stretch: Array
 
     def rest(self, rows: Mask, columns: Array) -> tuple[Array, Array]:
-        """Return values of plain columns for each of some columns, and what is left of all rows."""
+        """Return values of plain columns for each of some columns, and the rest of all rows."""
         values = np.linalg.lstsq(self.plain[rows], columns[rows], rcond=None)[0]
         return values, columns - self.plain @ values
 

@@ -1,4 +1,4 @@
-"""The residual along each variable, for people to see: by the simulation as it was, and as extended."""
+"""The residual along each variable, for plots: of the simulation as given, and as extended."""
 
 from __future__ import annotations
 
@@ -43,9 +43,12 @@ def curves(before: Sequence[Array], after: Outcome) -> list[Curve]:
 
     """
     replays = after.replays
-    simulated = [each.added + error - rest for each, error, rest in zip(replays, beside_model(replays), before)]
-    values = [joined([part[each.kept] for part, each in zip(parts, replays)]) for parts in (before, what_is_left(after), simulated)]
-    found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after) for name, unit, of in _variables(replays)]
+    simulated = [each.added + error - rest
+                 for each, error, rest in zip(replays, beside_model(replays), before)]
+    values = [joined([part[each.kept] for part, each in zip(parts, replays)])
+              for parts in (before, what_is_left(after), simulated)]
+    found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after)
+             for name, unit, of in _variables(replays)]
     return [each for each in found if len(each.at) > 1] + [_spectrum(before, after)]
 
 
@@ -55,11 +58,13 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
     yield 'time', 's', lambda each: each.channels.time - each.channels.time[0]
     if any(np.ptp(each.channels.rate) > 0.0 for each in replays):
         yield 'rate', 'rad/s', lambda each: each.channels.rate
-        yield 'rate_change', 'rad/s²', lambda each: np.gradient(each.channels.rate, each.channels.time)
+        yield ('rate_change', 'rad/s²',
+               lambda each: np.gradient(each.channels.rate, each.channels.time))
         yield 'heading', 'rad', lambda each: np.mod(each.channels.heading, 2.0 * np.pi)
     if 'temperature' in has:
         yield 'temperature', 'degC', lambda each: each.channels.temperature
-        yield 'temperature_rate', 'K/s', lambda each: (each.channels.temperature - each.lagged('temperature', 10.0)) / 10.0
+        yield ('temperature_rate', 'K/s', lambda each: (
+            each.channels.temperature - each.lagged('temperature', 10.0)) / 10.0)
     if 'specific_force' in has:
         yield 'specific_force', 'm/s²', lambda each: each.channels.specific_force
         yield 'vibration', '(m/s²)²', lambda each: each.lagged('vibration', 1.0)
@@ -67,41 +72,49 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
         yield 'supply', 'V', lambda each: np.asarray(each.channels.supply)
 
 
-def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array], after: Outcome) -> Curve:
-    """Bin by even steps between the quantiles that hold nearly all, and leave out bins with few samples."""
+def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
+           after: Outcome) -> Curve:
+    """Bin evenly between the quantiles that hold nearly all, without bins of few samples."""
     at = joined(parts)
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
         return Curve(name, unit, *(np.empty(0) for _ in range(5)))
-    bins = [np.clip(((part - low) / (high - low) * BINS).astype(int), 0, BINS - 1) for part in parts]
+    bins = [np.clip(((part - low) / (high - low) * BINS).astype(int), 0, BINS - 1)
+            for part in parts]
     place = np.concatenate(bins)
     count = np.bincount(place, minlength=BINS)
     enough = count > 9
-    middle, left, mended, simulated = (np.bincount(place, each, BINS)[enough] / count[enough] for each in (at, *values))
-    return Curve(name, unit, middle, left, mended, np.sqrt(_variances(after, bins)[enough]) / count[enough], simulated)
+    middle, left, mended, simulated = (np.bincount(place, each, BINS)[enough] / count[enough]
+                                       for each in (at, *values))
+    return Curve(name, unit, middle, left, mended,
+                 np.sqrt(_variances(after, bins)[enough]) / count[enough], simulated)
 
 
 def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
 
-    Slow noise is alike in neighbours and averages out less than white noise; in the cosine transform it is independent. What was averaged
-    out of the samples that are one point of the grid is white.
+    Slow noise is alike in neighbours and averages out less than white noise; in the cosine
+    transform it is independent. What averages out among the samples of one grid point is white.
 
     """
     total = np.zeros(BINS)
-    for each, residual, variance, place in zip(after.replays, after.residuals, _spectra(after.work), bins):
+    for each, residual, variance, place in zip(after.replays, after.residuals,
+                                               _spectra(after.work), bins):
         point = np.minimum(each.place // each.every, each.points - 1)
-        held = np.bincount(place * each.points + point, minlength=BINS * each.points).reshape(BINS, each.points).astype(float)
+        held = np.bincount(place * each.points + point, minlength=BINS * each.points).reshape(
+            BINS, each.points).astype(float)
         within = np.maximum(held.sum(axis=1) - (held ** 2).sum(axis=1) / each.every, 0.0)
-        total += transform(held) ** 2 @ variance + white_deviation(residual[each.kept]) ** 2 * within
+        total += (transform(held) ** 2 @ variance
+                  + white_deviation(residual[each.kept]) ** 2 * within)
     return total
 
 
 def _spectra(done: Work) -> list[Array]:
-    """Return the variance of the coefficients of each log by noise, averaged over the noises that it may be, shape (points - 1,) each."""
+    """Return the noise variance of each log's coefficients, averaged over the noises."""
     whole, judged = done.field, done.judged
-    relative = (judged.probability[0] * judged.squares[0] / done.by.freedom) @ (1.0 / whole.noises.weights)
+    relative = (judged.probability[0] * judged.squares[0] / done.by.freedom) @ (
+        1.0 / whole.noises.weights)
     count = np.diff(np.append(whole.starts, len(whole.deviation)))
     variance = whole.deviation ** 2 * np.repeat(relative, count)
     return np.split(variance, np.cumsum([each.points - 1 for each in whole.replays])[:-1])
@@ -111,27 +124,32 @@ def _spectrum(before: Sequence[Array], after: Outcome) -> Curve:
     """Return the largest amplitude of the first log's residual in bins of frequency."""
     each = after.replays[0]
     series = [each.on_grid(left[0]) for left in (before, what_is_left(after))]
-    amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values) for values in series]
+    amplitude = [np.sqrt(2.0) * np.abs(np.fft.rfft(values))[1:] * np.sqrt(2.0) / len(values)
+                 for values in series]
     frequency = np.fft.rfftfreq(len(series[0]), each.step)[1:]
-    edges = np.unique(np.searchsorted(frequency, np.geomspace(frequency[0], frequency[-1], BINS + 1)))[:-1]
+    edges = np.unique(np.searchsorted(
+        frequency, np.geomspace(frequency[0], frequency[-1], BINS + 1)))[:-1]
     largest = [np.maximum.reduceat(values, edges) for values in amplitude]
     middle = np.sqrt(frequency[edges] * frequency[np.append(edges[1:], len(frequency)) - 1])
-    usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges) / np.diff(np.append(edges, len(frequency))))
+    usual = np.sqrt(np.add.reduceat(amplitude[1] ** 2, edges)
+                    / np.diff(np.append(edges, len(frequency))))
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
 def heading_curve(before: Sequence[Array], after: Outcome) -> HeadingCurve:
-    """Return what the heading of the first log is wrong by, if the simulation is believed, by what is left of each log before."""
+    """Return the heading error over the first log, by its residual before and after extension."""
     each = after.replays[0]
-    lines = [np.cumsum(each.on_grid(left[0])) * each.step for left in (before, what_is_left(after))]
+    lines = [np.cumsum(each.on_grid(left[0])) * each.step
+             for left in (before, what_is_left(after))]
     some = np.unique(np.linspace(0, each.points - 1, POINTS).astype(int))
     return HeadingCurve(some * each.step, lines[0][some], lines[1][some])
 
 
 def noise_curve(after: Outcome, fitted: Noise, expected: Noise) -> NoiseCurve:
-    """Return the Allan deviation of what is left of the first log, and of the noise that was fitted and simulated."""
+    """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = after.replays[0]
     chart = allan_deviation(each.on_grid(after.residuals[0])[:_ALLAN_SAMPLES], each.step)
     times = chart.time
     return NoiseCurve(times, chart.deviation, np.sqrt(fitted.allan_variance(times)),
-                      np.sqrt(expected.allan_variance(times)) if expected.angle_random_walk else None)
+                      np.sqrt(expected.allan_variance(times))
+                      if expected.angle_random_walk else None)

@@ -1,9 +1,10 @@
 """
-What dwells say beside a model: its bias and scale factor fitted anew, and the causes that they support on top of it.
+What dwells say beside a model: bias and scale factor fitted anew, and the causes they support.
 
-Effects of a model that are not fitted anew are taken off the output first, so that what is left is that of a gyro without them. A
-polynomial that looks at the output stays as it is: fitted together with effects of the rate it would explain the dwells by themselves,
-for their output less their rate is what is to be explained.
+Effects of a model that are not fitted anew are subtracted from the output first, so that what is
+left is that of a gyro without them. A polynomial of the output stays as it is: fitted together
+with effects of the rate it would explain the dwells by itself, for the output less the rate is
+what is to be explained.
 
 """
 
@@ -38,7 +39,8 @@ from gyro_calibration.selection import TECHNOLOGIES, part_twins, supported_effec
 NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
 #: What dwells without time can show of a model.
 _SEEN = {'rate', 'output', 'temperature'}
-#: Parts of the false-alarm rate: of causes beside bias and scale factor, and of a bias and a scale factor that are not the model's.
+#: Parts of the false-alarm rate: of causes beside bias and scale factor, and of a bias and a scale
+#: factor that differ from the model's.
 _CAUSES, _OF_NUISANCES = 0.65, 0.1
 #: Temperatures from which a curve may count without a slope, degC, beside the mean and the first.
 _USUAL = (25.0, 20.0)
@@ -52,7 +54,8 @@ class Named:
     Attributes
     ----------
     fit : of these and of bias and scale factor, to dwells less what stays of the model
-    change : the same as changes of the model, each beside all of it; their evidence, but for bias and scale factor
+    change : the same as changes of the model, each beside all of it; their evidence, but for bias
+        and scale factor
     causes : those that are named, of the effects of the fit
     model : that is put to the test
     rate : of false alarms that the whole diagnosis may have
@@ -74,10 +77,11 @@ class Named:
         return _level(self.rate, effect in NUISANCES)
 
     def chance_of(self, effect: Effect) -> float:
-        """Return how likely dwells without a cause would show as much of any of those that were tried."""
+        """Return how likely dwells without a cause show as much of any of those tried."""
         if effect in NUISANCES:
             return min(1.0, _chance_of_change(self.fit, self.model, effect) * len(NUISANCES))
-        return min(1.0, _chance(self.change, self.model, self.changed(effect)) * (len(STEADY) - len(NUISANCES)))
+        return min(1.0, _chance(self.change, self.model, self.changed(effect))
+                   * (len(STEADY) - len(NUISANCES)))
 
 
 # a model beside dwells
@@ -85,7 +89,8 @@ class Named:
 def surroundings(model: GyroModel, dwells: Dwells) -> Channels:
     """Return what a model looks at, at its reference temperature where the table holds none."""
     channels = channels_of(dwells)
-    return channels if dwells.temperature is not None else replace(channels, temperature=np.full(len(dwells), model.reference_temperature))
+    return channels if dwells.temperature is not None else replace(
+        channels, temperature=np.full(len(dwells), model.reference_temperature))
 
 
 def simulated(model: GyroModel, dwells: Dwells) -> Array:
@@ -95,14 +100,16 @@ def simulated(model: GyroModel, dwells: Dwells) -> Array:
 
 
 def seen(model: GyroModel) -> list[Term]:
-    """Return the effects of a model that dwells can show: those of rate, output and temperature alone."""
-    return [term for term in model.terms if term.effect.looks_at <= _SEEN and term.effect.distortion is None]
+    """Return the effects of a model that dwells can show: of rate, output and temperature."""
+    return [term for term in model.terms
+            if term.effect.looks_at <= _SEEN and term.effect.distortion is None]
 
 
 def beside(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
-    """Return the dwells with the output of a gyro without the effects of a model, but for those that are refitted."""
+    """Return dwells whose output is without the effects of a model that are not refitted."""
     channels, names = surroundings(model, dwells), {effect.name for effect in refitted}
-    return replace(dwells, output=dwells.output - sum(term.error(channels) for term in seen(model) if term.effect.name not in names))
+    return replace(dwells, output=dwells.output - sum(
+        term.error(channels) for term in seen(model) if term.effect.name not in names))
 
 
 def technology(model: GyroModel) -> str | None:
@@ -113,7 +120,8 @@ def technology(model: GyroModel) -> str | None:
 
 # naming
 
-def name_causes(dwells: Dwells, model: GyroModel | None, rate: float, without: frozenset[str] = frozenset()) -> Named:
+def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
+                without: frozenset[str] = frozenset()) -> Named:
     """
     Find the causes that dwells support on top of a model, or of an ideal gyro.
 
@@ -129,32 +137,39 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float, without: f
     change, _ = supported_effects(beside(dwells, tested), technology(tested), rate=_CAUSES * rate)
     change = _without(change, without)
     change, needless = _counted_well(change, model, _level(rate))
-    guilty = tuple(each for each in change.effects
-                   if each not in (*NUISANCES, *needless) and _chance(change, tested, each) < _level(rate))
-    change = _without(change, frozenset(each.name for each in change.effects if each not in (*NUISANCES, *needless, *guilty)))
+    guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless)
+                   and _chance(change, tested, each) < _level(rate))
+    change = _without(change, frozenset(each.name for each in change.effects
+                                        if each not in (*NUISANCES, *needless, *guilty)))
     if model is None:
         return Named(change, change, guilty, tested, rate)
     fit = _refitted(dwells, model, change)
-    moved = [each for each in NUISANCES if each in fit.effects and _chance_of_change(fit, model, each) < _level(rate, True)]
+    moved = [each for each in NUISANCES
+             if each in fit.effects and _chance_of_change(fit, model, each) < _level(rate, True)]
     return Named(fit, change, (*(_or_twin(each, fit) for each in guilty), *moved), tested, rate)
 
 
 def _level(rate: float, nuisance: bool = False) -> float:
     """Return the chance at which one cause is named."""
-    return _OF_NUISANCES * rate / len(NUISANCES) if nuisance else _CAUSES * rate / (len(STEADY) - len(NUISANCES))
+    return (_OF_NUISANCES * rate / len(NUISANCES) if nuisance
+            else _CAUSES * rate / (len(STEADY) - len(NUISANCES)))
 
 
 def _without(change: Calibration, names: frozenset[str]) -> Calibration:
-    """Fit anew without the causes that are withdrawn, and without what was there for their sake."""
+    """Fit anew without the withdrawn causes, and without what was there for their sake."""
     kept = [each for each in change.effects if each.name not in names]
-    return change if len(kept) == len(change.effects) else fit_effects(change.dwells, kept, change.scatter)
+    return (change if len(kept) == len(change.effects)
+            else fit_effects(change.dwells, kept, change.scatter))
 
 
 def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibration:
     """Fit the values that changed as a whole: the model's own and the change of them are one."""
     own = {term.effect.name for term in model.terms}
-    effects = tuple(twin if (twin := _twin(each)) is not None and twin.name in own - {each.name} else each for each in change.effects)
-    fit, _ = part_twins(fit_effects(beside(dwells, model, effects), effects, change.scatter), technology(model))
+    effects = tuple(
+        twin if (twin := _twin(each)) is not None and twin.name in own - {each.name} else each
+        for each in change.effects)
+    fit, _ = part_twins(fit_effects(beside(dwells, model, effects), effects, change.scatter),
+                        technology(model))
     return counted_from(fit, model.reference_temperature)
 
 
@@ -163,33 +178,36 @@ def _twin(effect: Effect) -> Effect | None:
 
 
 def change_of(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return by how much the value of bias or scale factor differs from that of the model, which is 0 where it has none."""
-    found, own = ([term.values[-1] for term in each.terms if term.effect is effect] for each in (fit, model))
+    """Return the change of bias or scale factor from the model, which has 0 where it has none."""
+    found, own = ([term.values[-1] for term in each.terms if term.effect is effect]
+                  for each in (fit, model))
     return float(sum(found) - sum(own))
 
 
 def _chance_of_change(fit: Calibration, model: GyroModel, effect: Effect) -> float:
-    """Return how likely dwells would show as much of a change of bias or scale factor where there is none."""
+    """Return how likely dwells show as much change of bias or scale factor without any."""
     column = columns_of(_used(fit), [term for term in fit.terms if term.effect is effect])[:, 0]
     return _chance(fit, model, effect, column * change_of(fit, model, effect))
 
 
-def _chance(fit: Calibration, model: GyroModel, effect: Effect, added: Array | None = None) -> float:
+def _chance(fit: Calibration, model: GyroModel, effect: Effect,
+            added: Array | None = None) -> float:
     """
-    Return how likely dwells and the errors that the model's values have would show as much of an effect where there is nothing of it.
+    Return how likely dwells and errors of the model's values show as much of an absent effect.
 
     Parameters
     ----------
     fit : of dwells beside the model
     model : whose own covariance counts too, where it has one
-    added : what is too much for chance, rad/s, of each dwell that is fitted; all that the effect adds where it is None
+    added : the effect in each dwell that is fitted, rad/s; None for all that the effect adds
 
     """
     if not fit.freedom:
         return 1.0
     used, others = _used(fit), [term for term in fit.terms if term.effect is not effect]
     if added is None:
-        added = sum(term.error(channels_of(used)) for term in fit.terms if term.effect is effect) + np.zeros(len(used))
+        added = (sum(term.error(channels_of(used)) for term in fit.terms if term.effect is effect)
+                 + np.zeros(len(used)))
     if not np.any(added):
         return 1.0
     columns = np.column_stack([*columns_of(used, others).T, added]) if others else added[:, None]
@@ -203,7 +221,7 @@ def _used(fit: Calibration) -> Dwells:
 
 
 def _of_dwells(fit: Calibration, model: GyroModel, columns: Array) -> float:
-    """Return how large the standard deviation of the last value by the dwells is, of that by dwells and model together."""
+    """Return the deviation of the last value by dwells over that by dwells and model."""
     whitener = Whitener(_used(fit), fit.scatter)
     inverse = np.linalg.pinv(whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
     by_model = inverse @ whitener.whiten(doubt(fit, model))
@@ -212,7 +230,7 @@ def _of_dwells(fit: Calibration, model: GyroModel, columns: Array) -> float:
 
 
 def doubt(fit: Calibration, model: GyroModel) -> Array:
-    """Return what independent deviations of one of the model's values add to each dwell that is fitted, rad/s, shape (n, m)."""
+    """Return what 1-sigma deviations of model values add to each dwell, rad/s, shape (n, m)."""
     known = [term for term in seen(model) if term.fitted]
     if model.covariance is None or not known:
         return np.zeros((len(_used(fit)), 1))
@@ -220,7 +238,8 @@ def doubt(fit: Calibration, model: GyroModel) -> Array:
     chosen = [place for term in known for place in places[term.effect.name]]
     sizes, directions = np.linalg.eigh(model.covariance[np.ix_(chosen, chosen)])
     channels = surroundings(model, _used(fit))
-    rows = [row + np.zeros(len(_used(fit))) for term in known for row in term.sensitivity(channels)]
+    rows = [row + np.zeros(len(_used(fit)))
+            for term in known for row in term.sensitivity(channels)]
     return np.column_stack(rows) @ (directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
@@ -230,23 +249,27 @@ def _or_twin(effect: Effect, fit: Calibration) -> Effect:
     return effect if effect in fit.effects or twin is None else twin
 
 
-def _counted_well(fit: Calibration, model: GyroModel | None, level: float) -> tuple[Calibration, tuple[Effect, ...]]:
-    """Return a fit that counts temperature from where a curve needs no slope, if there is such a place, and the slope as needless."""
+def _counted_well(fit: Calibration, model: GyroModel | None,
+                  level: float) -> tuple[Calibration, tuple[Effect, ...]]:
+    """Return a fit whose temperature counts from where no slope is needed, and needless slopes."""
     if fit.dwells.temperature is None:
         return fit, ()
     first = _USUAL if model is None else (model.reference_temperature, *_USUAL)
     if BIAS_TEMPERATURE_QUADRATIC in fit.effects:
-        for place in (*first, float(fit.dwells.temperature.mean()), float(fit.dwells.temperature[0])):
+        for place in (*first, float(fit.dwells.temperature.mean()),
+                      float(fit.dwells.temperature[0])):
             counted = counted_from(fit, place)
             if counted.chance_of(BIAS_TEMPERATURE) > level:
-                return (counted if model is None else counted_from(fit, first[0])), (BIAS_TEMPERATURE,)
+                return ((counted if model is None else counted_from(fit, first[0])),
+                        (BIAS_TEMPERATURE,))
     return (fit if model is None else counted_from(fit, first[0])), ()
 
 
 def counted_from(fit: Calibration, temperature: float) -> Calibration:
-    """Return a fit whose effects of temperature count from another one; what they add up to is the same."""
+    """Return the same fit with effects of temperature that count from another temperature."""
     terms = [_with_reference(term, temperature) for term in fit.terms]
-    places = [place for place, term in enumerate(terms) if not any(shape.default is None for shape in term.effect.shapes)]
+    places = [place for place, term in enumerate(terms)
+              if not any(shape.default is None for shape in term.effect.shapes)]
     channels = channels_of(fit.dwells)
     total = sum(fit.terms[place].error(channels) for place in places) + np.zeros(len(fit.dwells))
     columns = columns_of(fit.dwells, [terms[place] for place in places])
@@ -254,7 +277,8 @@ def counted_from(fit: Calibration, temperature: float) -> Calibration:
     values = iter((np.linalg.lstsq(columns / lengths, total, rcond=None)[0] / lengths).tolist())
     for place in places:
         shapes = terms[place].values[:len(terms[place].effect.shapes)]
-        terms[place] = replace(terms[place], values=(*shapes, *(next(values) for _ in terms[place].fitted)))
+        terms[place] = replace(terms[place],
+                               values=(*shapes, *(next(values) for _ in terms[place].fitted)))
     return replace(fit, terms=tuple(terms))
 
 
@@ -267,7 +291,7 @@ def _with_reference(term: Term, temperature: float) -> Term:
 # models
 
 def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
-    """Return the simulation that is put to the test: the model that was given, or that of the bias and scale factor that fit best."""
+    """Return the simulation under test: the given model, or the best bias and scale factor."""
     effects = [each for each in NUISANCES if each in named.change.effects]
     if model is not None or not effects:
         return model or GyroModel()
@@ -291,22 +315,25 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
     new = {term.effect.name: term for term in fit.terms}
     stays = [term for term in model.terms if not _replaced(term.effect, model, fit)]
     own = [term.effect.name for term in stays]
-    terms = (*(new.get(term.effect.name, term) for term in stays), *(term for name, term in new.items() if name not in own))
+    terms = (*(new.get(term.effect.name, term) for term in stays),
+             *(term for name, term in new.items() if name not in own))
     temperatures = [] if dwells.temperature is None else [dwells.temperature]
     # A self-calibration behind the model was of its old bias and scale factor.
-    return replace(model, terms=terms, covariance=_covariance(model, fit, terms), rate_range=wider(model.rate_range, [dwells.output], True),
-                   temperature_range=wider(model.temperature_range, temperatures, True), origin=origins_before(model),
-                   self_calibration=None)
+    return replace(model, terms=terms, covariance=_covariance(model, fit, terms),
+                   rate_range=wider(model.rate_range, [dwells.output], True),
+                   temperature_range=wider(model.temperature_range, temperatures, True),
+                   origin=origins_before(model), self_calibration=None)
 
 
 def _replaced(effect: Effect, model: GyroModel, fit: Calibration) -> bool:
     """Tell whether the twin of an effect of the model stands in its place."""
     twin = _twin(effect)
-    return twin in fit.effects and effect not in fit.effects and all(term.effect is not twin for term in model.terms)
+    return (twin in fit.effects and effect not in fit.effects
+            and all(term.effect is not twin for term in model.terms))
 
 
 def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Array | None:
-    """Return the covariance of all fitted values: what the model and what the dwells say of theirs, as if independent."""
+    """Return the covariance of all fitted values: of model and of dwells, as if independent."""
     found = fit.model.covariance
     stays = [term for term in terms if term.effect not in fit.effects and term.fitted]
     if found is None or (stays and model.covariance is None):
@@ -322,7 +349,8 @@ def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Ar
 def _places(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
     """Return where the fitted values of each term stand in a covariance."""
     ends = np.cumsum([first, *(len(term.fitted) for term in terms)]).tolist()
-    return {term.effect.name: list(range(begin, end)) for term, begin, end in zip(terms, ends, ends[1:])}
+    return {term.effect.name: list(range(begin, end))
+            for term, begin, end in zip(terms, ends, ends[1:])}
 
 
 def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:

@@ -1,4 +1,4 @@
-"""What an extension wins on sweeps that took no part in it, and what the errors of dwells look like before and after, for pictures."""
+"""What an extension improves on sweeps left out of it, and curves of errors before and after."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.scatter import FEWEST_SWEEPS, Scatter, parts_of, summed
 
-#: The parts of a table are left out in so many groups at most, for each choice of causes takes its time.
+#: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8
 #: Bins of a curve at most, and dwells in each at least.
 _MOST_BINS, _DWELLS_A_BIN = 40, 4
@@ -26,7 +26,7 @@ Extend = Callable[[Dwells], tuple[GyroModel, GyroModel]]
 
 def measure_gain(dwells: Dwells, extend: Extend) -> Gain | None:
     """
-    Return what an extension wins, or None where the parts of the table do not allow to make it without one of them.
+    Return what an extension improves, or None where it cannot be made without a part of the table.
 
     Parameters
     ----------
@@ -44,12 +44,14 @@ def measure_gain(dwells: Dwells, extend: Extend) -> Gain | None:
         except DataRefused:
             continue
         left_out = take(dwells, hidden)
-        before[hidden], after[hidden] = (left_out.output - simulated(model, left_out) for model in models)
+        before[hidden], after[hidden] = (left_out.output - simulated(model, left_out)
+                                         for model in models)
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
     numbered = np.unique(parts[known], return_inverse=True)[1]
-    rate = change_over(summed(np.column_stack([before, after])[known] ** 2, numbered), np.bincount(numbered).astype(float))
+    rate = change_over(summed(np.column_stack([before, after])[known] ** 2, numbered),
+                       np.bincount(numbered).astype(float))
     # A heading error is that of so long a turn at the rate of a dwell.
     return Gain(_held_out(dwells, groups), rate, rate.scaled(WINDOW), WINDOW)
 
@@ -61,25 +63,32 @@ def _held_out(dwells: Dwells, groups: Numbers) -> str:
 
 # curves
 
-def curves(dwells: Dwells, scatter: Scatter, before: GyroModel, after: GyroModel) -> tuple[Curve, ...]:
-    """Return the errors of dwells that are not outlying along rate, temperature and their order."""
+def curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
+           after: GyroModel) -> tuple[Curve, ...]:
+    """Return the errors of dwells, without outliers, along rate, temperature and their order."""
     used = take(dwells, scatter.kept)
     ways, straight = np.sign(used.rate), np.ones(len(used))
     found = [_curve('rate', 'rad/s', used.rate, straight, used, scatter, before, after),
-             _curve('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), straight, used, scatter, before, after)]
+             _curve('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), straight, used,
+                    scatter, before, after)]
     if used.temperature is not None and np.ptp(used.temperature) > 0.0:
-        found.append(_curve('temperature', 'degC', used.temperature, straight, used, scatter, before, after))
-        # A scale factor that changes with temperature averages out over turns both ways, unless errors count in the sense of the turn.
-        found.append(_curve('temperature_while_turning', 'degC', used.temperature, ways, used, scatter, before, after))
+        found.append(_curve('temperature', 'degC', used.temperature, straight, used, scatter,
+                            before, after))
+        # A scale factor that changes with temperature averages out over turns both ways, unless
+        # errors count in the sense of the turn.
+        found.append(_curve('temperature_while_turning', 'degC', used.temperature, ways, used,
+                            scatter, before, after))
     return tuple(found)
 
 
-def _curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells, scatter: Scatter, before: GyroModel,
-           after: GyroModel) -> Curve:
+def _curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells, scatter: Scatter,
+           before: GyroModel, after: GyroModel) -> Curve:
     outputs = [simulated(model, dwells) for model in (before, after)]
-    errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]), sign * (outputs[0] - dwells.rate)]
+    errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]),
+              sign * (outputs[0] - dwells.rate)]
     bins = list(_bins(values, sign != 0.0))
-    at, *means = (np.array([float(each[chosen].mean()) for chosen in bins]) for each in (values, *errors))
+    at, *means = (np.array([float(each[chosen].mean()) for chosen in bins])
+                  for each in (values, *errors))
     deviation = np.array([_deviation(dwells, scatter, sign, chosen) for chosen in bins])
     return Curve(along, unit, at, means[0], means[1], deviation, means[2])
 
@@ -93,7 +102,9 @@ def _bins(values: Array, wanted: Mask) -> Iterator[Mask]:
 
 
 def _deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> float:
-    """Return the standard deviation of the mean error of some dwells; what a sweep shares does not average out within it."""
+    """Return the standard deviation of the mean error of dwells; a sweep shares a part of it."""
     part = take(dwells, chosen)
-    shared = summed(sign[chosen, None] * scatter.shared(part), np.unique(part.sweep, return_inverse=True)[1])
+    shared = summed(sign[chosen, None] * scatter.shared(part),
+                    np.unique(part.sweep, return_inverse=True)[1])
+
     return math.sqrt(float(np.sum(scatter.deviation(part) ** 2) + np.sum(shared ** 2))) / len(part)
