@@ -286,4 +286,3 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
     doubt = doubt_of(seen)
     return (middle > 0.5 * step + 2.0 * doubt
             or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt)))
-

@@ -1,9 +1,10 @@
 """
-What is left of the errors of dwells that no cause explains: curves over rate, temperature, their product, the order of dwells and within
-sweeps, and errors that repeat at single rates.
+What no cause explains in the errors of dwells: curves, and errors that repeat at single rates.
 
-What the dwells of a sweep share, a bias and a scale factor that wander, is scatter and no structure. How large scatter is, is not known
-either; so each chance is averaged over what it may be, as the intervals of a calibration are.
+The curves are over rate, temperature, their product, the order of dwells, and within sweeps. What
+the dwells of a sweep share, a bias and a scale factor that wander, is scatter and no structure.
+The size of the scatter is not known either; so each chance is averaged over what it may be, as the
+intervals of a calibration are.
 
 """
 
@@ -28,7 +29,8 @@ _MOST_COLUMNS = 9
 _DWELLS_A_COLUMN = 4
 #: What of a curve the model explains already to this part of its length is not tried again.
 _NEW = 1e-3
-RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = 'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep'
+RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = (
+    'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep')
 SINGLE_RATES = 'single_rates'
 #: A rate that is repeated in so many sweeps may show an error of its own.
 _REPEATED = 4
@@ -58,7 +60,8 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     ----------
     fit : of dwells
     level : the chance to find any where there is none
-    doubt : what deviations of the values of the model add to each dwell, rad/s, shape (n, m): that is no structure
+    doubt : what deviations of the model's values add to each dwell, rad/s, shape (n, m): that is
+        no structure
 
     """
     used = take(fit.dwells, fit.scatter.kept)
@@ -66,7 +69,8 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
     found, gains, tried = [], {}, len(probes)
     while probes:
-        judged = [_judged(name, fit, known, columns, error, doubt) for name, columns in probes.items()]
+        judged = [_judged(name, fit, known, columns, error, doubt)
+                  for name, columns in probes.items()]
         best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
         chance = min(1.0, tried * best.p_value)
         if chance >= level:
@@ -77,8 +81,9 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     return Left(tuple(found), gains)
 
 
-def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array, doubt: Array) -> tuple[Unexplained, float]:
-    """Return how much a curve explains beside what is known, with the chance of this one alone, and by what it lowers the misfit."""
+def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
+            doubt: Array) -> tuple[Unexplained, float]:
+    """Return what a curve explains beside what is known, its own chance, and the misfit it saves."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
     base = _orthonormal(whitener.whiten(known))
@@ -92,15 +97,18 @@ def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
     share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
     # Columns in their own unit, for the covariance of the dwells may be another one.
     plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
-    chance = _chance(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error), new.T @ whitener.whiten(doubt))
+    chance = _chance(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error),
+                     new.T @ whitener.whiten(doubt))
     return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
 def _chance(uncertainty: Uncertainty, doubt: Array) -> float:
-    """Return how likely the last values are all nothing but doubt, by Fisher's distribution, averaged over what the scatter may be."""
+    """Return how likely the last values are all doubt, by an F test averaged over the scatter."""
     count = len(doubt)
-    values, covariances = uncertainty.offsets[:, -count:], uncertainty.covariances[:, -count:, -count:] + doubt @ doubt.T
-    squares = np.einsum('ki,ki->k', values, np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
+    values, covariances = (uncertainty.offsets[:, -count:],
+                           uncertainty.covariances[:, -count:, -count:] + doubt @ doubt.T)
+    squares = np.einsum('ki,ki->k', values,
+                        np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
     return float(uncertainty.weights @ fisher.sf(squares / count, count, uncertainty.freedom))
 
 
@@ -121,13 +129,18 @@ def _beside(base: Array, columns: Array) -> Array:
 def _probes(dwells: Dwells) -> Mapping[str, Array]:
     """Return the columns of each curve, shape (n, m)."""
     sweeps = len(np.unique(parts_of(dwells)))
-    slow = min(_MOST_COLUMNS, sweeps // 3)  # what differs between sweeps alone has no more evidence than there are sweeps
+    # What differs between sweeps alone has no more evidence than there are sweeps.
+    slow = min(_MOST_COLUMNS, sweeps // 3)
     probes = {RATE: _spline(dwells.rate, min(_MOST_COLUMNS, len(dwells) // _DWELLS_A_COLUMN)),
-              SINGLE_RATES: _by_rate(dwells), ORDER: _spline(np.arange(len(dwells)).astype(float), slow), SWEEP: _by_sweep(dwells)}
-    if dwells.temperature is not None and np.ptp(dwells.temperature) >= SMALLEST_TEMPERATURE_SPREAD:
+              SINGLE_RATES: _by_rate(dwells),
+              ORDER: _spline(np.arange(len(dwells)).astype(float), slow),
+              SWEEP: _by_sweep(dwells)}
+    if (dwells.temperature is not None
+            and np.ptp(dwells.temperature) >= SMALLEST_TEMPERATURE_SPREAD):
         probes[TEMPERATURE] = _spline(dwells.temperature, slow)
         rate, temperature = _scaled(dwells.rate), _scaled(dwells.temperature)
-        probes[PRODUCT] = np.column_stack([rate ** i * temperature ** j for i in (1, 2, 3) for j in range(1, min(slow, 2) + 1)]
+        probes[PRODUCT] = np.column_stack([rate ** i * temperature ** j
+                                           for i in (1, 2, 3) for j in range(1, min(slow, 2) + 1)]
                                           or [np.zeros((len(dwells), 0))])
     return probes
 
@@ -139,7 +152,7 @@ def _scaled(values: Array) -> Array:
 
 
 def _spline(values: Array, most: int) -> Array:
-    """Return the columns of a cubic spline over some values, a parabola or a line where there is no more to tell, shape (n, m)."""
+    """Return a cubic spline over values, or fewer powers where they are few, shape (n, m)."""
     count = min(most, len(np.unique(np.round(_scaled(values), 3))) - 1)
     if count < 4:
         return _scaled(values)[:, None] ** np.arange(1, max(count, 0) + 1)
@@ -149,16 +162,17 @@ def _spline(values: Array, most: int) -> Array:
 
 
 def _by_rate(dwells: Dwells) -> Array:
-    """Return a column for each rate that is repeated in several sweeps, shape (n, rates): what repeats there, and is not smooth."""
+    """Return a column for each rate that several sweeps repeat, shape (n, rates)."""
     _, number = np.unique(np.round(_scaled(dwells.rate), 4), return_inverse=True)
     columns = (number[:, None] == np.arange(number.max() + 1)).astype(float)
     parts = parts_of(dwells)
     repeated = np.array([len(np.unique(parts[column > 0.0])) >= _REPEATED for column in columns.T])
-    return columns[:, repeated] if np.count_nonzero(repeated) * _DWELLS_A_COLUMN <= len(dwells) else columns[:, :0]
+    return (columns[:, repeated] if np.count_nonzero(repeated) * _DWELLS_A_COLUMN <= len(dwells)
+            else columns[:, :0])
 
 
 def _by_sweep(dwells: Dwells) -> Array:
-    """Return a parabola over the rate for each sweep, shape (n, sweeps): what no wander of bias and scale factor makes."""
+    """Return a parabola over rate per sweep, which no bias or scale makes, shape (n, sweeps)."""
     parts = parts_of(dwells)
     if len(dwells) < 8 * (parts.max() + 1):
         return np.zeros((len(dwells), 0))

@@ -53,9 +53,11 @@ def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
     """Return what dwells cannot rule out in place of one effect of a fit."""
     if effect in _ALWAYS:
         return Alternatives((_ALWAYS[effect],), CAUSES[effect.name].separate_by)
-    steady = [(sigmas, other) for other in _others(fit, effect) if (sigmas := sigmas_of(fit, other)) < PARTED]
+    steady = [(sigmas, other) for other in _others(fit, effect)
+              if (sigmas := sigmas_of(fit, other)) < PARTED]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
-    found += [(sigmas, name) for name, columns in _beyond(fit, effect) if (sigmas := _sigmas(fit, effect, columns)) < PARTED]
+    found += [(sigmas, name) for name, columns in _beyond(fit, effect)
+              if (sigmas := _sigmas(fit, effect, columns)) < PARTED]
     if not found:
         return Alternatives()
     said = [_experiment(fit, steady[0][1])] if steady else []
@@ -64,7 +66,7 @@ def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
 
 
 def sigmas_of(fit: Calibration, other: Calibration) -> float:
-    """Return by how many standard deviations a fit is better than another one of the same dwells."""
+    """Return by how many sigma a fit is better than another one of the same dwells."""
     return math.sqrt(max(other.misfit - fit.misfit, 0.0))
 
 
@@ -73,30 +75,34 @@ def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
     if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects:
         return  # the curve would be without its slope
     for other in STEADY.values():
-        swapped = None if other in fit.effects else tried(fit, swapped_effects(fit.effects, effect, other))
+        swapped = (None if other in fit.effects
+                   else tried(fit, swapped_effects(fit.effects, effect, other)))
         if swapped is not None:
             yield swapped
 
 
 def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
-    """Give causes that are no effects of rate and temperature, with the columns that dwells have of them: each is tried alone."""
+    """Give causes that are no effects of rate or temperature, with columns tried one by one."""
     rate, order = fit.dwells.rate, np.arange(len(fit.dwells)) / len(fit.dwells)
     if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
         yield 'rate_ramp', [order]
-        yield 'warm_up', [np.exp(-order / time_constant) for time_constant in (0.05, 0.1, 0.2, 0.5)]
+        yield 'warm_up', [np.exp(-order / time_constant)
+                          for time_constant in (0.05, 0.1, 0.2, 0.5)]
     if effect in (CUBIC_NONLINEARITY, SINE_RESPONSE):
         limits = np.abs(rate).max() * np.linspace(0.5, 0.98, 25)
         assert SATURATION.distortion is not None
-        yield 'saturation', [SATURATION.distortion(rate, order, limit) - rate for limit in limits.tolist()]
+        yield 'saturation', [SATURATION.distortion(rate, order, limit) - rate
+                             for limit in limits.tolist()]
 
 
 def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
-    """Return by how many standard deviations an effect is better than the best of some columns with a free factor."""
+    """Return by how many sigma an effect is better than the best column with a free factor."""
     used = take(fit.dwells, fit.scatter.kept)
     rest = [term for term in fit.terms if term.effect is not effect]
     whitener = Whitener(used, fit.scatter)
     error, known = whitener.whiten(_error(fit, effect)), whitener.whiten(columns_of(used, rest))
-    best = min(_misfit(np.column_stack([known, whitener.whiten(column[fit.scatter.kept])]), error) for column in columns)
+    best = min(_misfit(np.column_stack([known, whitener.whiten(column[fit.scatter.kept])]), error)
+               for column in columns)
     return math.sqrt(max(best - fit.misfit, 0.0))
 
 
@@ -115,14 +121,16 @@ def _misfit(columns: Array, error: Array) -> float:
 # what would part them
 
 def _menu(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
-    """Give sweeps that may be added, the easiest first: in words, their rates, and their temperature."""
+    """Give sweeps that may be added, the easiest first: in words, rates, and temperature."""
     fastest = float(np.abs(fit.dwells.rate).max())
     middle = fit.model.reference_temperature
     slow = fastest * np.array([0.0, 0.02, 0.05, 0.1, 0.2])
-    yield 'two dwells each way at 2, 5, 10 and 20 % of the fastest rate, and rests', np.tile([*slow, *-slow], 2), middle
+    yield ('two dwells each way at 2, 5, 10 and 20 % of the fastest rate, and rests',
+           np.tile([*slow, *-slow], 2), middle)
     for factor in np.arange(1.0, 3.0, 0.05).tolist():
         rate = factor * fastest
-        yield f'two dwells each way at {rate / DEGREE:.0f} deg/s', np.array([rate, rate, -rate, -rate]), middle
+        yield (f'two dwells each way at {rate / DEGREE:.0f} deg/s',
+               np.array([rate, rate, -rate, -rate]), middle)
     yield from _thermal(fit, fastest)
 
 
@@ -145,4 +153,5 @@ def _experiment(fit: Calibration, other: Calibration) -> str:
         if sigmas >= _AIM:
             break
     sigmas, words = max(tried_sweeps)
-    return f'add {words}: that parts them by {sigmas:.1f} standard deviations' + ('' if sigmas >= _AIM else ', and repeat it')
+    return (f'add {words}: that parts them by {sigmas:.1f} standard deviations'
+            + ('' if sigmas >= _AIM else ', and repeat it'))

@@ -1,10 +1,12 @@
 """
 How much a residual speaks for a cause, whatever its noise.
 
-The transformed residual z and the columns X of all causes are summed once, band by band. For any noise the likelihood is then a little
-linear algebra on these sums, so that every cause is judged under every noise of a grid, and a slow cause cannot hide in a random walk that
-was fitted before it was looked for. The evidence of a cause is the likelihood with it over the likelihood without, each averaged over the
-noises, at the most likely value of the cause (a flat prior, scaled so that for a known noise it is half the square of its deviations).
+The transformed residual z and the columns X of all causes are summed once, band by band. For any
+noise the likelihood is then a little linear algebra on these sums, so that every cause is judged
+under every noise of a grid, and a slow cause cannot hide in a random walk that was fitted before
+it. The evidence of a cause is the likelihood with it over the likelihood without, each averaged
+over the noises, at the most likely value of the cause (a flat prior, scaled so that for a known
+noise it is half the square of its deviations).
 
 """
 
@@ -104,8 +106,10 @@ def sums(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Plac
     parts = [slice(begin, end) for begin, end in zip(starts, [*starts[1:], nuisances.shape[1]])]
     own = np.array([nuisances[:, part] @ nuisances[:, part].T for part in parts])
     towards = np.array([nuisances[:, part] @ columns[:, part].T for part in parts])
-    squares = np.add.reduceat(columns ** 2, starts, axis=1) if len(columns) else np.empty((0, len(starts)))
-    blocks = tuple(squares[group[0], :, None, None] if len(group) == 1 else _block(columns[list(group)], parts) for group in groups)
+    squares = (np.add.reduceat(columns ** 2, starts, axis=1) if len(columns)
+               else np.empty((0, len(starts))))
+    blocks = tuple(squares[group[0], :, None, None] if len(group) == 1
+                   else _block(columns[list(group)], parts) for group in groups)
     return Sums(own, towards, blocks, np.array([part.stop - part.start for part in parts], float))
 
 
@@ -121,15 +125,17 @@ def sample(residuals: Array, nuisances: Array, columns: Array, starts: Places) -
     return Sample(own, crossed, np.add.reduceat(residuals ** 2, starts, axis=1))
 
 
-def drawn(noises: Noises, count: Array, probability: Array, draws: int, generator: np.random.Generator) -> Array:
+def drawn(noises: Noises, count: Array, probability: Array, draws: int,
+          generator: np.random.Generator) -> Array:
     """
-    Draw residuals that hold nothing but noise, each by one of the noises, as probable as given: shape (draws, m).
+    Draw residuals of nothing but noise, each by one of the probable noises, shape (draws, m).
 
     In single precision, which is enough for what chance shows, and twice as fast.
 
     """
     which = generator.choice(len(probability), draws, p=probability)
-    deviation = np.repeat((1.0 / np.sqrt(noises.weights)).astype(np.float32), count.astype(int), axis=1)
+    deviation = np.repeat((1.0 / np.sqrt(noises.weights)).astype(np.float32), count.astype(int),
+                          axis=1)
     return generator.standard_normal((draws, deviation.shape[1]), np.float32) * deviation[which]
 
 
@@ -168,7 +174,8 @@ def beside(known: Sums, groups: Sequence[Group], noises: Noises) -> Beside:
         part = whole - np.swapaxes(crossing[:, :, list(group)], 1, 2) @ towards[:, :, list(group)]
         left.append(part)
         tied.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
-    return Beside(own, towards, tuple(left), noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
+    return Beside(own, towards, tuple(left),
+                  noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
                   float(known.count.sum()) - own.shape[1])
 
 
@@ -211,10 +218,11 @@ def judge(given: Sample, noises: Noises, by: Beside) -> Judged:
 
 
 def evidence(judged: Judged, by: Beside, groups: Sequence[Group]) -> Array:
-    """Return the evidence of candidates, shape (d, groups); minus infinity where one is tied to the nuisances."""
+    """Return the evidence of candidates, shape (d, groups): minus infinity if tied to nuisances."""
     if not groups:
         return np.empty((len(judged.squares), 0))
-    return np.column_stack([_evidence(judged, by, place, list(group)) for place, group in enumerate(groups)])
+    return np.column_stack([_evidence(judged, by, place, list(group))
+                            for place, group in enumerate(groups)])
 
 
 def _evidence(judged: Judged, by: Beside, place: int, group: list[int]) -> Array:
@@ -223,7 +231,8 @@ def _evidence(judged: Judged, by: Beside, place: int, group: list[int]) -> Array
     own, pull = by.left[place], judged.pull[:, :, group]
     own = own + 1e-10 * np.eye(len(group)) * _diagonal(own)[:, None]
     if len(group) == 1:
-        return _summary(judged, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]), by.freedom, 1)
+        return _summary(judged, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]),
+                        by.freedom, 1)
     gained = ((pull[:, :, None, :] @ np.linalg.inv(own))[:, :, 0] * pull).sum(axis=-1)
     return _summary(judged, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
 
@@ -241,4 +250,5 @@ def log_sum(logarithms: Array) -> Array:
     """Return the logarithm of the sum of exponentials along the last axis."""
     top = logarithms.max(axis=-1)
     with np.errstate(invalid='ignore'):
-        return np.where(np.isfinite(top), top + np.log(np.exp(logarithms - top[..., None]).sum(axis=-1)), top)
+        return np.where(np.isfinite(top),
+                        top + np.log(np.exp(logarithms - top[..., None]).sum(axis=-1)), top)

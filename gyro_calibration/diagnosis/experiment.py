@@ -1,9 +1,11 @@
 """
 The experiment that parts causes which the data at hand cannot part.
 
-Each experiment of the menu is simulated with each cause in turn, as it was fitted, in the noise that was fitted. What another cause leaves
-of that, with all its values and shapes free, beside the bias of the power-on, the scale and the causes that are named besides, is how far
-apart the two are, in sigmas. The log at hand is counted in: what it says of a value binds the value in the experiment.
+Each experiment of the menu is simulated with each cause in turn, as it was fitted, in the noise
+that was fitted. Another cause is fitted to that, with all its values and shapes free, beside the
+bias of the power-on, the scale and the other named causes. What it leaves is how far apart the two
+are, in sigmas. The log at hand is counted in: what it says of a value binds the value in the
+experiment.
 
 """
 
@@ -24,13 +26,13 @@ from gyro_calibration.diagnosis.spectrum import Shape, angles
 from gyro_calibration.diagnosis.units import number
 from gyro_calibration.log import Array
 
-#: Sigmas that part two causes for sure, though the values that were fitted may be off; more are not needed.
+#: Sigmas that part two causes even if the fitted values are somewhat off; more are not needed.
 ENOUGH = 8.0
 #: With fewer sigmas, in expectation, an experiment is not worth its time.
 LEAST = 4.0
 #: A shape is changed by this part of itself to see what its column changes by.
 _SMALL = 1e-4
-#: What is found against a model only: what looks like it has no value of its own then, but the one that explains it.
+#: Causes found against a model only: a cause that looks like one takes the value that explains it.
 _AGAINST_A_MODEL = ('bias', 'scale_factor_error')
 
 #: (true one, another) of the members of a set -> how far they are apart, sigmas.
@@ -88,11 +90,12 @@ class _Question:
 
     def again(self) -> _Question:
         """Return the same for another log, in which nothing happens that happens once."""
-        return replace(self, others=tuple(map(_gone, self.others)), members=tuple(map(_gone, self.members)))
+        return replace(self, others=tuple(map(_gone, self.others)),
+                       members=tuple(map(_gone, self.members)))
 
     def deviation(self, each: Replay) -> Array:
         """Return the standard deviation of the coefficients of a log."""
-        # The rounding of a heading is one reading a point, whose rate is the smaller, the longer the point.
+        # The rounding of a heading is one reading a point: its rate falls with the point's length.
         noise = replace(self.noise, reference=self.noise.reference * self.step / each.step)
         return np.sqrt(self.level * noise.variance(angles(each.points), each.step) / each.step)
 
@@ -105,31 +108,35 @@ def _gone(known: Named) -> Named:
 def separating(whole: Field, named: Sequence[Named], known: Named, rivals: Sequence[Named],
                generator: np.random.Generator) -> Experiment:
     """
-    Return the experiment that parts a named cause from its rivals: the shortest that is enough, or the best where none is.
+    Return the shortest experiment that parts a named cause from its rivals, or else the best.
 
     Parameters
     ----------
     whole : the logs
     named : all causes that are named, with values
     known : one of them
-    rivals : causes that may stand in its place, with the shapes that fit best; values are fitted where they have none
+    rivals : causes that may stand in its place, with the shapes that fit best; values are fitted
+        where they have none
     generator : source of what fills lost samples
 
     """
     question = _question(whole, named, known, rivals)
     have = _root(question, whole.replays)
     plans = menu(reach(whole.replays), whole.replays)
-    apart = [_apart(question, np.concatenate([have, _root(question.again(), [plan.replay(generator)])])) for plan in plans]
+    apart = [_apart(question, np.concatenate([
+        have, _root(question.again(), [plan.replay(generator)])])) for plan in plans]
     best = min(range(len(plans)), key=lambda place: _rank(plans[place], apart[place]))
     return _told(question, plans[best], apart[best], _apart(question, have))
 
 
-def _question(whole: Field, named: Sequence[Named], known: Named, rivals: Sequence[Named]) -> _Question:
+def _question(whole: Field, named: Sequence[Named], known: Named,
+              rivals: Sequence[Named]) -> _Question:
     others = tuple(each for each in named if each is not known)
     members = tuple(_valued(whole, others, each, known) for each in (known, *rivals))
     done = work(whole, [*others, members[0]])
     best = int(done.judged.likelihood[0].argmax())
-    return _Question(others, members, done.field.shapes[best], float(done.judged.squares[0, best]) / done.by.freedom,
+    return _Question(others, members, done.field.shapes[best],
+                     float(done.judged.squares[0, best]) / done.by.freedom,
                      min(each.step for each in whole.replays))
 
 
@@ -146,13 +153,14 @@ def _valued(whole: Field, others: tuple[Named, ...], rival: Named, known: Named)
     done = work(whole, [*others, rival])
     found = dict(zip(done.owner, done.estimates[0]))
     width = len(candidate.columns(whole.replays[0]))
-    return replace(rival, values=tuple(float(found.get((len(others), place), 0.0)) for place in range(width)))
+    return replace(rival, values=tuple(float(found.get((len(others), place), 0.0))
+                                       for place in range(width)))
 
 
 # what is left of one cause by another
 
 def _root(question: _Question, replays: Sequence[Replay]) -> Array:
-    """Return a triangle whose columns have the lengths and angles of the whitened columns, shape (q, q): see `_apart` for their order."""
+    """Return a triangle with the lengths and angles of the whitened columns, shape (q, q)."""
     deviation = np.concatenate([question.deviation(each) for each in replays])
     through = [seen(each, question.others) for each in replays]
     scale = np.concatenate([each.coefficients(each.channels.rate) for each in through])[None]
@@ -169,16 +177,19 @@ def _total(known: Named, replays: Sequence[Replay], through: Sequence[Replay]) -
 
 
 def _columns(known: Named, replays: Sequence[Replay], through: Sequence[Replay]) -> Array:
-    return columns_of(known.candidate, replays if is_of_the_rate(known.candidate.cause) else through)
+    return columns_of(known.candidate,
+                      replays if is_of_the_rate(known.candidate.cause) else through)
 
 
 def _freedom(known: Named, replays: Sequence[Replay], through: Sequence[Replay]) -> Array:
-    """Return what a cause can be changed by: its columns, and what they change by with its shapes."""
+    """Return what a cause can be changed by: its columns, and their changes with its shapes."""
     own, changes = _columns(known, replays, through), []
     for place in free_shapes(known.candidate):
         step = _SMALL * abs(known.candidate.shapes[place]) or 1e-6
-        moved = replace(known, candidate=with_shape(known.candidate, place, known.candidate.shapes[place] + step))
-        changes.append((_total(moved, replays, through) - _total(known, replays, through))[None] / step)
+        moved = replace(known, candidate=with_shape(known.candidate, place,
+                                                    known.candidate.shapes[place] + step))
+        changes.append((_total(moved, replays, through)
+                        - _total(known, replays, through))[None] / step)
     return np.concatenate([own if known.candidate.amplitude is None else own[:0], *changes])
 
 
@@ -188,7 +199,8 @@ def _apart(question: _Question, root: Array) -> Pairs:
     common, owned = _places(question)
     found = {}
     for true, other in question.pairs:
-        bound = any(question.members[place].candidate.cause in _AGAINST_A_MODEL for place in (true, other))
+        bound = any(question.members[place].candidate.cause in _AGAINST_A_MODEL
+                    for place in (true, other))
         free = root[:, [count, *common, *([] if bound else owned[other])]]
         found[true, other] = _left(root[:, true] - root[:, other], free)
     return found
@@ -196,7 +208,8 @@ def _apart(question: _Question, root: Array) -> Pairs:
 
 def _places(question: _Question) -> tuple[list[int], list[list[int]]]:
     """Return the columns of the root that belong to the other causes, and those of each member."""
-    widths = [len(free_shapes(each.candidate)) + (len(each.values) if each.candidate.amplitude is None else 0)
+    widths = [len(free_shapes(each.candidate))
+              + (len(each.values) if each.candidate.amplitude is None else 0)
               for each in (*question.others, *question.members)]
     ends = len(question.members) + 1 + np.cumsum(widths)
     places = [list(range(end - width, end)) for end, width in zip(ends.tolist(), widths)]
@@ -217,8 +230,9 @@ def _rank(plan: Conditions, apart: Pairs) -> tuple[float, ...]:
     """
     Return what is smallest for the best plan.
 
-    First come those that part all members, then those that part the named one from all others; of both, those within what was seen, and
-    of these the shortest, and the first of the menu of those that are as short. Where none is enough, it counts what is parted.
+    First come those that part all members, then those that part the named one from all others; of
+    both, those within what was seen, and of these the shortest, and the first of the menu of those
+    that are as short. Where none is enough, the number of parted members counts.
 
     """
     reached = sum(min(value, ENOUGH) for value in apart.values())
@@ -234,14 +248,17 @@ def _told(question: _Question, plan: Conditions, apart: Pairs, now: Pairs) -> Ex
     each_way = [min(apart[0, place], apart[place, 0]) for place in range(1, len(names))]
     parted = [place for place, value in enumerate(each_way, 1) if value >= LEAST]
     if not parted:
-        return Experiment('', next((CAUSES[name].separate_by for name in names if name in CAUSES and CAUSES[name].separate_by), ''))
+        return Experiment('', next((CAUSES[name].separate_by for name in names
+                                    if name in CAUSES and CAUSES[name].separate_by), ''))
     worst = min(parted, key=lambda place: each_way[place - 1])
     before, after = min(now[0, worst], now[worst, 0]), each_way[worst - 1]
     stay = [name for place, name in enumerate(names[1:], 1) if place not in parted]
     rest = f'; {_listed(stay)} would stay possible' if stay else ''
     by = 'more than 100' if after > 100.0 else number(after, 2)
-    return Experiment(plan.name, f'{plan.to_do}: would part {names[0]} from {_listed([names[place] for place in parted])} by {by} sigma '
-                      f'(now {before:.1f}){rest}', after, before, plan.minutes, plan)
+    return Experiment(
+        plan.name, f'{plan.to_do}: would part {names[0]} from '
+        f'{_listed([names[place] for place in parted])} by {by} sigma (now {before:.1f}){rest}',
+        after, before, plan.minutes, plan)
 
 
 def _listed(names: Sequence[str]) -> str:

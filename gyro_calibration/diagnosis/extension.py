@@ -1,4 +1,4 @@
-"""The model with what was found: named effects, limit and steps, values, covariance, noise, and where it comes from."""
+"""The model with what was found: effects, limit, steps, values, covariance, noise and origin."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from gyro_calibration.diagnosis.figures import NAMES
 from gyro_calibration.diagnosis.finding import Finding
 from gyro_calibration.diagnosis.hygiene import Hygiene
 from gyro_calibration.diagnosis.outcome import Outcome
-from gyro_calibration.effects import BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CATALOGUE, SCALE_FACTOR_ERROR, Effect
+from gyro_calibration.effects import (BIAS, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC,
+                                      CATALOGUE, SCALE_FACTOR_ERROR, Effect)
 from gyro_calibration.log import Array
 from gyro_calibration.model import GyroModel, Term, same_effects
 from gyro_calibration.noise import Noise
@@ -21,12 +22,13 @@ from gyro_calibration.self_calibration import Limits
 #: What must be known of a scale factor error for it to be believed.
 LIMITS = Limits()
 #: Effects that count from somewhere -> what comes of it beside them to count from elsewhere.
-_BESIDE: Mapping[str, Effect] = {'bias_temperature': BIAS, 'supply_sensitivity': BIAS, 'scale_factor_temperature': SCALE_FACTOR_ERROR,
-                                 'bias_temperature_quadratic': BIAS_TEMPERATURE}
+_BESIDE: Mapping[str, Effect] = {
+    'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
+    'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
 
 
-def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hygiene], findings: Sequence[Finding], noise: Noise,
-                  bias_deviation: float) -> GyroModel:
+def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hygiene],
+                  findings: Sequence[Finding], noise: Noise, bias_deviation: float) -> GyroModel:
     """
     Return the extended model: the one that was given, where no finding is of the gyro.
 
@@ -40,68 +42,84 @@ def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hyg
     bias_deviation : standard deviation of the bias, rad/s
 
     """
-    given, names = model or GyroModel(), {name for each in findings for name in (each.effect, *each.ambiguous_with)}
-    fitted = model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name} or any(each.candidate.cause in CATALOGUE for each in found.named)
-    new = _with_exact(extended(given, found, bias_deviation) if fitted else given, _of_the_output(hygiene))
-    figures = replace(given.noise, **{each.effect: getattr(noise, each.effect) for each in findings if each.effect in NAMES})
+    given, names = (model or GyroModel(),
+                    {name for each in findings for name in (each.effect, *each.ambiguous_with)})
+    fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
+              or any(each.candidate.cause in CATALOGUE for each in found.named))
+    new = _with_exact(extended(given, found, bias_deviation) if fitted else given,
+                      _of_the_output(hygiene))
+    figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
+                                      for each in findings if each.effect in NAMES})
     if model is not None and same_effects(new, model) and figures == model.noise:
         return model
-    return noted(replace(new, noise=figures if given.noise.angle_random_walk else noise), given, hygiene, findings)
+    return noted(replace(new, noise=figures if given.noise.angle_random_walk else noise), given,
+                 hygiene, findings)
 
 
 def extended(model: GyroModel, found: Outcome, bias_deviation: float) -> GyroModel:
-    """Return a model with all effects of the gyro that were named, and with bias and scale factor error put right."""
+    """Return a model with all named effects of the gyro, bias and scale factor put right."""
     new, spread = _values(found, bias_deviation)
     moves = _moves(found) and not doubts_scale(found)
-    outputs = [each.channels.output[each.kept] + each.added[each.kept] for each in found.replays if moves]
-    temperatures = [each.channels.temperature[each.kept] for each in found.replays if 'temperature' in each.has]
+    outputs = [each.channels.output[each.kept] + each.added[each.kept]
+               for each in found.replays if moves]
+    temperatures = [each.channels.temperature[each.kept]
+                    for each in found.replays if 'temperature' in each.has]
     return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
                    rate_range=wider(model.rate_range, outputs, bool(model.terms)),
-                   temperature_range=wider(model.temperature_range, temperatures, bool(model.terms)))
+                   temperature_range=wider(model.temperature_range, temperatures,
+                                           bool(model.terms)))
 
 
-def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Array, temperatures: Array | None) -> GyroModel:
-    """Return a model with more terms, the covariance of whose values is `spread`, for the outputs and temperatures of a log, too."""
+def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Array,
+               temperatures: Array | None) -> GyroModel:
+    """Return a model with more terms of covariance `spread`, and ranges that hold a log, too."""
     known = [] if temperatures is None else [temperatures]
     return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
                    rate_range=wider(model.rate_range, [outputs], bool(model.terms)),
                    temperature_range=wider(model.temperature_range, known, bool(model.terms)))
 
 
-def noted(new: GyroModel, given: GyroModel, hygiene: Sequence[Hygiene], findings: Sequence[Finding] = ()) -> GyroModel:
-    """Return a new model whose origin says what it may be instead, for which output it is, and what the one that was given came from."""
+def noted(new: GyroModel, given: GyroModel, hygiene: Sequence[Hygiene],
+          findings: Sequence[Finding] = ()) -> GyroModel:
+    """Return a new model whose origin names its ambiguities, output factors and predecessor."""
     used = {term.effect.name for term in new.terms if term not in given.terms}
-    notes = notes_of([each for each in findings if each.effect in used], [clean.factor for clean in hygiene])
+    notes = notes_of([each for each in findings if each.effect in used],
+                     [clean.factor for clean in hygiene])
     return replace(new, origin={**notes, **origins_before(given)})
 
 
 def notes_of(findings: Sequence[Finding], factors: Sequence[float]) -> dict[str, object]:
-    """Return what the file of a model says of its findings that may be others, and of what outputs were multiplied by."""
-    sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead' for each in findings if each.ambiguous_with]
+    """Return what a model's file says of ambiguous findings and of factors of the output."""
+    sets = [f'{each.effect} is used; it may be {" or ".join(each.ambiguous_with)} instead'
+            for each in findings if each.ambiguous_with]
     mended = list(factors) if any(factor != 1.0 for factor in factors) else []
-    return {name: note for name, note in (('ambiguous', sets), ('output_multiplied_by', mended)) if note}
+    return {name: note for name, note in (('ambiguous', sets), ('output_multiplied_by', mended))
+            if note}
 
 
 def origins_before(model: GyroModel) -> dict[str, object]:
-    """Return the origins of a model for that of its successor: side by side, for a reader of files allows few levels."""
+    """Return the origins of a model side by side, for its file may have only few levels."""
     earlier = model.origin.get('before', [])
     own = {name: value for name, value in model.origin.items() if name != 'before'}
     return {'before': [own, *(earlier if isinstance(earlier, list) else [earlier])]} if own else {}
 
 
 def calibrated(model: GyroModel) -> GyroModel:
-    """Return the same gyro without a self-calibration: what that found is in its bias and scale factor error, to the first order."""
+    """Return the same gyro with a self-calibration put into its terms, to the first order."""
     known = model.self_calibration
     if known is None:
         return model
     slope = 1.0 + sum(term.values[0] for term in model.terms if term.effect is SCALE_FACTOR_ERROR)
-    new = [Term(SCALE_FACTOR_ERROR, (slope * known.scale_factor_error,)), Term(BIAS, (slope * known.bias,))]
-    covariance = None if known.covariance is None else _covariance(model, new, slope ** 2 * np.array(known.covariance))
-    return replace(model, terms=_all(model.terms, new), covariance=covariance, self_calibration=None)
+    new = [Term(SCALE_FACTOR_ERROR, (slope * known.scale_factor_error,)),
+           Term(BIAS, (slope * known.bias,))]
+    covariance = (None if known.covariance is None
+                  else _covariance(model, new, slope ** 2 * np.array(known.covariance)))
+    return replace(model, terms=_all(model.terms, new), covariance=covariance,
+                   self_calibration=None)
 
 
 def left_out(model: GyroModel, found: Outcome) -> tuple[Named, ...]:
-    """Return the causes of the gyro that its model cannot hold: a file names each effect once, and not every two of them make one."""
+    """Return the gyro's causes that its model cannot hold, as a file names each effect once."""
     terms, out = model.terms, []
     for place, known in enumerate(found.named):
         if known.candidate.cause in CATALOGUE:
@@ -115,11 +133,13 @@ def doubts_scale(found: Outcome) -> bool:
     """
     Tell whether a scale factor error was found that is not to be believed.
 
-    Where the gyro hardly turns, the noise of the reference passes for motion that the gyro does not see: an error of up to -100 %.
+    Where the gyro hardly turns, the noise of the reference passes for motion that the gyro does
+    not see: an error of up to -100 %.
 
     """
     scale = found.scale_factor_error
-    return _moves(found) and (scale.value < -LIMITS.scale_factor_error or scale.deviation > LIMITS.scale_standard_deviation)
+    return _moves(found) and (scale.value < -LIMITS.scale_factor_error
+                              or scale.deviation > LIMITS.scale_standard_deviation)
 
 
 def _moves(found: Outcome) -> bool:
@@ -129,7 +149,7 @@ def _moves(found: Outcome) -> bool:
 # values
 
 def _of_the_output(hygiene: Sequence[Hygiene]) -> list[Term]:
-    """Return limit and steps of the output, where they are findings: of several logs, those of the first that shows them."""
+    """Return limit and steps of the output, if they are findings, of the first log with them."""
     found: dict[str, Term] = {}
     for clean in hygiene:
         sizes = {'saturation': clean.limit, 'quantization': clean.step}
@@ -141,11 +161,12 @@ def _of_the_output(hygiene: Sequence[Hygiene]) -> list[Term]:
 def _with_exact(model: GyroModel, terms: Sequence[Term]) -> GyroModel:
     """Return a model with effects whose values are exact."""
     spread = np.zeros((len(terms), len(terms)))
-    return replace(model, terms=_all(model.terms, terms), covariance=_covariance(model, terms, spread)) if terms else model
+    return (replace(model, terms=_all(model.terms, terms),
+                    covariance=_covariance(model, terms, spread)) if terms else model)
 
 
 def _values(found: Outcome, bias_deviation: float) -> tuple[list[Term], Array]:
-    """Return what was found as terms, and the covariance of all their values in a row: 0 of those that were not fitted."""
+    """Return what was found as terms, and the covariance of all values in a row, 0 if exact."""
     doubtful = doubts_scale(found)
     scale = 0.0 if doubtful else found.scale_factor_error.value
     terms = [Term(BIAS, (_bias(found, scale),)), Term(SCALE_FACTOR_ERROR, (scale,))]
@@ -154,10 +175,12 @@ def _values(found: Outcome, bias_deviation: float) -> tuple[list[Term], Array]:
         if known.candidate.cause in CATALOGUE:
             terms.append(_term(found, place))
             shapes = len(known.candidate.shapes)
-            ranks += [found.place(place, -1 - number if number < shapes else number - shapes) for number in range(len(terms[-1].values))]
+            ranks += [found.place(place, -1 - number if number < shapes else number - shapes)
+                      for number in range(len(terms[-1].values))]
     fitted = {number: rank for number, rank in enumerate(ranks) if rank is not None}
     spread = np.zeros((len(ranks), len(ranks)))
-    spread[np.ix_(list(fitted), list(fitted))] = found.covariance[np.ix_(list(fitted.values()), list(fitted.values()))]
+    spread[np.ix_(list(fitted), list(fitted))] = found.covariance[
+        np.ix_(list(fitted.values()), list(fitted.values()))]
     spread[0, 0] = bias_deviation ** 2
     return terms, spread
 
@@ -172,7 +195,8 @@ def _term(found: Outcome, place: int) -> Term:
     """Return a cause of the gyro as a term."""
     candidate = found.named[place].candidate
     effect = CATALOGUE[candidate.cause]
-    coefficients = [one.value for one in found.coefficients(place)] or [candidate.amplitude or 0.0][:len(effect.coefficients)]
+    coefficients = ([one.value for one in found.coefficients(place)]
+                    or [candidate.amplitude or 0.0][:len(effect.coefficients)])
     return Term(effect, (*candidate.shapes, *coefficients))
 
 
@@ -185,21 +209,23 @@ def _all(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
-    """Return terms with one more, which becomes one with that of its effect; None where two of an effect do not make one."""
+    """Return terms with one more, merged with that of its effect; None if they do not merge."""
     old = next((term for term in terms if term.effect.name == new.effect.name), None)
     if old is None:
         return (*terms, new)
     alike, *beside = _counted_like(old, new)
     one = _one(old, alike)
-    return None if one is None else _all(tuple(one if term is old else term for term in terms), beside)
+    return None if one is None else _all(
+        tuple(one if term is old else term for term in terms), beside)
 
 
 def _counted_like(old: Term, new: Term) -> list[Term]:
-    """Return a term that counts from where another one of its effect does, and the terms that come of it: together they do the same."""
+    """Return a term that counts from another's reference, and the terms that make up for it."""
     if new.effect.name not in _BESIDE or new.values[0] == old.values[0]:
         return [new]
     begin, value = old.values[0], new.values[1]
-    way, other, alike = begin - new.values[0], _BESIDE[new.effect.name], Term(new.effect, (begin, value))
+    way, other, alike = (begin - new.values[0], _BESIDE[new.effect.name],
+                         Term(new.effect, (begin, value)))
     if new.effect is BIAS_TEMPERATURE_QUADRATIC:
         return [alike, Term(other, (begin, 2.0 * way * value)), Term(BIAS, (way ** 2 * value,))]
     return [alike, Term(other, (way * value,))]
@@ -209,26 +235,29 @@ def _one(old: Term, new: Term) -> Term | None:
     """Return the term that does what two of one effect do; None where there is none."""
     effect, shapes = new.effect, len(new.effect.shapes)
     if effect.stage == 'output':
-        return new  # logs are compared before limits and steps, so that those of a model are not in the simulation
+        # Logs are compared before limits and steps, so that those of a model are not simulated.
+        return new
     # Delays add up, and so do the paces of clocks, as they hardly differ from 1.
     first = 0 if effect.moved is not None else shapes
     if new.values[:first] != old.values[:first] or (first and not effect.coefficients) or any(
             each.default is not None for each in effect.coefficients):
         return None
-    one = Term(effect, (*new.values[:first], *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
+    one = Term(effect, (*new.values[:first],
+                        *(a + b for a, b in zip(old.values[first:], new.values[first:]))))
     return one if _is_within(one) else None
 
 
 def _is_within(term: Term) -> bool:
     """Tell whether the values of a term are within the bounds that a file has for them."""
-    return all(parameter.bounds[0] <= value <= parameter.bounds[1] for parameter, value in zip(term.effect.parameters, term.values))
+    return all(parameter.bounds[0] <= value <= parameter.bounds[1]
+               for parameter, value in zip(term.effect.parameters, term.values))
 
 
 # how well known
 
 def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array | None:
     """
-    Return the covariance of all fitted values of a model with new terms; None where that of its own is not known.
+    Return the covariance of all fitted values of a model with new terms; None if its own is none.
 
     Parameters
     ----------
@@ -242,7 +271,8 @@ def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array |
     values, moved = _fitted(_all(model.terms, new)), np.sqrt(np.diag(spread))
     changes = np.zeros((len(values), len(spread)))
     for place in np.flatnonzero(moved).tolist():
-        changes[:, place] = (_fitted(_all(model.terms, list(_moved(new, place, moved[place])))) - values) / moved[place]
+        changes[:, place] = (_fitted(_all(
+            model.terms, list(_moved(new, place, moved[place])))) - values) / moved[place]
     whole = changes @ spread @ changes.T
     if model.covariance is not None:
         whole[:len(model.covariance), :len(model.covariance)] += model.covariance
@@ -257,12 +287,13 @@ def _moved(terms: Sequence[Term], place: int, change: float) -> Iterator[Term]:
     """Give terms of which one value, by its place in a row, is another one."""
     for term in terms:
         here = 0 <= place < len(term.values)
-        yield replace(term, values=(*term.values[:place], term.values[place] + change, *term.values[place + 1:])) if here else term
+        yield replace(term, values=(*term.values[:place], term.values[place] + change,
+                                    *term.values[place + 1:])) if here else term
         place -= len(term.values)
 
 
 def wider(known: tuple[float, float], parts: Sequence[Array], was: bool) -> tuple[float, float]:
-    """Return a range that holds what the logs show, too: as it was where they show nothing, and of a new model theirs alone."""
+    """Return a range that holds the logs, too: the old one without logs, theirs if it is new."""
     if not parts:
         return known
     low, high = min(float(part.min()) for part in parts), max(float(part.max()) for part in parts)
