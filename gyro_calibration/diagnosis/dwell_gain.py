@@ -106,5 +106,4 @@ def _deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> f
     part = take(dwells, chosen)
     shared = summed(sign[chosen, None] * scatter.shared(part),
                     np.unique(part.sweep, return_inverse=True)[1])
-
     return math.sqrt(float(np.sum(scatter.deviation(part) ** 2) + np.sum(shared ** 2))) / len(part)

@@ -83,7 +83,7 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
 
 def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
             doubt: Array) -> tuple[Unexplained, float]:
-    """Return what a curve explains beside what is known, its own chance, and the misfit it saves."""
+    """Return what a curve explains beside what is known, its chance, and the misfit it saves."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
     base = _orthonormal(whitener.whiten(known))

@@ -218,7 +218,7 @@ def judge(given: Sample, noises: Noises, by: Beside) -> Judged:
 
 
 def evidence(judged: Judged, by: Beside, groups: Sequence[Group]) -> Array:
-    """Return the evidence of candidates, shape (d, groups): minus infinity if tied to nuisances."""
+    """Return the evidence of candidates, shape (d, groups), -inf where tied to nuisances."""
     if not groups:
         return np.empty((len(judged.squares), 0))
     return np.column_stack([_evidence(judged, by, place, list(group))
