@@ -57,7 +57,7 @@ def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tupl
 
 
 def _detectable(search: Search, known: Named, deviation: float) -> float | None:
-    """Return the smallest size that is found with the power asked for; None without a deviation."""
+    """Return the smallest size found with the power asked for; None without a deviation."""
     needed = search.chance.threshold(known.candidate.cause, search.rate) + price_of_freedom(known)
     # Half the square of a size in standard deviations is its evidence.
     return (float(np.sqrt(2.0 * max(needed, 0.0)) + norm.isf(1.0 - _POWER)) * deviation

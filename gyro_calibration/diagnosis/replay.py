@@ -1,4 +1,4 @@
-"""A log and its simulation side by side: the residual, and what the causes look at, sample by sample and on an even grid."""
+"""A log and its simulation: the residual and what the causes look at, by sample and on a grid."""
 
 from __future__ import annotations
 
@@ -20,19 +20,24 @@ from gyro_calibration.log import Array, DataRefused, Log, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.stamps import number_stamps
 
-#: More points of the grid than this are averaged in neighbours, for a million samples are more than are needed to part causes.
+#: More points of the grid than this are averaged in neighbours: causes are told apart with fewer.
 MOST_POINTS = 50_000
-#: Towards the highest frequencies the power of jumps falls to 0.18 between the second and the last quarter, that of noise to no less; what
-#: falls below this was smoothed before it was recorded. It is averaged over intervals of at most so many s.
+#: Towards the highest frequencies the power of jumps falls to 0.18 between the second and the last
+#: quarter, that of noise to no less; what falls below this was smoothed before it was recorded. It
+#: is averaged over intervals of at most so many s.
 SMOOTHED, _LONGEST = 0.05, 0.03
-#: Frequencies over which the power of a rate is averaged, and by what rounding is taken to be stronger than on average.
+#: Frequencies over which the power of a rate is averaged, and by what factor rounding is taken to
+#: be stronger than on average.
 _NEIGHBOURS, _OVER = 101, 1.5
-#: A held reference that keeps its value for more than so many of its intervals stood still; a change of fewer steps may have been slow.
+#: A held reference that keeps its value for more than so many of its intervals stood still; a
+#: change of fewer steps may have been slow.
 _STOOD = 1.5
-#: Samples beside a gap of a heading whose rate is not compared, where the gap has as many: a spline errs by 0.13, 0.036 and 0.01 of what
-#: its slope changes by there. Beside a shorter gap it changes by little.
+#: Samples beside a gap of a heading whose rate is not compared, where the gap has as many: a
+#: spline errs by 0.13, 0.036 and 0.01 of what its slope changes by there. Beside a shorter gap it
+#: changes by little.
 _BESIDE = 4
-#: Points of the grid for each sample, and points of a log that is too short to matter: most of a log must not be made up.
+#: Points of the grid for each sample, and points of a log that is too short to matter: most of a
+#: log must not be made up.
 _EACH, _SHORT = 5, 10_000
 
 
@@ -43,16 +48,18 @@ class Replay:
 
     Attributes
     ----------
-    channels : what the effects look at; the rate is that of the reference, the time counts from the first sample
-    reference : the rate that the output is compared with, rad/s: as measured, where `channels.rate` is smooth
+    channels : what the effects look at; the rate is that of the reference, the time counts from
+        the first sample
+    reference : the rate that the output is compared with, rad/s: as measured, where
+        `channels.rate` is smooth
     kept : samples that are trusted
     place : number of each kept sample on the even grid
     interval : of the grid, s
     every : so many points of the grid are averaged into one
-    filling : white noise of variance 1 for the points of the grid that are lost, shape (place[-1] + 1,)
+    filling : white noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
     rounded : step of the heading that the reference is the derivative of, rad; 0 where it has none
     has : names of the channels that the log has
-    added : what the simulation adds to the rate, rad/s, shape (n,); it is taken out of `channels.output`
+    added : what the simulation adds to the rate, rad/s, shape (n,); `channels.output` is without
     coarse : variance that the rounding of the output adds to a sample, (rad/s)²
     levels : of its white noise, where a filter took from it: see `spectrum.levels`
 
@@ -78,7 +85,7 @@ class Replay:
 
     @property
     def points(self) -> int:
-        """Return how many points are searched: a number that has a fast transform, so that a few at the end may be left out."""
+        """Return how many points are searched: one with a fast transform, a few left out."""
         return _fast((int(self.place[-1]) + 1) // self.every)
 
     @property
@@ -93,9 +100,10 @@ class Replay:
 
     def on_grid(self, values: Array, filling: float = 0.0) -> Array:
         """
-        Return samples, shape (n,), on the even grid: lost ones are bridged, and neighbours averaged where there are many.
+        Return samples, shape (n,), on the even grid: lost ones bridged, many neighbours averaged.
 
-        A bridge has no noise of its own. Where that would matter, white noise of a standard deviation fills it.
+        A bridge has no noise of its own. Where that would matter, white noise of a standard
+        deviation fills it.
 
         """
         whole = _bridged(values[self.kept], self.place)
@@ -107,7 +115,7 @@ class Replay:
         return whole.reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
 
     def noisy(self, values: Array) -> Array:
-        """Return the cosine transform of a residual, whose bridges get the white noise that the rest has."""
+        """Return the cosine transform of a residual; bridges get the white noise of the rest."""
         return transform(self.on_grid(values, white_deviation(values[self.kept])))
 
     def coefficients(self, values: Array) -> Array:
@@ -119,8 +127,9 @@ class Replay:
         return level(angles(self.points), self.levels)
 
     def filtered(self, more: Array) -> Replay:
-        """Return it with its levels multiplied by more of them; what fills the points that are lost is filtered, too."""
-        whole = transform(self.filling) * np.sqrt(level(angles(len(self.filling)) * self.every, more))
+        """Return it with its levels multiplied by more; the filling is filtered, too."""
+        whole = transform(self.filling) * np.sqrt(
+            level(angles(len(self.filling)) * self.every, more))
         filling = inverse(whole)
         return replace(self, levels=self.levels * more, filling=filling / white_deviation(filling))
 
@@ -130,12 +139,13 @@ class Replay:
 
 
 def white_deviation(residual: Array) -> float:
-    """Return the standard deviation of the white noise of a residual, by the median of its second differences."""
-    return 1.4826 * float(np.median(np.abs(np.diff(residual, 2)))) / math.sqrt(6.0) if len(residual) > 2 else 0.0
+    """Return the standard deviation of a residual's white noise, by median second differences."""
+    return (1.4826 * float(np.median(np.abs(np.diff(residual, 2)))) / math.sqrt(6.0)
+            if len(residual) > 2 else 0.0)
 
 
-def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None, step: float = 0.0,
-           codes: float = 0.0, model: GyroModel | None = None) -> Replay:
+def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None,
+           step: float = 0.0, codes: float = 0.0, model: GyroModel | None = None) -> Replay:
     """
     Lay a log out.
 
@@ -159,13 +169,14 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     place, interval = numbered(time, kept)
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
-    channels = replace(channels_of(_surrounded(shown, model)), rate=smooth, time=time, heading=_heading(time, shown, smooth))
+    channels = replace(channels_of(_surrounded(shown, model)), rate=smooth, time=time,
+                       heading=_heading(time, shown, smooth))
     rounded = step if shown.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
     foreseen = _rounding(log.output, smooth, kept, codes) if codes else np.zeros(len(time))
     coarse = max(codes ** 2 / 12.0 - float(np.var(foreseen[kept])), 0.0)
-    plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place, interval, every, filling, rounded, _known(log),
-                   np.zeros(len(time)), coarse)
+    plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place,
+                   interval, every, filling, rounded, _known(log), np.zeros(len(time)), coarse)
     plain = replace(plain, every=every * _smoothed(plain))
     return plain if model is None else _simulated(plain, model)
 
@@ -173,20 +184,22 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
 def _refuse_few(kept: Mask) -> None:
     count = int(np.count_nonzero(kept))
     if count < FEWEST:
-        raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are needed; the others are lost, stuck, wild or '
-                          'near a limit: turn more slowly, or mend the line, and record again')
+        raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are '
+                          'needed; the others are lost, stuck, wild or near a limit: turn more '
+                          'slowly, or mend the line, and record again')
 
 
 def _refuse_gaps(time: Array, place: NDArray[np.intp]) -> None:
-    """Refuse a log of which most is missing: what fills gaps is made up, and after a clock jumped it takes more memory than there is."""
+    """Refuse a log of which most is missing: gaps are made up, and a clock's jump fills memory."""
     points = int(place[-1]) + 1
     if points <= max(_EACH * len(place), _SHORT):
         return
     gaps = np.diff(time)
     longest = int(np.argmax(gaps))
-    raise DataRefused(f'{len(place)} samples can be used where the log has room for {points}, at least a fifth is needed; the longest gap, '
-                      f'of {gaps[longest]:.6g} s, begins at {time[longest]:.3f} s: cut the log there, and give both parts, or give --rate '
-                      'where the stamps are no use')
+    raise DataRefused(f'{len(place)} samples can be used where the log has room for {points}, at '
+                      f'least a fifth is needed; the longest gap, of {gaps[longest]:.6g} s, '
+                      f'begins at {time[longest]:.3f} s: cut the log there, and give both parts, '
+                      'or give --rate where the stamps are no use')
 
 
 def _surrounded(log: Log, model: GyroModel | None) -> Log:
@@ -197,7 +210,7 @@ def _surrounded(log: Log, model: GyroModel | None) -> Log:
 
 
 def _even(time: Array) -> Array:
-    """Return the time since the first sample; where stamps come in bursts, that of the even grid that the samples belong to, s."""
+    """Return the time since the first sample, s; that of the even grid for stamps in bursts."""
     try:
         stamps = number_stamps(time)
     except DataRefused:
@@ -209,10 +222,11 @@ def _even(time: Array) -> Array:
 
 def _smoothed(plain: Replay) -> int:
     """
-    Return over how many points more to average, so that no smoothing of the record is left to be seen.
+    Return how many more points to average, so that no smoothing of the record is left.
 
-    A gyro whose samples are means of many, or a reference that was smoothed, has nearly nothing but rounding at the highest frequencies. No
-    noise of a model is like that, and what motion and noise of the reference leave there would count for much more than it is worth.
+    A gyro whose samples are means of many, or a reference that was smoothed, has nearly nothing
+    but rounding at the highest frequencies. No noise of a model is like that, and what motion and
+    noise of the reference leave there would count for much more than it is worth.
 
     """
     rest, more, found = plain.channels.output - plain.reference, 1, 1
@@ -229,18 +243,21 @@ def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
     """
     Return what rounding adds to the output on average, rad/s, shape (n,).
 
-    Where steps are not small beside the noise, this depends on the rate, and would pass for an effect of it. It is the Fourier series of
-    a saw, smoothed by the noise before the rounding (Widrow, Kollar and Liu 1996).
+    Where steps are not small beside the noise, this depends on the rate, and would pass for an
+    effect of it. It is the Fourier series of a saw, smoothed by the noise before the rounding
+    (Widrow, Kollar and Liu 1996).
 
     """
-    scale, bias = np.polyfit(rate[kept], output[kept], 1) if np.ptp(rate[kept]) > 0.0 else (1.0, float(output[kept].mean()))
+    scale, bias = (np.polyfit(rate[kept], output[kept], 1) if np.ptp(rate[kept]) > 0.0
+                   else (1.0, float(output[kept].mean())))
     expected = scale * rate + bias
     variance = max(float(np.var((output - expected)[kept])) - step ** 2 / 12.0, 0.0)
     wave = 2.0 * math.pi / step
     total = np.zeros(len(output))
     for order in wave * np.arange(1.0, 8.0):
         sign = -1.0 if round(order / wave) % 2 else 1.0
-        total += sign * 2.0 / order * math.exp(-0.5 * order ** 2 * variance) * np.sin(order * expected)
+        total += (sign * 2.0 / order * math.exp(-0.5 * order ** 2 * variance)
+                  * np.sin(order * expected))
     return total
 
 
@@ -250,7 +267,8 @@ def _reference(log: Log, time: Array, held: bool, step: float) -> tuple[Array, A
         rate = _between_updates(time, log.reference_rate, step) if held else log.reference_rate
         return rate, _filled(time, rate)
     if log.reference_heading is not None:
-        heading = _between_updates(time, log.reference_heading, step) if held else log.reference_heading
+        heading = (_between_updates(time, log.reference_heading, step) if held
+                   else log.reference_heading)
         return _rates(time, heading, step)
     return np.zeros(len(time)), np.zeros(len(time))
 
@@ -262,17 +280,17 @@ def _filled(time: Array, values: Array) -> Array:
 
 
 def _simulated(plain: Replay, model: GyroModel) -> Replay:
-    """Take what a model adds out of the output, and let effects look at the rate that its gyro sees."""
+    """Take what a model adds out of the output, and show effects the rate that its gyro sees."""
     channels = plain.channels
     rate = model.distorted('rate', channels.rate, channels.time)
     added = model.output_in(channels.moving(rate, rate)) - rate
-    return replace(plain, channels=channels.moving(rate, channels.output - added), reference=plain.reference + (rate - channels.rate),
-                   added=added)
+    return replace(plain, channels=channels.moving(rate, channels.output - added),
+                   reference=plain.reference + (rate - channels.rate), added=added)
 
 
 @cache
 def _fast(count: int) -> int:
-    """Return the largest number up to a count whose only factors are 2, 3 and 5; none is further off than some percent."""
+    """Return the largest number up to a count whose only prime factors are 2, 3 and 5."""
     while next_fast_len(count, real=True) != count:
         count -= 1
     return count
@@ -282,7 +300,8 @@ def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
     """
     Return samples on the whole grid, straight lines across what is lost.
 
-    A line begins and ends in the mean of as many samples as it bridges: the noise of a single one would be carried across the gap.
+    A line begins and ends in the mean of as many samples as it bridges: the noise of a single one
+    would be carried across the gap.
 
     """
     if len(known) == place[-1] + 1:
@@ -294,10 +313,12 @@ def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
     length = steps[before] - 1
     total = np.concatenate([[0.0], np.cumsum(known)])
     first, last = np.maximum(before + 1 - length, 0), np.minimum(before + 1 + length, len(known))
-    left, right = ((total[end] - total[begin]) / (end - begin) for begin, end in ((first, before + 1), (before + 1, last)))
+    left, right = ((total[end] - total[begin]) / (end - begin)
+                   for begin, end in ((first, before + 1), (before + 1, last)))
     number = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
     share = (number + 1.0) / np.repeat(length + 1, length)
-    whole[np.repeat(place[before], length) + 1 + number] = np.repeat(left, length) * (1.0 - share) + np.repeat(right, length) * share
+    whole[np.repeat(place[before], length) + 1 + number] = (
+        np.repeat(left, length) * (1.0 - share) + np.repeat(right, length) * share)
     return whole
 
 
@@ -310,45 +331,53 @@ def numbered(time: Array, kept: Mask) -> tuple[NDArray[np.intp], float]:
 
 
 def _known(log: Log) -> frozenset[str]:
-    return frozenset(name for name in ('temperature', 'specific_force', 'supply') if getattr(log, name) is not None)
+    return frozenset(name for name in ('temperature', 'specific_force', 'supply')
+                     if getattr(log, name) is not None)
 
 
 def _between_updates(time: Array, values: Array, step: float) -> Array:
     """
     Interpolate a held reference between its updates, for a held value is half an interval late.
 
-    An update that brings the same value leaves no trace. So a value that stands for longer is held until the last update before the next.
+    An update that brings the same value leaves no trace. So a value that stands for longer is held
+    until the last update before the next.
 
     """
     known = np.isfinite(values)
     renewed = np.flatnonzero((np.diff(values, prepend=np.nan) != 0.0) & known)
     when, what = time[renewed], values[renewed]
     usual = float(np.median(np.diff(when)))
-    stood = 1 + np.flatnonzero((np.diff(when) > _STOOD * usual) & (np.abs(np.diff(what)) > _STOOD * step))
-    when, what = np.insert(when, stood, when[stood] - usual), np.insert(what, stood, what[stood - 1])
+    stood = 1 + np.flatnonzero((np.diff(when) > _STOOD * usual)
+                               & (np.abs(np.diff(what)) > _STOOD * step))
+    when, what = (np.insert(when, stood, when[stood] - usual),
+                  np.insert(what, stood, what[stood - 1]))
     return np.where(known, np.interp(time, when, what), np.nan)
 
 
 def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
-    """Return the rate of a heading by cubic splines, nan where that is lost, and the same from a smooth heading where it has steps."""
+    """Return the rate of a heading by splines, nan where lost; and a smooth one without steps."""
     lost = ~np.isfinite(heading)
     rate = CubicSpline(time, _filled(time, heading))(time, 1)
-    near = maximum_filter1d(lost, 3) | maximum_filter1d(binary_opening(lost, np.ones(_BESIDE)), 2 * _BESIDE + 1)
+    near = (maximum_filter1d(lost, 3)
+            | maximum_filter1d(binary_opening(lost, np.ones(_BESIDE)), 2 * _BESIDE + 1))
     raw = np.where(near, np.nan, rate)
     return raw, _without_rounding(rate, step, float(np.median(np.diff(time)))) if step else rate
 
 
 def _without_rounding(rate: Array, step: float, interval: float) -> Array:
     """
-    Return the rate of a heading without what rounding to steps makes of it, by the filter of Wiener.
+    Return the rate of a heading without what rounding to steps makes of it, by a Wiener filter.
 
-    Each frequency is kept as far as its power is beyond that of the rounding, so that quick motion stays.
+    Each frequency is kept as far as its power is beyond that of the rounding, so that quick motion
+    stays.
 
     """
     coefficients = dct(rate, norm='ortho')
-    rounding = (step / interval) ** 2 / 12.0 * differentiated(np.arange(len(rate)) * math.pi / len(rate))
+    rounding = ((step / interval) ** 2 / 12.0
+                * differentiated(np.arange(len(rate)) * math.pi / len(rate)))
     power = uniform_filter1d(coefficients ** 2, _NEIGHBOURS, mode='nearest')
-    return idct(coefficients * np.clip(1.0 - _OVER * rounding / np.maximum(power, 1e-300), 0.0, 1.0), norm='ortho')
+    return idct(coefficients * np.clip(1.0 - _OVER * rounding / np.maximum(power, 1e-300),
+                                       0.0, 1.0), norm='ortho')
 
 
 def _heading(time: Array, log: Log, rate: Array) -> Array:

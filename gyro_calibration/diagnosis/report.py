@@ -11,7 +11,8 @@ import numpy as np
 
 import gyro_calibration
 from gyro_calibration.diagnosis.charts import Chart, Line, draw
-from gyro_calibration.diagnosis.finding import Change, Curve, Diagnosis, Estimate, Finding, Gain, HeadingCurve, NoiseCurve, Trace
+from gyro_calibration.diagnosis.finding import (Change, Curve, Diagnosis, Estimate, Finding, Gain,
+                                                HeadingCurve, NoiseCurve, Trace)
 from gyro_calibration.diagnosis.markup import Markup, element, joined
 from gyro_calibration.diagnosis.units import amount, for_people, number, quantity, span
 from gyro_calibration.diagnosis.words import (
@@ -43,17 +44,23 @@ _PARTS = 90
 _SLOW = 2e-3 * DEGREE
 #: The curve that holds amplitudes in place of means.
 SPECTRUM = 'frequency'
-_VERDICTS = {'adequate': 'Adequate: nothing was found', 'extended': 'Extended: all that was found has a name',
+_VERDICTS = {'adequate': 'Adequate: nothing was found',
+             'extended': 'Extended: all that was found has a name',
              'unexplained': 'Unexplained: something is left without a name',
              'mismatched': 'Mismatched: gyro and reference do not belong together'}
 
 _METHOD = (
-    '{logs} replayed through the simulation: the motion and the temperature as recorded, the output as the model has it.',
-    'What the output then differs by, the residual, was compared with every cause of the catalogue, under a noise of angle random walk,',
+    '{logs} replayed through the simulation: the motion and the temperature as recorded, the '
+    'output as the model has it.',
+    'What the output then differs by, the residual, was compared with every cause of the '
+    'catalogue, under a noise of angle random walk,',
     'flicker and rate random walk that was found together with the causes.',
-    'A cause is named where it shows more than the strongest of all causes does in noise drawn for this very log, so that of logs without',
-    'any cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and taken back where another one explains more.',
-    'Those that explain the same are given as a set, of which the simplest is in the model. Bias and scale factor are fitted in any case.',
+    'A cause is named where it shows more than the strongest of all causes does in noise drawn '
+    'for this very log, so that of logs without',
+    'any cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and '
+    'taken back where another one explains more.',
+    'Those that explain the same are given as a set, of which the simplest is in the model. Bias '
+    'and scale factor are fitted in any case.',
     'What is won was measured on parts that took no part in this; intervals are of 95 %.')
 
 
@@ -69,30 +76,37 @@ def report(diagnosis: Diagnosis) -> str:
 def _as_it_was(diagnosis: Diagnosis) -> Diagnosis:
     """Return the diagnosis with nothing drawn as after an extension, for there is none."""
     heading, trace = diagnosis.heading, diagnosis.trace
-    return replace(diagnosis, curves=[replace(curve, after=curve.before) for curve in diagnosis.curves],
+    return replace(diagnosis,
+                   curves=[replace(curve, after=curve.before) for curve in diagnosis.curves],
                    heading=None if heading is None else replace(heading, after=heading.before),
                    trace=None if trace is None else replace(trace, extended=trace.simulated))
 
 
 def _header(diagnosis: Diagnosis) -> Markup:
     what, won = headline(diagnosis)
-    gyro = ' '.join(clean(str(diagnosis.model.gyro.get(name, ''))) for name in ('name', 'serial_number')).strip()
+    gyro = ' '.join(clean(str(diagnosis.model.gyro.get(name, '')))
+                    for name in ('name', 'serial_number')).strip()
     about = ' · '.join(filter(None, ['Diagnosis', gyro, ', '.join(map(clean, diagnosis.logs))]))
-    return element('header', element('p', about, class_='about'), element('h1', what), element('p', won, class_='won'),
-                   element('p', _VERDICTS[diagnosis.verdict], class_=f'verdict {diagnosis.verdict}'), _tiles(diagnosis.gain))
+    return element('header', element('p', about, class_='about'), element('h1', what),
+                   element('p', won, class_='won'),
+                   element('p', _VERDICTS[diagnosis.verdict],
+                           class_=f'verdict {diagnosis.verdict}'), _tiles(diagnosis.gain))
 
 
 def _tiles(gain: Gain | None) -> Markup | None:
     if gain is None:
         return None
-    return element('div', *(_tile(sentence(what).rstrip('.'), errors, unit) for what, errors, unit in _errors(gain)), class_='tiles')
+    return element('div', *(_tile(sentence(what).rstrip('.'), errors, unit)
+                            for what, errors, unit in _errors(gain)), class_='tiles')
 
 
 def _tile(what: str, errors: Change, unit: str) -> Markup:
     name, factor = for_people(unit)
-    numbers = element('p', number(errors.before * factor), element('span', ' → ', class_='quiet'), number(errors.after * factor),
-                      element('span', f' {name}', class_='quiet'), class_='big')
-    return element('div', element('p', what), numbers, element('p', f'won {_gained(errors, unit)}', class_='quiet'), class_='tile')
+    numbers = element('p', number(errors.before * factor), element('span', ' → ', class_='quiet'),
+                      number(errors.after * factor), element('span', f' {name}', class_='quiet'),
+                      class_='big')
+    return element('div', element('p', what), numbers,
+                   element('p', f'won {_gained(errors, unit)}', class_='quiet'), class_='tile')
 
 
 def _gained(errors: Change, unit: str) -> str:
@@ -103,14 +117,19 @@ def _gained(errors: Change, unit: str) -> str:
 def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     guilty, others = _curves(diagnosis)
     yield _section('Simulation and measurement', _misfit(diagnosis, guilty or others))
-    yield _section('Causes', [_cause(place, found, diagnosis) for place, found in enumerate(diagnosis.findings, 1)])
-    yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])] if diagnosis.unexplained else [])
+    yield _section('Causes', [_cause(place, found, diagnosis)
+                              for place, found in enumerate(diagnosis.findings, 1)])
+    yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])]
+                   if diagnosis.unexplained else [])
     yield _section('What is won' if diagnosis.gain is not None else 'Heading', _gain(diagnosis))
     measured = diagnosis.noise_curve is not None or diagnosis.noise != Noise()
     yield _section('Noise', _noise(diagnosis) if measured else [])
     rest = others if guilty else []
-    yield _section('Along the other variables', [_pairs(draw(_residual(curve, place)) for place, curve in rest)] if rest else [])
-    yield _section('What these data cannot show', [_reasons(diagnosis)] if diagnosis.cannot_show else [])
+    yield _section('Along the other variables',
+                   [_pairs(draw(_residual(curve, place)) for place, curve in rest)]
+                   if rest else [])
+    yield _section('What these data cannot show',
+                   [_reasons(diagnosis)] if diagnosis.cannot_show else [])
     yield _section('The model', _model(diagnosis))
     yield _section('How this was computed', _method(diagnosis))
 
@@ -135,7 +154,8 @@ Numbered = tuple[int, Curve]
 
 def _curves(diagnosis: Diagnosis) -> tuple[list[Numbered], list[Numbered]]:
     """Return the curves along guilty variables, in the order of the causes, and the others."""
-    along = [*(found.along for found in diagnosis.findings), *(each.along for each in diagnosis.unexplained)]
+    along = [*(found.along for found in diagnosis.findings),
+             *(each.along for each in diagnosis.unexplained)]
     curves = list(enumerate(diagnosis.curves))
     guilty = [each for each in curves if each[1].along in along]
     guilty.sort(key=lambda each: along.index(each[1].along))
@@ -144,21 +164,25 @@ def _curves(diagnosis: Diagnosis) -> tuple[list[Numbered], list[Numbered]]:
 
 def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup | None]:
     if guilty or diagnosis.trace is not None:
-        yield element('p', 'Point at a chart, or use the arrow keys, to read its values.', class_='quiet hint')
+        yield element('p', 'Point at a chart, or use the arrow keys, to read its values.',
+                      class_='quiet hint')
     if diagnosis.trace is not None:
         yield element('p', 'The stretch where they differ most:')
         yield _pairs(draw(chart) for chart in _trace(diagnosis.trace))
     for place, curve in guilty:
         yield element('p', _misfit_sentence(curve))
-        yield _pairs(draw(chart) for chart in (_predicted(curve, place), _residual(curve, place)) if chart is not None)
+        yield _pairs(draw(chart) for chart in (_predicted(curve, place), _residual(curve, place))
+                     if chart is not None)
 
 
 def _misfit_sentence(curve: Curve) -> str:
-    sizes = [np.abs(each[np.isfinite(each)]).max(initial=0.0) for each in (curve.before, curve.after)]
+    sizes = [np.abs(each[np.isfinite(each)]).max(initial=0.0)
+             for each in (curve.before, curve.after)]
     before, after = (amount(float(size), 'rad/s') for size in sizes)
     if _same(curve):
         return f'Along {spoken(curve.along)}, the simulation is off by up to {before}.'
-    return f'Along {spoken(curve.along)}, the simulation is off by up to {before} as it was, and by up to {after} as extended.'
+    return (f'Along {spoken(curve.along)}, the simulation is off by up to {before} as it was, and '
+            f'by up to {after} as extended.')
 
 
 def _same(curve: Curve) -> bool:
@@ -166,13 +190,17 @@ def _same(curve: Curve) -> bool:
 
 
 def _trace(trace: Trace) -> Iterator[Chart]:
-    time, measured, simulated, extended = _thinned(trace.time, trace.measured, trace.simulated, trace.extended)
+    time, measured, simulated, extended = _thinned(trace.time, trace.measured, trace.simulated,
+                                                   trace.extended)
     unit, factor = _rate_unit(measured)
-    lines = [Line('measured', 'measured', factor * measured), Line('simulated', 'simulated', factor * simulated)]
-    yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time', 's', time, 'output', unit, lines)
+    lines = [Line('measured', 'measured', factor * measured),
+             Line('simulated', 'simulated', factor * simulated)]
+    yield Chart('trace', 'Output of the gyro', 'Measured and simulated output over time.', 'time',
+                's', time, 'output', unit, lines)
     unit, factor = _rate_unit(measured - simulated)
     lines = _before_and_after(factor * (measured - simulated), factor * (measured - extended))
-    yield Chart('difference', 'Measured less simulated', f'What the simulation leaves over time{_when(lines)}.', 'time', 's', time,
+    yield Chart('difference', 'Measured less simulated',
+                f'What the simulation leaves over time{_when(lines)}.', 'time', 's', time,
                 'residual', unit, lines)
 
 
@@ -211,8 +239,9 @@ def _predicted(curve: Curve, place: int) -> Chart | None:
     if not _same(curve):
         lines.append(Line('simulated, extended', 'after', factor * (measured - curve.after)))
     along = spoken(curve.along)
-    return Chart(f'predicted-{place}', f'Error of the gyro along {along}', f'Mean of output less true rate along {along}, as measured '
-                 'and as the simulation has it.', along, across, scale * curve.at, 'error', unit, lines)
+    return Chart(f'predicted-{place}', f'Error of the gyro along {along}',
+                 f'Mean of output less true rate along {along}, as measured and as the simulation '
+                 'has it.', along, across, scale * curve.at, 'error', unit, lines)
 
 
 def _residual(curve: Curve, place: int) -> Chart:
@@ -220,21 +249,26 @@ def _residual(curve: Curve, place: int) -> Chart:
         return _spectrum(curve, place)
     unit, factor = _rate_unit(np.concatenate([curve.before, curve.after]))
     across, scale = _across(curve)
-    lines = _before_and_after(factor * curve.before, factor * curve.after, factor * curve.deviation)
+    lines = _before_and_after(factor * curve.before, factor * curve.after,
+                              factor * curve.deviation)
     along = spoken(curve.along)
-    return Chart(f'residual-{place}', f'Residual along {along}', f'Mean of what the simulation leaves along {along}{_when(lines)}, '
-                 'with bands of 95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
+    return Chart(f'residual-{place}', f'Residual along {along}',
+                 f'Mean of what the simulation leaves along {along}{_when(lines)}, with bands of '
+                 '95 % by noise alone.', along, across, scale * curve.at, 'residual', unit, lines)
 
 
 def _spectrum(curve: Curve, place: int) -> Chart:
     """Return the amplitudes of the residual over frequency beside those of noise."""
-    lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE), Line('usual', 'simulated', curve.deviation / DEGREE)]
-    return Chart(f'residual-{place}', 'Residual along frequency', 'Largest amplitude of the residual in bands of frequency, and the usual '
-                 'one there; a line that stands out is a tone.', 'frequency', 'Hz', curve.at, 'amplitude', 'deg/s', lines, logarithmic=True)
+    lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE),
+             Line('usual', 'simulated', curve.deviation / DEGREE)]
+    return Chart(f'residual-{place}', 'Residual along frequency',
+                 'Largest amplitude of the residual in bands of frequency, and the usual one '
+                 'there; a line that stands out is a tone.', 'frequency', 'Hz', curve.at,
+                 'amplitude', 'deg/s', lines, logarithmic=True)
 
 
 def _thinned(at: Array, *values: Array) -> list[Array]:
-    """Return curves with fewer points: of each part the lowest and the highest ones, which stay where they are."""
+    """Return curves with fewer points: the lowest and the highest of each part, in place."""
     if len(at) <= 4 * _PARTS:
         return [at, *values]
     chosen = {0, len(at) - 1}
@@ -242,7 +276,8 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
         for each in values:
             known = np.isfinite(each[part])
             if known.any():
-                chosen |= {int(part[np.nanargmin(each[part])]), int(part[np.nanargmax(each[part])])}
+                chosen |= {int(part[np.nanargmin(each[part])]),
+                           int(part[np.nanargmax(each[part])])}
     kept = np.array(sorted(chosen))
     return [each[kept] for each in (at, *values)]
 
@@ -251,11 +286,13 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
 
 def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
     inside = is_inside(found, diagnosis)
-    facts = [*certainty(found), smallest(found), 'It is in the extended model.' if inside else '', todo(found)]
+    facts = [*certainty(found), smallest(found),
+             'It is in the extended model.' if inside else '', todo(found)]
     uncertain = element('p', doubt(found), class_='doubt') if found.ambiguous_with else None
-    title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect), ' ', _code(found.effect))
-    return element('article', title,
-                   *(element('p', text) for text in shown_by(found)), _parameters(found), uncertain,
+    title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect),
+                    ' ', _code(found.effect))
+    return element('article', title, *(element('p', text) for text in shown_by(found)),
+                   _parameters(found), uncertain,
                    element('p', ' '.join(filter(None, facts)), class_='quiet'))
 
 
@@ -273,7 +310,8 @@ def _parameters(found: Finding) -> Markup | None:
 
 def _folding(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
     """Return a table whose rows become lists on a narrow screen."""
-    table = element('table', element('thead', element('tr', *(element('th', head, scope='col') for head in heads))),
+    table = element('table', element('thead', element('tr', *(element('th', head, scope='col')
+                                                              for head in heads))),
                     element('tbody', *(_row(heads, row) for row in rows)))
     return element('div', table, class_='fold')
 
@@ -295,25 +333,30 @@ def _gain(diagnosis: Diagnosis) -> Iterator[Markup | None]:
 
 def _errors(gain: Gain) -> list[tuple[str, Change, str]]:
     """Return what was measured before and after, with its unit of SI."""
-    heading = [] if gain.heading is None else [(f'heading error over {gain.window:g} s', gain.heading, 'rad')]
+    heading = ([] if gain.heading is None
+               else [(f'heading error over {gain.window:g} s', gain.heading, 'rad')])
     return [*heading, ('rate error', gain.rate, 'rad/s')]
 
 
 def _gain_sentences(gain: Gain) -> str:
-    changes = [f'The extension {change(errors, unit, f"the {what}")}.' for what, errors, unit in _errors(gain)]
-    return ' '.join([f'Measured on {clean(gain.held_out)}, which took no part in the choice or the fit.', *changes])
+    changes = [f'The extension {change(errors, unit, f"the {what}")}.'
+               for what, errors, unit in _errors(gain)]
+    return ' '.join([f'Measured on {clean(gain.held_out)}, which took no part in the choice or '
+                     'the fit.', *changes])
 
 
 def _gain_table(gain: Gain) -> Markup:
     return _folding(['rms', 'before', 'after', 'won, 95 % interval'], [
-        [what, amount(errors.before, unit), amount(errors.after, unit), _gained(errors, unit)] for what, errors, unit in _errors(gain)])
+        [what, amount(errors.before, unit), amount(errors.after, unit), _gained(errors, unit)]
+        for what, errors, unit in _errors(gain)])
 
 
 def _heading(curve: HeadingCurve) -> Chart:
     time, before, after = _thinned(curve.time, curve.before, curve.after)
     unit, factor = span(float(np.ptp(time)) if len(time) else 0.0)
     lines = _before_and_after(before / DEGREE, after / DEGREE)
-    return Chart('heading', 'Heading error over the log', f'Error of the heading if the simulation is believed{_when(lines)}.', 'time',
+    return Chart('heading', 'Heading error over the log',
+                 f'Error of the heading if the simulation is believed{_when(lines)}.', 'time',
                  unit, factor * time, 'heading error', 'deg', lines)
 
 
@@ -327,11 +370,14 @@ def _noise(diagnosis: Diagnosis) -> Iterator[Markup | None]:
 
 def _allan(curve: NoiseCurve) -> Chart:
     factor = 3600.0 / DEGREE
-    lines = [Line('residual', 'measured', factor * curve.measured, dots=True), Line('noise as found', 'after', factor * curve.fitted)]
+    lines = [Line('residual', 'measured', factor * curve.measured, dots=True),
+             Line('noise as found', 'after', factor * curve.fitted)]
     if curve.simulated is not None:
         lines.append(Line('noise of the simulation', 'simulated', factor * curve.simulated))
-    return Chart('noise', 'Allan deviation of the residual', 'Allan deviation over averaging time, of the residual and of the noise '
-                 'that is simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation', 'deg/h', lines, logarithmic=True)
+    return Chart('noise', 'Allan deviation of the residual',
+                 'Allan deviation over averaging time, of the residual and of the noise that is '
+                 'simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation',
+                 'deg/h', lines, logarithmic=True)
 
 
 # the rest
@@ -342,15 +388,18 @@ def _reasons(diagnosis: Diagnosis) -> Markup:
 
 
 def _model(diagnosis: Diagnosis) -> Iterator[Markup]:
-    what = ('This is the extended model, as model.yaml has it; compensate, simulate and the compensation node take it as it is.'
-            if offered(diagnosis) else 'The model is as it was.')
+    what = ('This is the extended model, as model.yaml has it; compensate, simulate and the '
+            'compensation node take it as it is.' if offered(diagnosis)
+            else 'The model is as it was.')
     yield element('p', what)
-    yield element('pre', element('code', model_text(diagnosis.model)), tabindex='0', class_='scroll')
+    yield element('pre', element('code', model_text(diagnosis.model)), tabindex='0',
+                  class_='scroll')
 
 
 def _method(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
     share = f'{100.0 * diagnosis.false_alarm_rate:.2g} %'
-    yield element('p', sentence(diagnosis.method) or ' '.join(_METHOD).format(logs=logs, share=share))
+    yield element('p', sentence(diagnosis.method)
+                  or ' '.join(_METHOD).format(logs=logs, share=share))
     yield _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None
     yield element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')

@@ -1,9 +1,10 @@
 """
 Which causes the data support.
 
-Causes are added one by one, the strongest first. The shapes of those that come into question are refined before one is taken, so that a
-large effect that was only nearly right leaves nothing that other causes could take up. In the end each is taken out again, to see
-whether another explains it better, or none is needed.
+Causes are added one by one, the strongest first. The shapes of those that come into question are
+refined before one is taken, so that a large effect that was only nearly right leaves nothing that
+other causes could take up. In the end each is taken out again, to see whether another explains it
+better, or none is needed.
 
 """
 
@@ -30,8 +31,10 @@ from gyro_calibration.diagnosis.candidates import (
     spacing_of_steps,
     with_shape,
 )
-from gyro_calibration.diagnosis.evidence import Places, beside, drawn, evidence, judge, log_sum, sample, sums
-from gyro_calibration.diagnosis.field import Field, Named, Work, field, is_of_the_rate, seen, with_columns, with_one_more, work
+from gyro_calibration.diagnosis.evidence import (Places, beside, drawn, evidence, judge, log_sum,
+                                                 sample, sums)
+from gyro_calibration.diagnosis.field import (Field, Named, Work, field, is_of_the_rate, seen,
+                                              with_columns, with_one_more, work)
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
@@ -41,13 +44,15 @@ from gyro_calibration.log import Array, DataRefused
 DRAWS = 400
 #: Of the noises that are likely, so many are used to learn it.
 MOST_NOISES = 60
-#: A cause that explains the data less well than the best by more than this, in logarithms of the likelihood, is ruled out.
+#: A cause that explains the data less well than the best by more than this, in logarithms of the
+#: likelihood, is ruled out.
 RULED_OUT = 3.2
 #: What a shape costs at least, for it is known to some part of where it may be.
 PRICE_OF_SHAPE = 2.0
 #: Causes that have no first shapes, but are scanned for.
 SCANNED = frozenset({'interference_tone', 'reference_slip'})
-#: So many of a kind at most in a log: slips are found all at once, and many tones are no tones, but something that is not even.
+#: So many of a kind at most in a log: slips are found all at once, and many tones are no tones,
+#: but something that is not even.
 MOST_OF = {'interference_tone': 3, 'reference_slip': 1}
 #: A tone has at least so many periods in a log; slower ones are wander.
 LEAST_PERIODS = 20
@@ -55,9 +60,10 @@ LEAST_PERIODS = 20
 WIDTHS = (0.0, 0.05, 0.1, 0.2, 0.4)
 #: So many slips at most are counted in a log.
 MOST_SLIPS = 20
-#: A noise less likely than the best by more than this, in logarithms of the likelihood, is not tried again.
+#: A noise less likely than the best by more than this, in logarithms of the likelihood, is not
+#: tried again.
 UNLIKELY = 12.0
-#: An effect with so much evidence passes for a noise that is none, so that all noises are tried throughout.
+#: An effect with so much evidence passes for a noise that is none, so that all noises are tried.
 STRONG = 60.0
 #: What each column beyond the first costs, for it fits a little noise.
 PRICE_OF_COLUMN = 1.2
@@ -71,7 +77,7 @@ MOST_CAUSES = 6
 
 @dataclass(frozen=True)
 class Chance:
-    """What evidence of each cause chance shows: beyond `start`, with probability `share`, it falls off by e every `scale`."""
+    """Evidence of causes by chance: with probability `share` above `start`, then exponential."""
 
     start: Mapping[str, float]
     scale: Mapping[str, float]
@@ -79,7 +85,7 @@ class Chance:
 
     def threshold(self, cause: str, rate: float) -> float:
         """Return the evidence that chance reaches at a given rate."""
-        if cause not in self.start:  # it is scanned for, and its evidence counts the places already
+        if cause not in self.start:  # it is scanned for: its evidence counts the places already
             return -float(np.log(rate))
         return self.start[cause] + self.scale[cause] * float(np.log(self.share / rate))
 
@@ -87,7 +93,8 @@ class Chance:
         """Return how often chance reaches an evidence."""
         if cause not in self.start:
             return float(np.exp(-max(found, 0.0)))
-        return min(1.0, self.share * float(np.exp(min(-(found - self.start[cause]) / self.scale[cause], 700.0))))
+        return min(1.0, self.share * float(np.exp(
+            min(-(found - self.start[cause]) / self.scale[cause], 700.0))))
 
 
 @dataclass(frozen=True)
@@ -167,8 +174,10 @@ class Search:
 def screen(done: Work, stock: Bank) -> Array:
     """Return the evidence of all candidates beside what is named, shape (candidates,)."""
     noises = done.field.noises
-    by = beside(sums(done.columns, stock.columns, stock.groups, done.field.starts), stock.groups, noises)
-    judged = judge(sample(done.residual[None], done.columns, stock.columns, done.field.starts), noises, by)
+    by = beside(sums(done.columns, stock.columns, stock.groups, done.field.starts), stock.groups,
+                noises)
+    judged = judge(sample(done.residual[None], done.columns, stock.columns, done.field.starts),
+                   noises, by)
     return _priced(evidence(judged, by, stock.groups), stock)[0]
 
 
@@ -178,7 +187,7 @@ def _priced(found: Array, stock: Bank) -> Array:
 
 
 def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
-    """Draw residuals of noise alone, as this log may have it, and see what evidence of each cause they show."""
+    """Draw residuals of noise alone for this log, and see what evidence of causes they show."""
     probable = done.judged.probability[0]
     kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
     noises = done.field.noises.take(kept)
@@ -187,8 +196,11 @@ def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
     single = done.columns.astype(np.float32), stock.columns.astype(np.float32)
     found = []
     for _ in range(DRAWS // 100):
-        residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100, generator)
-        found.append(_priced(evidence(judge(sample(residuals, *single, done.field.starts), noises, by), by, stock.groups), stock))
+        residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100,
+                          generator)
+        found.append(_priced(evidence(
+            judge(sample(residuals, *single, done.field.starts), noises, by), by, stock.groups),
+            stock))
     return _chance(np.concatenate(found), by_cause(stock.candidates))
 
 
@@ -203,7 +215,8 @@ def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
     return Chance(start, scale, share)
 
 
-def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006) -> Search:
+def begin(replays: Sequence[Replay], generator: np.random.Generator,
+          rate: float = 0.006) -> Search:
     """Lay out logs and learn what chance shows in them."""
     found = [*candidates(replays), *probes(replays)]
     everywhere = field(replays)
@@ -216,26 +229,33 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float
     return Search(whole, stock, chances(done, stock, generator), rate / len(places), tied=tied)
 
 
-def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str], rate: float) -> Search:
-    """Return a search for some causes in other parts of the same logs, at a rate of false alarms a cause."""
+def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
+           rate: float) -> Search:
+    """Return a search for some causes in other parts of the logs, at a rate of false alarms."""
     found = [each for each in search.candidates if each.cause in causes]
     whole = field(replays)
-    return replace(search, field=whole, bank=bank(whole, found), rate=rate, scanned=SCANNED & frozenset(causes), banks={}, looked={})
+    return replace(search, field=whole, bank=bank(whole, found), rate=rate,
+                   scanned=SCANNED & frozenset(causes), banks={}, looked={})
 
 
 def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
-    """Leave out noises that are out of the question, both where nothing is in the logs and where much may be."""
-    middle = [places[len(places) // 2] for places in by_cause([each for each in found if is_named(each)]).values()]
+    """Leave out noises that are out of the question, both with no cause and with many."""
+    middle = [places[len(places) // 2]
+              for places in by_cause([each for each in found if is_named(each)]).values()]
     tried = [work(whole, []), work(whole, [], [found[place] for place in middle])]
-    kept = np.flatnonzero(np.any([each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried], axis=0))
+    kept = np.flatnonzero(np.any(
+        [each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried],
+        axis=0))
     if not len(kept):
-        raise DataRefused('no noise explains what the simulation leaves, it is so large; see whether columns and units are right')
-    return replace(whole, shapes=tuple(whole.shapes[place] for place in kept), noises=whole.noises.take(kept))
+        raise DataRefused('no noise explains what the simulation leaves, it is so large; see '
+                          'whether columns and units are right')
+    return replace(whole, shapes=tuple(whole.shapes[place] for place in kept),
+                   noises=whole.noises.take(kept))
 
 
 @dataclass(frozen=True)
 class _First:
-    """A candidate with its first shapes: its evidence, and that averaged over all first shapes of its cause."""
+    """A candidate with its first shapes: its evidence, and the mean over those of its cause."""
 
     candidate: Candidate
     most: float
@@ -251,11 +271,11 @@ def _runs(done: Work, cause: str) -> list[int]:
 
 
 def tones(done: Work) -> list[_First]:
-    """Return the strongest tone, of as many as there are frequencies in all logs; in each, a tone has a size and a phase of its own."""
+    """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
     found, left = [], done.white()
     for run in _runs(done, 'interference_tone'):
         each, white = done.field.replays[run], left[run]
-        # Twice as long, since a tone between two frequencies of the log alone would lose more than half of its power.
+        # Twice as long: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
         lowest = 2 * LEAST_PERIODS
         if len(power) > 2 * lowest:
@@ -264,59 +284,67 @@ def tones(done: Work) -> list[_First]:
             if each.rounded and not _of_the_gyro(each, frequency):
                 continue
             most, places = float(power[best]) - PRICE_OF_COLUMN, len(power) * len(left)
-            found.append(_First(effect('interference_tone', frequency, run=run), most, most - float(np.log(places))))
+            found.append(_First(effect('interference_tone', frequency, run=run), most,
+                                most - float(np.log(places))))
     return [max(found, key=lambda one: one.mean)] if found else []
 
 
 def _unfolded(each: Replay, frequency: float) -> float:
-    """Return the frequency that a tone has where neighbours are not averaged: of those that fold to it, the one that stands out most."""
+    """Return a tone's frequency without averaging: the strongest of those that fold to it."""
     if each.every == 1:
         return frequency
     samples = replace(each, every=1)
-    power = np.abs(np.fft.rfft(samples.on_grid(each.channels.output - each.reference), 2 * samples.points)) ** 2
+    power = np.abs(np.fft.rfft(samples.on_grid(each.channels.output - each.reference),
+                               2 * samples.points)) ** 2
     folds = np.arange(each.every // 2 + 1) / each.step
     places = 2.0 * samples.duration * np.concatenate([folds + frequency, folds[1:] - frequency])
-    return float(max(places[places < len(power) - 3], key=lambda at: _outstanding(power, round(at)))) / (2.0 * samples.duration)
+    return float(max(places[places < len(power) - 3],
+                     key=lambda at: _outstanding(power, round(at)))) / (2.0 * samples.duration)
 
 
 def _outstanding(power: Array, place: int) -> float:
     """Return what the power at a frequency is over that of its neighbours."""
-    return float(power[place - 2:place + 3].max() / np.median(power[max(place - 60, 0):place + 61]))
+    return float(power[place - 2:place + 3].max()
+                 / np.median(power[max(place - 60, 0):place + 61]))
 
 
 def _of_the_gyro(each: Replay, frequency: float) -> bool:
-    """Tell whether a tone is in the output, and not in the reference alone: the steps of an encoder make tones of their own."""
+    """Tell whether a tone is in the output, not only in the reference: encoders make tones."""
     wave = np.exp(-2.0j * np.pi * frequency * each.channels.time[each.kept])
-    output, reference = (np.abs(np.mean(values[each.kept] * wave)) for values in (each.channels.output, each.reference))
+    output, reference = (np.abs(np.mean(values[each.kept] * wave))
+                         for values in (each.channels.output, each.reference))
     return bool(output > 0.7 * reference)
 
 
 def slips(done: Work) -> list[_First]:
-    """Return the clearest jumps of the reference's heading, of those moments where it accelerates."""
+    """Return the clearest jumps of the reference's heading, where it accelerates."""
     found = []
     parts = np.cumsum([each.points - 1 for each in done.field.replays])[:-1]
-    divided = np.split(done.field.divided(int(done.judged.likelihood[0].argmax())) / done.field.deviation, parts)
+    divided = np.split(done.field.divided(int(done.judged.likelihood[0].argmax()))
+                       / done.field.deviation, parts)
     left = done.white()
     for run in _runs(done, 'reference_slip'):
         each, white, factor = done.field.replays[run], left[run], divided[run]
         acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
-            tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step)) for width in WIDTHS]
-            # As many as are looked for at most, and there would be more: those are no slips, but something that goes on all the time.
+            tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step))
+                     for width in WIDTHS]
+            # With as many as are looked for, they are no slips, but something that always goes on.
             if max(len(one.candidate.shapes) - 1 for one in tried) < MOST_SLIPS:
                 found += tried
     return [max(found, key=lambda one: one.mean)] if found else []
 
 
-def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places, width: float) -> _First:
-    """Return the jumps of one width, a second apart or more, each with evidence beyond what so many moments make likely."""
+def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Places,
+             width: float) -> _First:
+    """Return jumps of one width, at least 1 s apart, with evidence beyond so many moments."""
     time = np.arange(each.points) * each.step
     likely = float(np.log(len(moments) * len(WIDTHS)))
     size, deviation = _matched(white, factor, time, width)
     wide, _ = _matched(white, factor, time, 5.0 * width + 0.3)
     value = 0.5 * (size[moments] / deviation) ** 2 - likely - PRICE_OF_COLUMN
-    # What a slip turned stays turned; an error that comes and goes again has nothing left over a longer time.
+    # A slip stays; an error that comes and goes again has nothing left over a longer time.
     value[wide[moments] / size[moments] < 0.3] = -np.inf
     chosen: list[float] = []
     total = 0.0
@@ -330,38 +358,45 @@ def _slipped(each: Replay, run: int, white: Array, factor: Array, moments: Place
         if all(abs(at - other) > 1.0 for other in chosen):
             chosen.append(at)
             total += float(value[place])
-    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen), total if chosen else -np.inf)
+    return _First(effect('reference_slip', width, *chosen, run=run), total + likely * len(chosen),
+                  total if chosen else -np.inf)
 
 
 def _matched(white: Array, factor: Array, time: Array, width: float) -> tuple[Array, float]:
     """Return the size of a pulse at each moment, rad, and its standard deviation."""
     kernel = inverse(transform(pulse(time, time[len(time) // 2], width)) * factor)
-    return correlate(white, kernel, 'same') / (kernel @ kernel), float(1.0 / np.sqrt(kernel @ kernel))
+    return (correlate(white, kernel, 'same') / (kernel @ kernel),
+            float(1.0 / np.sqrt(kernel @ kernel)))
 
 
 def _single(each: Replay, at: int, width: float) -> int | None:
-    """Return the one point that has most of what is off about a point of the grid; None where it is not one alone."""
+    """Return the one point with most of what is off about a point; None if it is not one."""
     left = each.on_grid(each.channels.output - each.channels.rate)
     reach = max(3, round(2.0 * width / each.step))
     begin = max(at - reach, 0)
     near = left[begin:at + reach + 1]
     off = (near - np.median(near)) ** 2
-    return begin + int(off.argmax()) if off.max() > max(40.0 * np.median(off), 0.4 * off.sum()) else None
+    return (begin + int(off.argmax())
+            if off.max() > max(40.0 * np.median(off), 0.4 * off.sum()) else None)
 
 
 def _of_the_reference(each: Replay, moment: float) -> bool:
-    """Tell whether it is the reference that leaps, and not the output: the one that is further off its neighbours."""
-    at = int(np.clip(np.searchsorted(each.channels.time[each.kept], moment + each.channels.time[each.kept][0]), 3, each.kept.sum() - 4))
-    off = [np.abs(np.diff(values[each.kept][at - 3:at + 4], 2)).max() for values in (each.reference, each.channels.output)]
+    """Tell whether the reference leaps, not the output: it is further off its neighbours."""
+    at = int(np.clip(np.searchsorted(each.channels.time[each.kept],
+                                     moment + each.channels.time[each.kept][0]),
+                     3, each.kept.sum() - 4))
+    off = [np.abs(np.diff(values[each.kept][at - 3:at + 4], 2)).max()
+           for values in (each.reference, each.channels.output)]
     return bool(off[0] > off[1])
 
 
 # one cause more
 
 def _stock(search: Search, named: Sequence[Named]) -> Bank:
-    """Return all candidates as the gyro sees its rate; what a shape changes in its third digit changes none of their columns visibly."""
+    """Return all candidates as the gyro sees its rate, with shapes to two digits."""
     changes = [each for each in named if is_of_the_rate(each.candidate.cause)]
-    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes)) for each in changes)
+    key = tuple((each.candidate.cause, *(float(f'{shape:.2g}') for shape in each.candidate.shapes))
+                for each in changes)
     if not changes:
         return search.bank
     if key not in search.banks:
@@ -393,7 +428,8 @@ def refined(before: Work, candidate: Candidate, price: float) -> Step:
         done = with_one_more(before, candidate)
         columns = PRICE_OF_COLUMN * max(done.widths[-1] - 1, 0)
         margin = 0.0 if is_named(candidate) else MARGIN
-        return Step((*before.named, Named(candidate, price=price)), done.score - columns - price - margin)
+        return Step((*before.named, Named(candidate, price=price)),
+                    done.score - columns - price - margin)
     begin = candidate if candidate.amplitude is None else _unbent(before, candidate)
     place = fitted_shapes(candidate)[0]
     low, high = _around(before.plain, begin, place)
@@ -401,18 +437,20 @@ def refined(before: Work, candidate: Candidate, price: float) -> Step:
     def cost(at: float) -> float:
         return -with_one_more(before, with_shape(begin, place, _shape(at, begin, place))).score
 
-    best = minimize_scalar(cost, bounds=(low, high), method='bounded', options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
+    best = minimize_scalar(cost, bounds=(low, high), method='bounded',
+                           options={'xatol': 2e-3 * (high - low), 'maxiter': 14})
     columns = PRICE_OF_COLUMN if candidate.cause == 'interference_tone' else 0.0
     found = Named(with_shape(begin, place, _shape(best.x, begin, place)), price=price)
     return Step((*before.named, found), -float(best.fun) - price - columns)
 
 
 def _shape(at: float, begin: Candidate, place: int) -> float:
-    return at if begin.cause == 'bias_step' else float(np.copysign(np.exp(at), begin.shapes[place]))
+    return (at if begin.cause == 'bias_step'
+            else float(np.copysign(np.exp(at), begin.shapes[place])))
 
 
 def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[float, float]:
-    """Return where to look for a shape: between its neighbours, on a scale of logarithms but for moments."""
+    """Return where to look for a shape: between neighbours; moments apart, in logarithms."""
     mine = begin.shapes[place]
     if begin.cause == 'bias_step':
         width = 1.5 * max(spacing_of_steps(each, len(replays)) for each in replays)
@@ -432,7 +470,7 @@ _POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_ra
 
 
 def _unbent(before: Work, candidate: Candidate) -> Candidate:
-    """Return a cause of fixed amplitude with the shape that the free amplitude of its column speaks for."""
+    """Return a cause of fixed amplitude with the shape that its free amplitude suggests."""
     power = _POWERS.get(candidate.cause)
     if power is None:
         return candidate
@@ -441,7 +479,8 @@ def _unbent(before: Work, candidate: Candidate) -> Candidate:
     values, _ = free.estimates
     ratio = float(values[-1])
     place = fitted_shapes(candidate)[0]
-    return with_shape(candidate, place, candidate.shapes[place] * float(np.copysign(abs(ratio) ** (1.0 / power), ratio)))
+    return with_shape(candidate, place, candidate.shapes[place]
+                      * float(np.copysign(abs(ratio) ** (1.0 / power), ratio)))
 
 
 def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
@@ -453,7 +492,8 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     the best, None where nothing is beyond chance, and all that were refined, the best first
 
     """
-    key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes) for each in named)
+    key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
+                for each in named)
     if key not in search.looked:
         search.looked[key] = _strongest(search, named)
     return search.looked[key]
@@ -465,27 +505,36 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         return None, []
     top = max(first, key=lambda each: each.most)
-    # What changes the rate itself is alike to first order, and of a large one a first shape says little.
+    # Causes that change the rate are alike to first order; of a large one, a first shape says
+    # little.
     alike = is_of_the_rate(top.candidate.cause)
-    worth = [each for each in first if each.most > 0.8 * top.most - 8.0 or (alike and is_of_the_rate(each.candidate.cause))]
-    worth = [each for each in worth if is_named(each.candidate) or search.excess(each.candidate.cause, each.mean) > 0.0]
+    worth = [each for each in first if each.most > 0.8 * top.most - 8.0
+             or (alike and is_of_the_rate(each.candidate.cause))]
+    worth = [each for each in worth if is_named(each.candidate)
+             or search.excess(each.candidate.cause, each.mean) > 0.0]
     worth.sort(key=lambda each: -each.most)
     steps = [refined(done, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
-    # The screen takes a column at its first shape and with a free size; refined, it may explain less than its price.
-    steps = sorted((step for step in steps if step.score > done.score), key=lambda step: -step.score)
-    beyond = (step for step in steps if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
+    # The screen takes a column at its first shape and with a free size; refined, it may explain
+    # less than its price.
+    steps = sorted((step for step in steps if step.score > done.score),
+                   key=lambda step: -step.score)
+    beyond = (step for step in steps
+              if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
     return next(beyond, None), steps
 
 
 def _first(search: Search, done: Work, named: Sequence[Named]) -> list[_First]:
     """Return of each cause the first shape that is the best."""
     found = screen(done, _stock(search, named))
-    # What has nothing but shapes is there or not: another of its kind is the first one, not well refined.
+    # What has nothing but shapes is there or not: another one is the first, not well refined.
     taken = {each.candidate.cause for each in named if each.candidate.amplitude is not None}
-    first = [_First(search.candidates[max(own, key=lambda place: found[place])], float(found[own].max()), float(averaged(found[own])))
-             for cause, own in by_cause(search.candidates).items() if cause not in taken and np.isfinite(found[own]).any()]
+    first = [_First(search.candidates[max(own, key=lambda place: found[place])],
+                    float(found[own].max()), float(averaged(found[own])))
+             for cause, own in by_cause(search.candidates).items()
+             if cause not in taken and np.isfinite(found[own]).any()]
     scans = {'interference_tone': tones, 'reference_slip': slips}
-    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done) if np.isfinite(each.mean)]
+    return first + [each for cause in sorted(search.scanned) for each in scans[cause](done)
+                    if np.isfinite(each.mean)]
 
 
 def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
@@ -507,7 +556,8 @@ def _updated(done: Work, place: int, values: Array) -> Named:
     for shape in fitted_shapes(candidate):
         change = own.get((place, -1 - shape), 0.0)
         before = candidate.shapes[shape]
-        candidate = with_shape(candidate, shape, before + float(np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
+        candidate = with_shape(candidate, shape, before + float(
+            np.clip(change, -0.3 * abs(before), 0.3 * abs(before))))
     return replace(known, candidate=candidate, values=found or known.values)
 
 
@@ -515,15 +565,19 @@ def searched(search: Search) -> tuple[Named, ...]:
     """
     Return the causes that the data support, with values.
 
-    Several causes along one variable together may look like none of them. So where something without a name is found, the search is done
-    without such things too, and the likelier list is taken.
+    Several causes along one variable together may look like none of them. So where something
+    without a name is found, the search is done without such things too, and the likelier list is
+    taken.
 
     """
     everything = _grown(search)
     if all(is_named(each.candidate) for each in everything):
         return everything
-    named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates if is_named(each)]), banks={}, looked={}))
-    return max((everything, named), key=lambda each: work(search.field, each).score - sum(map(_price, each)))
+    named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates
+                                                            if is_named(each)]),
+                           banks={}, looked={}))
+    return max((everything, named),
+               key=lambda each: work(search.field, each).score - sum(map(_price, each)))
 
 
 def _price(known: Named) -> float:
@@ -532,7 +586,7 @@ def _price(known: Named) -> float:
 
 
 def price_of_freedom(known: Named) -> float:
-    """Return what the choice of its place and shapes, and the columns of a cause cost, in logarithms of the likelihood."""
+    """Return the price of place, shapes and columns of a cause, in logarithms of likelihood."""
     shapes = max(known.price, PRICE_OF_SHAPE * len(fitted_shapes(known.candidate)))
     return shapes + PRICE_OF_COLUMN * max(len(known.values) - 1, 0)
 
@@ -553,7 +607,8 @@ def _grown(search: Search) -> tuple[Named, ...]:
 def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
     """Take out causes that, beside the others, are not beyond chance, the weakest first."""
     while named:
-        left = [search.excess(each.candidate.cause, evidence_of(search, named, place)) for place, each in enumerate(named)]
+        left = [search.excess(each.candidate.cause, evidence_of(search, named, place))
+                for place, each in enumerate(named)]
         weakest = int(np.argmin(left))
         if left[weakest] > 0.0:
             break
@@ -569,16 +624,19 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
         step, _ = strongest(search, others)
         if step is None:
             return polished(search, others) if others else others
-        if step.named[-1].candidate.cause != known.candidate.cause and step.score > work(search.field, named).score + 1.0:
+        if (step.named[-1].candidate.cause != known.candidate.cause
+                and step.score > work(search.field, named).score + 1.0):
             return polished(search, step.named)
     return named
 
 
-def alternatives(search: Search, named: tuple[Named, ...], place: int) -> list[tuple[Named, float]]:
-    """Return the causes that may stand in the place of a named one, itself among them, with what they lack in likelihood."""
+def alternatives(search: Search, named: tuple[Named, ...],
+                 place: int) -> list[tuple[Named, float]]:
+    """Return the causes that may stand for a named one, and it, with what they lack in score."""
     cause = named[place].candidate.cause
     _, steps = strongest(search, named[:place] + named[place + 1:])
-    mine = max((step.score for step in steps if step.named[-1].candidate.cause == cause), default=np.inf)
+    mine = max((step.score for step in steps if step.named[-1].candidate.cause == cause),
+               default=np.inf)
     return [(step.named[-1], mine - step.score) for step in steps
             if mine - step.score < RULED_OUT and is_named(step.named[-1].candidate)]
 
@@ -586,4 +644,5 @@ def alternatives(search: Search, named: tuple[Named, ...], place: int) -> list[t
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the evidence of one of the causes beside the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
-    return work(search.field, named).score - work(search.field, others).score - price_of_freedom(named[place])
+    return (work(search.field, named).score - work(search.field, others).score
+            - price_of_freedom(named[place]))

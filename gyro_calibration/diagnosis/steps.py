@@ -11,10 +11,12 @@ from scipy.stats import chi2, norm
 
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.diagnosis.curves import beside_model, curves, heading_curve, noise_curve, what_is_left
+from gyro_calibration.diagnosis.curves import (beside_model, curves, heading_curve, noise_curve,
+                                               what_is_left)
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.experiment import separating
-from gyro_calibration.diagnosis.extension import calibrated, doubts_scale, extended, left_out, noted, with_findings
+from gyro_calibration.diagnosis.extension import (calibrated, doubts_scale, extended, left_out,
+                                                  noted, with_findings)
 from gyro_calibration.diagnosis.field import Named, filtered, work
 from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figures
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
@@ -27,14 +29,16 @@ from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.diagnosis.search import MOST_OF, Search, alternatives, begin, evidence_of, polished, pruned, searched
+from gyro_calibration.diagnosis.search import (MOST_OF, Search, alternatives, begin, evidence_of,
+                                               polished, pruned, searched)
 from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.effects import QUANTIZATION
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
 
-#: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of bias and of scale factor error.
+#: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of
+#: bias and of scale factor error.
 _OF_SEARCH, _OF_NOISE, _OF_BIAS = 0.6, 0.03, 0.05
 #: An effect along the rate that is larger than this part of it is not named.
 _LARGEST = 0.5
@@ -43,15 +47,17 @@ _REPEATS = 1e-3
 #: Causes named from a temperature must repeat.
 _MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
 #: What is said of a channel that is constant, and the variable that is constant with it.
-_HARDLY = {'temperature': 'the temperature hardly changes', 'supply': 'the supply voltage does not change',
+_HARDLY = {'temperature': 'the temperature hardly changes',
+           'supply': 'the supply voltage does not change',
            'specific_force': 'the specific force does not change'}
 _WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
 Say = Callable[[str], object]
 
 
-def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None, rate: float = 0.01,
-             names: Sequence[str] = (), say: Say = lambda step: None, kind: str | None = None) -> Diagnosis:
+def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
+             rate: float = 0.01, names: Sequence[str] = (), say: Say = lambda step: None,
+             kind: str | None = None) -> Diagnosis:
     """
     Say what a simulation gets wrong, and why.
 
@@ -59,7 +65,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     ----------
     logs : of one gyro, with time, and a reference unless it rests
     generator : source of what is drawn: residuals of noise alone, and blocks for intervals
-    model : of the simulation; an ideal gyro with the bias and scale factor error that fit best where it is None
+    model : of the simulation; an ideal gyro with the bias and scale factor error that fit best
+        where it is None
     rate : of false alarms a diagnosis
     names : of the logs, for people
     say : is told each step as it begins
@@ -88,8 +95,8 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     say('hygiene')
     hygiene = [decided(inspect(log, model)) for log in logs]
     say('replay')
-    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval, clean.heading_step, clean.step, model)
-               for log, clean in zip(logs, hygiene)]
+    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval,
+                      clean.heading_step, clean.step, model) for log, clean in zip(logs, hygiene)]
     say('search')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate)
     named, unnamed = _parted(search, everything)
@@ -101,23 +108,31 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     figures = noise_figures(found.work, *_said_of_noise(model, hygiene))
     say('gain')
     changed = [] if model is None else _of_model(found, model, figures.noise, rate)
-    causes = {each.candidate.cause for known, members in zip(named, rivals) if known not in out for each in members}
-    won = gain(search, causes, model is not None) if (causes or changed) and not doubts_scale(found) else None
+    causes = {each.candidate.cause for known, members in zip(named, rivals) if known not in out
+              for each in members}
+    won = (gain(search, causes, model is not None)
+           if (causes or changed) and not doubts_scale(found) else None)
     say('report')
-    known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won, _cannot_show(search, logs))
-    result = replace(_told(known, hygiene, model, rate, names, generator), gates=tuple(gate for each in checked for gate in each),
+    known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won,
+                        _cannot_show(search, logs))
+    result = replace(_told(known, hygiene, model, rate, names, generator),
+                     gates=tuple(gate for each in checked for gate in each),
                      reference=told[0] if len(logs) == 1 else None)
     return _checked_answer(result, model, given)
 
 
-def _checked_answer(found: Diagnosis, model: GyroModel | None, given: GyroModel | None) -> Diagnosis:
-    """Return a diagnosis that has a model that is left as it is in the words in which it was given."""
-    return replace(found, before=given, model=given) if given is not None and found.model is model else found
+def _checked_answer(found: Diagnosis, model: GyroModel | None,
+                    given: GyroModel | None) -> Diagnosis:
+    """Return a diagnosis whose model, where it is left as it is, is in the words given."""
+    return (replace(found, before=given, model=given)
+            if given is not None and found.model is model else found)
 
 
-def _mismatched(failed: Finding, checked: tuple[Gate, ...], model: GyroModel, names: Sequence[str], rate: float) -> Diagnosis:
-    """Return the diagnosis of a log whose gyro and reference do not belong together: that alone, and the model as it is."""
-    return Diagnosis((failed,), (), Noise(), model.noise, None, model, model, false_alarm_rate=rate, logs=tuple(names), gates=checked)
+def _mismatched(failed: Finding, checked: tuple[Gate, ...], model: GyroModel, names: Sequence[str],
+                rate: float) -> Diagnosis:
+    """Return the diagnosis of a gyro and a reference that do not match: the model as it is."""
+    return Diagnosis((failed,), (), Noise(), model.noise, None, model, model,
+                     false_alarm_rate=rate, logs=tuple(names), gates=checked)
 
 
 @dataclass(frozen=True)
@@ -156,13 +171,15 @@ class _Conclusion:
 
     @cached_property
     def inside(self) -> Outcome:
-        """Return the causes that the model can hold, in values: fitted without the others, as it will stand without them."""
+        """Return the causes that the model can hold, in values, fitted without the others."""
         kept = [each for each in self.found.named if each not in self.out]
-        return Outcome(work(self.search.field, kept), self.found.replays) if self.out else self.found
+        return (Outcome(work(self.search.field, kept), self.found.replays) if self.out
+                else self.found)
 
 
-def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: float) -> tuple[Search, tuple[Named, ...]]:
-    """Search, and once more where what is left is the noise of a filter, which passes for causes while it is taken for white."""
+def _searched(replays: Sequence[Replay], generator: np.random.Generator,
+              rate: float) -> tuple[Search, tuple[Named, ...]]:
+    """Search, and once more where what is left is filtered noise, which passes for causes."""
     search = begin(replays, generator, rate)
     everything = searched(search)
     as_filtered = filtered(work(search.field, everything))
@@ -173,9 +190,10 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: f
 
 
 def _said_of_noise(model: GyroModel | None, hygiene: Sequence[Hygiene]) -> tuple[Noise, bool]:
-    """Return the noise that a model states, none without a model, and whether its output is rounded besides: a new one has steps found."""
+    """Return the noise that a model states, none without one, and whether output is rounded."""
     if model is None:
-        return Noise(), any(each.effect == QUANTIZATION.name for clean in hygiene for each in clean.findings)
+        return Noise(), any(each.effect == QUANTIZATION.name for clean in hygiene
+                            for each in clean.findings)
     return model.noise, any(term.effect is QUANTIZATION for term in model.terms)
 
 
@@ -184,56 +202,69 @@ def _mended(log: Log, clean: Hygiene) -> Log:
     return log if clean.factor == 1.0 else replace(log, output=log.output * clean.factor)
 
 
-def _parted(search: Search, everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
+def _parted(search: Search,
+            everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
     """
     Part what is named from what is not.
 
-    A name is withdrawn where there is more along its variable than it explains, where tones are many, and where a cause named from a
-    temperature is another one in each log.
+    A name is withdrawn where there is more along its variable than it explains, where tones are
+    many, and where a cause named from a temperature is another one in each log.
 
     """
-    beyond = {name for each in everything if not is_named(each.candidate) for name in along(each.candidate).split(' and ')}
-    tones = [each.candidate.run for each in everything if each.candidate.cause == 'interference_tone']
+    beyond = {name for each in everything if not is_named(each.candidate)
+              for name in along(each.candidate).split(' and ')}
+    tones = [each.candidate.run for each in everything
+             if each.candidate.cause == 'interference_tone']
     if any(tones.count(run) >= MOST_OF['interference_tone'] for run in tones):
         beyond.add('frequency')
-    kept = tuple(each for each in everything if is_named(each.candidate) and CAUSES[each.candidate.cause].along not in beyond)
-    kept = tuple(each for each in kept if _repeats(search, everything, each) and _is_small(search, each))
+    kept = tuple(each for each in everything if is_named(each.candidate)
+                 and CAUSES[each.candidate.cause].along not in beyond)
+    kept = tuple(each for each in kept
+                 if _repeats(search, everything, each) and _is_small(search, each))
     unnamed = tuple(each for each in everything if each not in kept)
     if not unnamed:
         return kept, ()
-    rest = tuple(each for each in unnamed if not is_named(each.candidate) or CAUSES[each.candidate.cause].along not in
+    rest = tuple(each for each in unnamed if not is_named(each.candidate)
+                 or CAUSES[each.candidate.cause].along not in
                  {along(other.candidate) for other in unnamed if not is_named(other.candidate)})
     left = pruned(search, polished(search, (*kept, *rest)))
     return tuple(each for each in left if any(_same(each, one) for one in kept)), rest
 
 
 def _is_small(search: Search, known: Named) -> bool:
-    """Tell whether an effect along the rate is small beside it, as those of a gyro are: another one has only its shape."""
+    """Tell whether an effect along the rate is small beside it, as those of a gyro are."""
     if CAUSES[known.candidate.cause].along != 'rate' or known.candidate.amplitude is not None:
         return True
-    most = [float(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)), 1)).max()) for each in search.field.replays]
-    return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max()) for each in search.field.replays)
+    most = [float(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
+                                      1)).max()) for each in search.field.replays]
+    return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max())
+                                      for each in search.field.replays)
 
 
 def _same(one: Named, other: Named) -> bool:
-    return one.candidate.cause == other.candidate.cause and one.candidate.run == other.candidate.run
+    return (one.candidate.cause == other.candidate.cause
+            and one.candidate.run == other.candidate.run)
 
 
 def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:
-    """Tell whether a cause named from a temperature is the same in all logs, as far as chance allows."""
+    """Tell whether a cause from a temperature is the same in all logs, but for chance."""
     candidate, runs = known.candidate, len(search.field.replays)
-    if runs == 1 or CAUSES[candidate.cause].along not in _MUST_REPEAT or not known.values or candidate.amplitude is not None:
+    if (runs == 1 or CAUSES[candidate.cause].along not in _MUST_REPEAT or not known.values
+            or candidate.amplitude is not None):
         return True
     alone = [replace(candidate, run=run) for run in range(runs - 1)]
-    more = 2.0 * (work(search.field, everything, alone).score - work(search.field, everything).score)
+    more = 2.0 * (work(search.field, everything, alone).score
+                  - work(search.field, everything).score)
     return bool(chi2.sf(max(more, 0.0), len(known.values) * len(alone)) > _REPEATS)
 
 
-def _simplest(search: Search, named: tuple[Named, ...], unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
+def _simplest(search: Search, named: tuple[Named, ...],
+              unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
     """Put the simplest member of each set in its place, and return all members of each."""
     rivals: list[list[Named]] = []
     for place in range(len(named)):
-        members = [each for each, _ in alternatives(search, (*named, *unnamed), place)] or [named[place]]
+        members = ([each for each, _ in alternatives(search, (*named, *unnamed), place)]
+                   or [named[place]])
         sizes = [_size(search, each) for each in members]
         chosen = members[int(np.argmin(sizes))]
         if min(sizes) < _size(search, named[place]):
@@ -245,26 +276,34 @@ def _simplest(search: Search, named: tuple[Named, ...], unnamed: tuple[Named, ..
 def _size(search: Search, known: Named) -> int:
     """Return how many values a cause has."""
     candidate = known.candidate
-    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else len(candidate.columns(search.field.replays[0])))
+    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else
+                                            len(candidate.columns(search.field.replays[0])))
 
 
-def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float, names: Sequence[str],
-          generator: np.random.Generator) -> Diagnosis:
+def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float,
+          names: Sequence[str], generator: np.random.Generator) -> Diagnosis:
     """Put all that was found into words and records."""
-    search, found, noise, simulated = known.search, known.found, known.figures.noise, Noise() if model is None else model.noise
+    search, found, noise, simulated = (known.search, known.found, known.figures.noise,
+                                       Noise() if model is None else model.noise)
     of_record = _once([each for clean in hygiene for each in clean.findings])
     said = {name for each in of_record for name in each.ambiguous_with}
-    findings = [*_named(known, generator), *of_record, *(each for each in known.changed if each.effect not in said)]
+    findings = [*_named(known, generator), *of_record,
+                *(each for each in known.changed if each.effect not in said)]
     if model is not None:
         findings += _of_noise(known.figures, model.noise, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
-    plain, deviation = Outcome(work(search.field, []), found.replays), _bias_deviation(known.inside, noise)
-    before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise), GyroModel(), hygiene)
-    after = with_findings(model, known.inside, hygiene, findings, noise, deviation) if known.offered else before
-    # Bias and scale factor error that are not found to differ are drawn as they fit best: they may differ by chance.
-    left, shown = beside_model(found.replays) if known.changed else what_is_left(plain), known.inside if known.offered else plain
+    plain, deviation = (Outcome(work(search.field, []), found.replays),
+                        _bias_deviation(known.inside, noise))
+    before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise),
+                            GyroModel(), hygiene)
+    after = (with_findings(model, known.inside, hygiene, findings, noise, deviation)
+             if known.offered else before)
+    # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
+    left, shown = (beside_model(found.replays) if known.changed else what_is_left(plain),
+                   known.inside if known.offered else plain)
     return Diagnosis(
-        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated, known.won, before, after, known.cannot_show,
+        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated,
+        known.won, before, after, known.cannot_show,
         curves(left, shown), heading_curve(left, shown), noise_curve(found, noise, simulated),
         tuple(_remarks(hygiene, names, known, model)), rate, tuple(names))
 
@@ -273,16 +312,20 @@ def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
     """Return the causes that were named."""
     search, found, findings = known.search, known.found, []
     for place, (each, members) in enumerate(zip(found.named, known.rivals)):
-        chance = search.chance.p_value(each.candidate.cause, evidence_of(search, (*found.named, *known.unnamed), place))
-        findings.append(named_finding(search, found, place, chance, members, _separated(search, found, place, members, generator)))
+        chance = search.chance.p_value(each.candidate.cause,
+                                       evidence_of(search, (*found.named, *known.unnamed), place))
+        findings.append(named_finding(search, found, place, chance, members,
+                                      _separated(search, found, place, members, generator)))
     return findings
 
 
-def _separated(search: Search, found: Outcome, place: int, members: Sequence[Named], generator: np.random.Generator) -> str:
+def _separated(search: Search, found: Outcome, place: int, members: Sequence[Named],
+               generator: np.random.Generator) -> str:
     """Return the experiment that parts the members of a set."""
     known = found.named[place]
     others = [each for each in members if each.candidate.cause != known.candidate.cause]
-    return separating(search.field, found.named, known, others, generator).sentence if others else ''
+    return (separating(search.field, found.named, known, others, generator).sentence if others
+            else '')
 
 
 def _once(findings: Sequence[Finding]) -> list[Finding]:
@@ -296,57 +339,71 @@ def _once(findings: Sequence[Finding]) -> list[Finding]:
 
 def _bias_deviation(found: Outcome, noise: Noise) -> float:
     """Return the standard deviation of the mean bias of the logs, rad/s."""
-    each = [noise.heading_variance(replay.duration) / replay.duration ** 2 for replay in found.replays]
+    each = [noise.heading_variance(replay.duration) / replay.duration ** 2
+            for replay in found.replays]
     return float(np.sqrt(np.mean(each) / len(each) + found.bias_variance))
 
 
 def _of_model(found: Outcome, model: GyroModel, noise: Noise, rate: float) -> list[Finding]:
-    """Return bias and scale factor error as findings, where they differ from the model's beyond chance."""
+    """Return bias and scale factor error as findings, where they are not those of the model."""
     scale, bias = found.scale_factor_error, float(np.mean(found.biases))
     own = [_own_deviation(model, name) for name in ('bias', 'scale_factor_error')]
-    # A bias that a model allows to wander is no other bias; one log says little of how far it does.
-    likely = Noise(noise.angle_random_walk, *(max(getattr(each, name) for each in (noise, model.noise)) for name in NAMES[1:]))
+    # A bias that a model allows to wander is no other bias; one log hardly says how far.
+    likely = Noise(noise.angle_random_walk, *(max(getattr(each, name)
+                                                  for each in (noise, model.noise))
+                                              for name in NAMES[1:]))
     doubts = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
-    told = [('bias', bias, doubts[0], ()), ('scale_factor_error', scale.value, doubts[1], ('reference_scale',))]
-    return [_against(name, value, float(deviation), twins) for name, value, deviation, twins in told
+    told = [('bias', bias, doubts[0], ()),
+            ('scale_factor_error', scale.value, doubts[1], ('reference_scale',))]
+    return [_against(name, value, float(deviation), twins)
+            for name, value, deviation, twins in told
             if deviation > 0.0 and 2.0 * norm.sf(abs(value) / deviation) < _OF_BIAS * rate]
 
 
 def _own_deviation(model: GyroModel, name: str) -> float:
-    """Return the standard deviation that a model states for a value of its own, 0 where it states none."""
+    """Return the standard deviation that a model states for one of its values, or 0."""
     if model.covariance is None:
         return 0.0
     owners = [term.effect.name for term in model.terms for _ in term.fitted]
-    return float(np.sqrt(model.covariance[owners.index(name), owners.index(name)])) if name in owners else 0.0
+    return (float(np.sqrt(model.covariance[owners.index(name), owners.index(name)]))
+            if name in owners else 0.0)
 
 
 def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) -> Finding:
     cause = CAUSES[name]
     unit = next(iter(cause.units.values()))
-    return Finding(name, cause.sentence, {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
-                   float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins, cause.separate_by if twins else '',
-                   f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
+    return Finding(
+        name, cause.sentence,
+        {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
+        float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins,
+        cause.separate_by if twins else '', 'it comes on top of that of the model, '
+        f'{abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
 
 
-def _of_noise(figures: NoiseFigures, expected: Noise, rate: float, replays: Sequence[Replay]) -> list[Finding]:
+def _of_noise(figures: NoiseFigures, expected: Noise, rate: float,
+              replays: Sequence[Replay]) -> list[Finding]:
     """Return the noise figures that are not those of the model."""
     found = []
-    for name in NAMES[1:] if any(each.rounded for each in replays) else NAMES:  # the steps of an encoder hide white noise
+    # The steps of an encoder hide white noise.
+    for name in NAMES[1:] if any(each.rounded for each in replays) else NAMES:
         if figures.chance.get(name, 1.0) < _OF_NOISE * rate:
             cause, value = CAUSES[name], getattr(figures.noise, name)
             unit = next(iter(cause.units.values()))
-            said = f'the model says {amount(getattr(expected, name), unit, name)}, the log {amount(value, unit, name)}'
-            found.append(Finding(name, cause.sentence, {name: Estimate(value, figures.interval[name], unit)}, figures.chance[name], None,
-                                 evidence=said, along=cause.along))
+            said = (f'the model says {amount(getattr(expected, name), unit, name)}, the log '
+                    f'{amount(value, unit, name)}')
+            found.append(Finding(name, cause.sentence,
+                                 {name: Estimate(value, figures.interval[name], unit)},
+                                 figures.chance[name], None, evidence=said, along=cause.along))
     return found
 
 
 def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
-    """Say of each cause that was not searched for, or could not be found, why these logs cannot show it."""
+    """Say why these logs cannot show each cause that was not searched for or not found."""
     replays = search.field.replays
     has = frozenset.intersection(*(each.has for each in replays)) | {'time', 'output'}
     of_motion = frozenset({'reference', *REFERENCES})
-    has |= of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES) else frozenset()
+    has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
+            else frozenset())
     moves = any(np.any(each.reference[each.kept] != 0.0) for each in replays)
     told = {}
     for name, cause in CAUSES.items():
@@ -356,7 +413,8 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
         elif not moves and cause.needs & of_motion:
             told[name] = 'the reference shows no motion'
     for name, reason in _constant(replays).items():
-        told.update({cause.name: reason for cause in CAUSES.values() if cause.along == name and cause.name not in told})
+        told.update({cause.name: reason for cause in CAUSES.values()
+                     if cause.along == name and cause.name not in told})
     alike = 'in these logs it would look exactly like a bias or a scale factor error'
     told.update(dict.fromkeys(sorted(search.tied & (CAUSES.keys() - told.keys())), alike))
     return told
@@ -369,25 +427,33 @@ def _constant(replays: Sequence[Replay]) -> dict[str, str]:
     return {**quiet, **{other: quiet[name] for name, other in _WITH.items() if name in quiet}}
 
 
-def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion, model: GyroModel | None) -> Iterator[str]:
+def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion,
+             model: GyroModel | None) -> Iterator[str]:
     for place, clean in enumerate(hygiene):
         where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for name in dict.fromkeys(each.candidate.cause for each in known.unnamed if is_named(each.candidate)):
-        why = 'it is at many frequencies' if name == 'interference_tone' else 'it differs from log to log, or is not alone'
+    for name in dict.fromkeys(each.candidate.cause for each in known.unnamed
+                              if is_named(each.candidate)):
+        why = ('it is at many frequencies' if name == 'interference_tone'
+               else 'it differs from log to log, or is not alone')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
     yield from _of_what_is_left_out(known, model)
     if not known.offered:
-        yield 'On the parts held out, the extended model was worse than the one before; it is not offered.'
+        yield ('On the parts held out, the extended model was worse than the one before; it is '
+               'not offered.')
 
 
 def _of_what_is_left_out(known: _Conclusion, model: GyroModel | None) -> Iterator[str]:
     """Say what was found and is in no model, and why."""
-    scale, own = known.found.scale_factor_error, {term.effect.name for term in ([] if model is None else model.terms)}
+    scale, own = (known.found.scale_factor_error,
+                  {term.effect.name for term in ([] if model is None else model.terms)})
     if doubts_scale(known.found):
-        yield (f'A scale factor error of {100.0 * scale.value:.2g} +- {100.0 * scale.deviation:.1g} % is in no model: there is too little '
-               'motion beside the noise of gyro and reference for it to be believed; turn faster, and both ways.')
+        yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
+               f'{100.0 * scale.deviation:.1g} % is in no model: there is too little motion '
+               'beside the noise of gyro and reference for it to be believed; turn faster, and '
+               'both ways.')
     for name in dict.fromkeys(each.candidate.cause for each in known.out):
-        remedy = '; take that out of the model that is given, and diagnose again' if name in own else ''
-        yield (f'A further {name.replace("_", " ")} is not in the extended model, because that has one already and the two do not make '
-               f'one{remedy}.')
+        remedy = ('; take that out of the model that is given, and diagnose again' if name in own
+                  else '')
+        yield (f'A further {name.replace("_", " ")} is not in the extended model, because that '
+               f'has one already and the two do not make one{remedy}.')
