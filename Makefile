@@ -24,10 +24,11 @@ test timed evidence demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AM
 test: $(INSTALLED)
 	@$(MAKE) --no-print-directory --keep-going --jobs 3 style timed computing
 
-# what reads the code
+# what ROS reviewers run (flake8 with the plugins and settings of ament), ruff and mypy
 style:
 	@code=0; \
 	$(BIN)/python -m ruff check --quiet --output-format concise . || code=1; \
+	$(BIN)/python -m flake8 || code=1; \
 	$(BIN)/python -m mypy --no-error-summary gyro_calibration || code=1; \
 	exit $$code
 

@@ -1,0 +1,33 @@
+"""What ROS reviewers run, where it is installed; elsewhere `make style` runs the same checks."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.flake8
+@pytest.mark.linter
+def test_flake8(monkeypatch):
+    linter = pytest.importorskip('ament_flake8.main', reason='ament_flake8 is not installed')
+    monkeypatch.chdir(ROOT)
+    code, errors = linter.main_with_errors(argv=['--config', str(ROOT / '.flake8')])
+    assert code == 0, '\n'.join(errors)
+
+
+@pytest.mark.linter
+@pytest.mark.pep257
+def test_pep257(monkeypatch):
+    linter = pytest.importorskip('ament_pep257.main', reason='ament_pep257 is not installed')
+    monkeypatch.chdir(ROOT)
+    # the descriptions of parameters stand on the line of the name, where this check sees none
+    assert linter.main(argv=['--add-ignore', 'D417', '--', '.']) == 0
+
+
+@pytest.mark.copyright
+@pytest.mark.linter
+def test_copyright(monkeypatch):
+    linter = pytest.importorskip('ament_copyright.main', reason='ament_copyright is not installed')
+    monkeypatch.chdir(ROOT)
+    assert linter.main(argv=['.']) == 0
