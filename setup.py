@@ -46,34 +46,27 @@ else:
     launchers = ('bin', [f'bin/{name}'])
 
 setup(
-    name=name,
-    version=manifest.findtext('version'),
-    description=manifest.findtext('description'),
-    url=manifest.findtext("url[@type='website']"),
-    license=manifest.findtext('license'),
-    author=manifest.findtext('author'),
-    author_email=manifest.find('author').get('email'),
+    name=name, version=manifest.findtext('version'), description=manifest.findtext('description'),
+    url=manifest.findtext("url[@type='website']"), license=manifest.findtext('license'),
+    author=manifest.findtext('author'), author_email=manifest.find('author').get('email'),
     maintainer=manifest.findtext('maintainer'),
     maintainer_email=manifest.find('maintainer').get('email'),
-    packages=find_packages(include=[name, f'{name}.*']),
-    package_data={f'{name}.diagnosis': ['report.html']},
-    python_requires='>=3.10,<3.15',
-    install_requires=['numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'],
-    extras_require={'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED), 'plot': plot, 'test': test},
-    zip_safe=False,
-    entry_points={
+    packages=find_packages(include=[name, f'{name}.*']), package_data={
+        f'{name}.diagnosis': ['report.html']
+    }, python_requires='>=3.10,<3.15', install_requires=[
+        'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
+    ], extras_require={
+        'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED),
+        'plot': plot, 'test': test
+    }, zip_safe=False, entry_points={
         'console_scripts': [
             'gyro_calibration = gyro_calibration.cli.main:main',
             'driver_node = gyro_calibration.ros.driver_node:main',
             'compensation_node = gyro_calibration.ros.compensation_node:main',
         ],
-    },
-    data_files=[
-        ('share/ament_index/resource_index/packages', [f'resource/{name}']),
-        (f'share/{name}', ['package.xml']),
-        (f'share/{name}/config', sorted(glob('config/*.*'))),
-        (f'share/{name}/config/sros2', sorted(glob('config/sros2/*'))),
-        (f'share/{name}/launch', sorted(glob('launch/*.launch.py'))),
-        launchers,
-    ],
+    }, data_files=[('share/ament_index/resource_index/packages', [f'resource/{name}']),
+                   (f'share/{name}', ['package.xml']),
+                   (f'share/{name}/config', sorted(glob('config/*.*'))),
+                   (f'share/{name}/config/sros2', sorted(glob('config/sros2/*'))),
+                   (f'share/{name}/launch', sorted(glob('launch/*.launch.py'))), launchers, ],
 )

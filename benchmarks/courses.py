@@ -4,14 +4,16 @@ Calibrate a gyro on half of a drive against its course over ground, and correct 
     python benchmarks/courses.py drives FOLDER      recordings, as `wheeled_drives`
     python benchmarks/courses.py simulated [DRIVES] drives of a simulator of its own
 
-A model is judged by the heading that it gives in the half that it was not fitted on: the output is corrected and integrated, and
-compared with the course within windows of 60 s, each less its mean, at the lag where it fits best. Three models compete: nothing (no
-correction), a robust least squares (course = (1 + s) integral + b t + c at the best lag, residuals by their size), and `calibrate_encoder`
-as the verb `fit` calls it. A refusal counts as nothing.
+A model is judged by the heading that it gives in the half that it was not fitted on: the output is
+corrected and integrated, and compared with the course within windows of 60 s, each less its mean,
+at the lag where it fits best. Three models compete: nothing (no correction), a robust least
+squares (course = (1 + s) integral + b t + c at the best lag, residuals by their size), and
+`calibrate_encoder` as the verb `fit` calls it. A refusal counts as nothing.
 
-The simulated car follows a bicycle model with side slip, its course comes at 10 Hz, smoothed over some tenths of a second, late or early,
-with noise that is correlated over a second, gaps below a walking speed and under bridges. The gyro has bias, scale factor error, white
-noise and a wandering bias. None of it is code of the package.
+The simulated car follows a bicycle model with side slip, its course comes at 10 Hz, smoothed over
+some tenths of a second, late or early, with noise that is correlated over a second, gaps below a
+walking speed and under bridges. The gyro has bias, scale factor error, white noise and a wandering
+bias. None of it is code of the package.
 
 """
 
@@ -36,13 +38,21 @@ def half(log: Log, second: bool) -> Log:
     """Return the first or the second half of a log."""
     assert log.time is not None and log.output is not None and log.reference_heading is not None
     kept = (log.time > log.time[0] + 0.5 * (log.time[-1] - log.time[0])) == second
-    return Log(time=log.time[kept], output=log.output[kept], reference_heading=log.reference_heading[kept])
+    return Log(time=log.time[kept], output=log.output[kept],
+               reference_heading=log.reference_heading[kept])
 
 
-def points(log: Log, lag: float, bias: float = 0.0, scale: float = 1.0) -> tuple[Array, Array, Array]:
-    """Return times, corrected headings and courses at points where the course is known, the gyro being `lag` s late."""
+def points(log: Log, lag: float, bias: float = 0.0,
+           scale: float = 1.0) -> tuple[Array, Array, Array]:
+    """
+    Return times, corrected headings and courses at points where the course is known.
+
+    The gyro being `lag` s late.
+    """
     known = np.flatnonzero(np.isfinite(log.reference_heading))
-    at = known[np.unique(np.searchsorted(log.time[known], np.arange(log.time[known[0]], log.time[known[-1]], POINT)))]
+    at = known[np.unique(
+        np.searchsorted(log.time[known], np.arange(log.time[known[0]], log.time[known[-1]],
+                                                   POINT)))]
     at = at[(log.time[at] + lag >= log.time[0]) & (log.time[at] + lag <= log.time[-1])]
     interval = np.diff(log.time, prepend=log.time[0])
     rate = (log.output - bias) / scale
@@ -65,11 +75,16 @@ def error(log: Log, bias: float, scale: float) -> float:
 
 
 def robust(log: Log) -> tuple[float, float]:
-    """Return bias and scale by least squares of the course on the integral, residuals counting by their size, at the best lag."""
+    """
+    Return bias and scale by least squares of the course on the integral.
+
+    Residuals counting by their size, at the best lag.
+    """
     best = (math.inf, 0.0, 1.0)
     for lag in LAGS:
         time, turned, course = points(log, lag)
-        columns, weights = np.column_stack([turned, time - time[0], np.ones(len(time))]), np.ones(len(time))
+        columns, weights = np.column_stack([turned, time - time[0],
+                                            np.ones(len(time))]), np.ones(len(time))
         for _ in range(8):
             values = np.linalg.lstsq(columns * weights[:, None], course * weights, rcond=None)[0]
             off = np.abs(course - columns @ values)
@@ -89,7 +104,8 @@ def judged(name: str, log: Log) -> Iterator[tuple[str, float, float, float, str]
             ours = error(other, found.bias, 1.0 + found.scale_factor_error)
             deviation = np.sqrt(np.diag(found.covariance))
             words = (f's {100 * found.scale_factor_error:+.2f} +- {100 * deviation[0]:.2f} %, '
-                     f'b {found.bias / DEGREE:+.4f} +- {deviation[1] / DEGREE:.4f} deg/s, lag {found.time_offset:+.2f} s')
+                     f'b {found.bias / DEGREE:+.4f} +- {deviation[1] / DEGREE:.4f} deg/s, lag '
+                     f'{found.time_offset:+.2f} s')
         except DataRefused as refusal:
             ours, words = math.nan, f'refused: {refusal}'
         s = robust(mine)
@@ -100,13 +116,17 @@ def judged(name: str, log: Log) -> Iterator[tuple[str, float, float, float, str]
 def table(rows: list[tuple[str, float, float, float, str]]) -> Iterator[str]:
     """Give a line a half, and the ratios to the better of nothing and least squares."""
     for name, nothing, squares, ours, words in rows:
-        yield f'{name:28s} {nothing / DEGREE:8.3f} {squares / DEGREE:8.3f} {ours / DEGREE:8.3f}  {words}'
+        yield (f'{name:28s} {nothing / DEGREE:8.3f} {squares / DEGREE:8.3f} '
+               f'{ours / DEGREE:8.3f}  {words}')
     values = np.array([row[1:4] for row in rows])
     refused = np.isnan(values[:, 2])
     ratio = np.where(refused, values[:, 0], values[:, 2]) / np.minimum(values[:, 0], values[:, 1])
-    yield (f'{len(rows)} halves, {refused.sum()} refused; error over the better of nothing and least squares: median '
-           f'{np.median(ratio):.2f}, nine in ten {np.quantile(ratio, 0.9):.2f}, worst {ratio.max():.2f}; over least squares alone: median '
-           f'{np.nanmedian(values[:, 2] / values[:, 1]):.2f}, nine in ten {np.nanquantile(values[:, 2] / values[:, 1], 0.9):.2f}')
+    yield (f'{len(rows)} halves, {refused.sum()} refused; error over the better of nothing and '
+           'least squares: median '
+           f'{np.median(ratio):.2f}, nine in ten {np.quantile(ratio, 0.9):.2f}, worst '
+           f'{ratio.max():.2f}; over least squares alone: median '
+           f'{np.nanmedian(values[:, 2] / values[:, 1]):.2f}, nine in ten '
+           f'{np.nanquantile(values[:, 2] / values[:, 1], 0.9):.2f}')
 
 
 # a simulator of its own
@@ -118,8 +138,8 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     """
     Return a drive of four minutes, and the bias and scale of its gyro.
 
-    A car in town (little turning, stops, bursts of bad fixes, bias near zero) or a small quick one (turns all the time, a consumer
-    gyro, another delay each drive).
+    A car in town (little turning, stops, bursts of bad fixes, bias near zero) or a small quick one
+    (turns all the time, a consumer gyro, another delay each drive).
 
     """
     count = 240 * RATE
@@ -129,19 +149,26 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     if town:
         steering *= generator.uniform(size=len(knots)) < 0.4
     rate = np.interp(time, knots, steering)
-    speed = np.abs(np.interp(time, knots, generator.uniform(-2.0 if town else 0.5, 12.0 if town else 3.0, len(knots))))
+    speed = np.abs(
+        np.interp(time, knots,
+                  generator.uniform(-2.0 if town else 0.5, 12.0 if town else 3.0, len(knots))))
     rate = rate * np.minimum(speed / 2.0, 1.0)
     heading = np.cumsum(rate) / RATE
-    # bicycle model: the rear axle is `behind` the antenna, tyres slip in proportion to the lateral acceleration
-    behind, softness = generator.uniform(-0.1, 0.1) * (10.0 if town else 1.0), generator.uniform(0.0, 0.01)
+    # bicycle model: the rear axle is `behind` the antenna, tyres slip in proportion to the lateral
+    # acceleration
+    behind, softness = generator.uniform(-0.1, 0.1) * (10.0 if town else 1.0), generator.uniform(
+        0.0, 0.01)
     slip = behind * rate / np.maximum(speed, 0.5) - softness * speed * rate
     width = int(generator.uniform(0.2, 0.5) * RATE)
     course = np.convolve(heading + slip, np.ones(2 * width + 1) / (2 * width + 1), mode='same')
     fixes = np.arange(0, count, RATE // FIXES)
     noise, kept = np.zeros(len(fixes)), np.exp(-1.0 / FIXES)
-    sizes = np.where(np.convolve(generator.uniform(size=len(fixes)) < 0.003 * town, np.ones(30), mode='same') > 0.0, 6.0, 0.5) * DEGREE
+    sizes = np.where(
+        np.convolve(generator.uniform(size=len(fixes)) < 0.003 * town, np.ones(30), mode='same')
+        > 0.0, 6.0, 0.5) * DEGREE
     for place in range(1, len(fixes)):
-        noise[place] = kept * noise[place - 1] + math.sqrt(1.0 - kept ** 2) * sizes[place] * generator.standard_normal()
+        noise[place] = kept * noise[place - 1] + math.sqrt(
+            1.0 - kept ** 2) * sizes[place] * generator.standard_normal()
     late = generator.uniform(-0.2, 0.2) if town else generator.uniform(-0.75, 0.75)
     seen = np.interp(time - late, time[fixes], course[fixes] + noise)
     lost = (speed < (3.0 if town else 0.6)) | (np.abs(time - generator.uniform(50.0, 200.0)) < 4.0)
@@ -149,7 +176,8 @@ def simulated(generator: np.random.Generator, town: bool) -> tuple[Log, float, f
     scale = 1.0 + generator.standard_normal() * (0.002 if town else 0.01)
     bias = generator.standard_normal() * (0.01 if town else 0.5) * DEGREE
     walk = np.cumsum(generator.standard_normal(count)) * 0.0004 * DEGREE / math.sqrt(RATE)
-    output = scale * rate + bias + walk + generator.standard_normal(count) * 0.01 * DEGREE * math.sqrt(RATE)
+    output = scale * rate + bias + walk + generator.standard_normal(
+        count) * 0.01 * DEGREE * math.sqrt(RATE)
     return Log(time=time, output=output, reference_heading=seen), bias, scale
 
 
@@ -164,10 +192,12 @@ def held(drives: int) -> Iterator[str]:
             except DataRefused:
                 refused += 1
                 continue
-            off = np.array([fit.scale_factor_error + 1.0 - scale, fit.bias - bias]) / np.sqrt(np.diag(fit.covariance))
+            off = np.array([fit.scale_factor_error + 1.0 - scale, fit.bias - bias]) / np.sqrt(
+                np.diag(fit.covariance))
             hits.append(np.abs(off) < 1.96)
         share = np.mean(hits, axis=0) if hits else np.full(2, math.nan)
-        yield (f'{"town" if town else "small car"}: {refused} of {drives} refused; 95 % intervals hold the scale factor error in '
+        yield (f'{"town" if town else "small car"}: {refused} of {drives} refused; 95 % intervals '
+               'hold the scale factor error in '
                f'{share[0]:.2f}, the bias in {share[1]:.2f}')
 
 
@@ -175,12 +205,14 @@ def main(arguments: list[str]) -> None:
     """Print the table."""
     if arguments[:1] == ['drives']:
         files = sorted(Path(arguments[1]).glob('*.csv.gz'))
-        logs = ((path.name.removesuffix('.csv.gz'), read_log(path)) for path in files if 'as_recorded' not in path.name)
+        logs = ((path.name.removesuffix('.csv.gz'), read_log(path)) for path in files
+                if 'as_recorded' not in path.name)
     elif arguments[:1] == ['simulated']:
         drives = int(arguments[1]) if len(arguments) > 1 else 40
         print('\n'.join(held(drives)))
-        logs = ((f'{"town" if town else "small car"} {seed}', simulated(np.random.default_rng([seed, town]), town)[0])
-                for town in (False, True) for seed in range(drives // 4))
+        logs = ((f'{"town" if town else "small car"} {seed}',
+                 simulated(np.random.default_rng([seed, town]), town)[0]) for town in (False, True)
+                for seed in range(drives // 4))
     else:
         raise SystemExit(__doc__)
     rows = [row for name, log in logs for row in judged(name, log)]

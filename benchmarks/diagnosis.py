@@ -87,7 +87,8 @@ class Case:
     def __str__(self) -> str:
         what = '+'.join(self.names) or ('nothing' if self.part == 'nothing' else 'random')
         beside = '' if self.twins is None else f'({"|".join(self.twins)})'
-        return f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/{self.number}'
+        return (f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/'
+                f'{self.number}')
 
     @property
     def against_a_model(self) -> bool | None:

@@ -1,11 +1,16 @@
 """
-Calibrate on the first 20, 30 or 60 s of a swing against an encoder, and follow it for five minutes.
+Calibrate on the first 20, 30 or 60 s of a swing against an encoder.
 
-    python benchmarks/encoder_starts.py FOLDER [STEP]      FOLDER holds `mems_encoder_turntable`; a beginning every STEP s
+And follow it for five minutes.
 
-Prints the heading error over five minutes, rms in deg about its mean, the delay being the one that fits best: with nothing, with plain
-least squares on increments over 0.5 s (delay on a grid), and with `calibrate_encoder`; the root mean squares over the beginnings, the
-share of refusals, and how often a calibration that was answered is worse than nothing.
+    python benchmarks/encoder_starts.py FOLDER [STEP]
+
+FOLDER holds `mems_encoder_turntable`; there is a beginning every STEP s.
+
+Prints the heading error over five minutes, rms in deg about its mean, the delay being the one that
+fits best: with nothing, with plain least squares on increments over 0.5 s (delay on a grid), and
+with `calibrate_encoder`; the root mean squares over the beginnings, the share of refusals, and how
+often a calibration that was answered is worse than nothing.
 
 """
 
@@ -32,7 +37,11 @@ def integral(time: Array, rate: Array) -> Array:
 
 
 def squares(time: Array, output: Array, heading: Array) -> tuple[float, float]:
-    """Return bias and scale factor error by least squares on increments, at the delay that leaves least."""
+    """
+    Return bias and scale factor error by least squares on increments.
+
+    At the delay that leaves least.
+    """
     turned, best = integral(time, output), (math.inf, 0.0, 0.0)
     points = np.arange(time[0] + 0.1, time[-1] - 0.1, BLOCK)
     columns = np.column_stack([np.diff(np.interp(points, time, heading)), np.diff(points)])
@@ -47,12 +56,15 @@ def squares(time: Array, output: Array, heading: Array) -> tuple[float, float]:
 def error(time: Array, output: Array, heading: Array, bias: float, scale: float) -> float:
     """Return the heading error, rms about its mean, deg, at the best delay."""
     turned = integral(time, (output - bias) / (1.0 + scale))
-    return min(float(np.std(np.interp(time + lag, time, turned)[50:-50] - heading[50:-50])) for lag in LAGS[::2]) / DEGREE
+    return min(
+        float(np.std(np.interp(time + lag, time, turned)[50:-50] - heading[50:-50]))
+        for lag in LAGS[::2]) / DEGREE
 
 
 def main(folder: Path, step: float) -> None:
     """Print the table."""
-    print('| recording | on | nothing | increments | calibrated | the same, refusals as nothing | refused | worse than nothing |')
+    print('| recording | on | nothing | increments | calibrated | the same, refusals as nothing | '
+          'refused | worse than nothing |')
     print('|---|---|---|---|---|---|---|---|')
     for name, sense in SENSE.items():
         log = read_log(folder / 'mems_encoder_turntable' / f'{name}.csv.gz')
@@ -60,12 +72,15 @@ def main(folder: Path, step: float) -> None:
             rows = []
             for begin in np.arange(0.0, log.time[-1] - FOLLOWED, step):
                 inside = (log.time >= begin) & (log.time < begin + FOLLOWED)
-                time, output, heading = log.time[inside] - begin, sense * log.output[inside], log.reference_heading[inside]
+                time, output, heading = log.time[
+                    inside] - begin, sense * log.output[inside], log.reference_heading[inside]
                 run = time < seconds
                 given = time[run], output[run], heading[run]
-                nothing, plain = error(time, output, heading, 0.0, 0.0), error(time, output, heading, *squares(*given))
+                nothing, plain = error(time, output, heading, 0.0,
+                                       0.0), error(time, output, heading, *squares(*given))
                 try:
-                    fit = calibrate_encoder(Log(time=given[0], output=given[1], reference_heading=given[2])).fit
+                    fit = calibrate_encoder(
+                        Log(time=given[0], output=given[1], reference_heading=given[2])).fit
                     ours = error(time, output, heading, fit.bias, fit.scale_factor_error)
                 except DataRefused:
                     ours = math.nan
@@ -73,7 +88,8 @@ def main(folder: Path, step: float) -> None:
             values = np.array(rows)
             sizes = np.sqrt(np.nanmean(values ** 2, axis=0))
             print(f'| `{name}` | {seconds:.0f} s | ' + ' | '.join(f'{size:.1f}' for size in sizes)
-                  + f' | {np.isnan(values[:, 2]).sum()} of {len(values)} | {(values[:, 2] > values[:, 0]).sum()} |', flush=True)
+                  + f' | {np.isnan(values[:, 2]).sum()} of {len(values)} | '
+                    f'{(values[:, 2] > values[:, 0]).sum()} |', flush=True)
 
 
 if __name__ == '__main__':

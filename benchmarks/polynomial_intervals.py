@@ -3,9 +3,10 @@ How often the 95 % intervals of the polynomial of Ojeda, Chung and Borenstein ho
 
     python benchmarks/polynomial_intervals.py [TABLES]
 
-Simulated rate tables of 16 sweeps at as many temperatures, 13 rates up to 100 deg/s: an error that is a polynomial of the output (order
-3) and of temperature (order 2), noise of each dwell, and a scale that scatters from dwell to dwell and from sweep to sweep. Prints how
-often the intervals of the values hold, and those of the rate at all rates and temperatures of the table.
+Simulated rate tables of 16 sweeps at as many temperatures, 13 rates up to 100 deg/s: an error that
+is a polynomial of the output (order 3) and of temperature (order 2), noise of each dwell, and a
+scale that scatters from dwell to dwell and from sweep to sweep. Prints how often the intervals of
+the values hold, and those of the rate at all rates and temperatures of the table.
 
 """
 
@@ -33,11 +34,14 @@ def table(generator: np.random.Generator) -> tuple[Dwells, np.ndarray]:
     output = rate
     for _ in range(30):  # the error looks at the output
         w = output / (100.0 * DEGREE)
-        error = (0.006 + 0.1 * w + 0.012 * w ** 2 - 3.3 * w ** 3 + warm * (-0.24 * w) + 0.02 * warm ** 2 * w) * DEGREE
+        error = (0.006 + 0.1 * w + 0.012 * w ** 2 - 3.3 * w ** 3 + warm *
+                 (-0.24 * w) + 0.02 * warm ** 2 * w) * DEGREE
         output = rate + error
-    noise = DWELL * generator.standard_normal(len(rate)) + rate * (
-        DWELL_SCALE * generator.standard_normal(len(rate)) + SWEEP_SCALE * generator.standard_normal(16)[sweep])
-    return Dwells(rate, output + noise, temperature, np.full(len(rate), np.nan), sweep, ('',) * len(rate)), output
+    noise = DWELL * generator.standard_normal(
+        len(rate)) + rate * (DWELL_SCALE * generator.standard_normal(len(rate)) +
+                             SWEEP_SCALE * generator.standard_normal(16)[sweep])
+    return Dwells(rate, output + noise, temperature, np.full(len(rate), np.nan), sweep,
+                  ('', ) * len(rate)), output
 
 
 def main(tables: int) -> None:
@@ -58,8 +62,10 @@ def main(tables: int) -> None:
         reference.append(np.abs(values - true) < 1.96 * np.sqrt(np.diag(model.covariance)))
         fits.append(np.sqrt(np.diag(model.covariance)))
     by_value = 100.0 * np.mean(reference, axis=0)
-    print(f'{tables} tables: intervals of the values hold in {by_value.mean():.1f} % (by value from {by_value.min():.0f} to '
-          f'{by_value.max():.0f} %), of the rate in {100.0 * np.mean(held_rates):.1f} %; largest standard deviation of a value, median '
+    print(f'{tables} tables: intervals of the values hold in {by_value.mean():.1f} % (by value '
+          f'from {by_value.min():.0f} to '
+          f'{by_value.max():.0f} %), of the rate in {100.0 * np.mean(held_rates):.1f} %; largest '
+          'standard deviation of a value, median '
           f'{np.median(np.max(fits, axis=1)) / DEGREE:.3f} deg/s')
 
 

@@ -3,9 +3,9 @@ Diagnosis on real drives: the model of one part of a recording, judged by anothe
 
     python benchmarks/wild.py [--drives wid_02,rc_car_h_unit2] [--pairs] [--json FILE]
 
-The recordings are `wheeled_drives` of GYRO_CALIBRATION_DATA (see README.md there). Each half of a drive
-is diagnosed, and its model corrects the other half; with --pairs, so it does from drive h to i and
-from j to k of one unit. The error is that of the heading over 60 s against the course, at
+The recordings are `wheeled_drives` of GYRO_CALIBRATION_DATA (see README.md there). Each half of a
+drive is diagnosed, and its model corrects the other half; with --pairs, so it does from drive h to
+i and from j to k of one unit. The error is that of the heading over 60 s against the course, at
 the lag that is best for each model. It is given over the better one of doing nothing and of a
 robust least squares of bias, scale and lag, which saw the same part.
 
@@ -198,7 +198,8 @@ def main() -> None:
         for key in ('causes', 'again', 'values', 'agree')
     )
     print(
-        f'{len(table)} parts, {sum(bool(row["answered"]) for row in table)} answered; ratio: median '
+        f'{len(table)} parts, {sum(bool(row["answered"]) for row in table)} answered; ratio: '
+        'median '
         f'{np.median(ratios):.2f}, nine in ten {np.quantile(ratios, 0.9, method="higher"):.2f}, '
         f'worst {ratios.max():.2f}; {again} of {causes} causes in the other part too; '
         f'{same} of {values} values agree; '

@@ -1,9 +1,9 @@
 """
 The driver of a gyro and the compensation of its output, with their parameters from config.
 
-Topics: ``imu/data_raw``, ``imu/temperature``, ``imu/data``, ``heading``, ``yaw_rate``; ``odom`` and
-``cmd_vel`` under the names of the robot's base. A launch argument that is given goes before the
-parameter file, one that is left empty changes nothing.
+Topics: ``imu/data_raw``, ``imu/temperature``, ``imu/data``, ``heading``, ``yaw_rate``; ``odom``
+and ``cmd_vel`` under the names of the robot's base. A launch argument that is given goes before
+the parameter file, one that is left empty changes nothing.
 
 """
 

@@ -424,10 +424,12 @@ def test_what_comes_before_and_after_is_left_out(tmp_path, capsys):
     time, generator = np.arange(60000) * 0.05, np.random.default_rng(8)
     output = 0.1 * generator.standard_normal(len(time)) + np.exp(-time / 60.0)
     log = tmp_path / 'warm.csv'
-    np.savetxt(log, np.column_stack([time, output]), header='time_s,gyro_dps', delimiter=',', comments='', fmt='%.5f')
+    np.savetxt(log, np.column_stack([time, output]), header='time_s,gyro_dps', delimiter=',',
+               comments='', fmt='%.5f')
     assert main(['allan', str(log), '--from', '900', '--to', '2800', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert found['samples'] == 38001 and not found['rate_random_walk']['seen']
-    assert found['angle_random_walk']['value'] == pytest.approx(0.1 * math.sqrt(0.05) * math.pi / 180.0, rel=0.03)
+    assert found['angle_random_walk']['value'] == pytest.approx(
+        0.1 * math.sqrt(0.05) * math.pi / 180.0, rel=0.03)
     assert main(['allan', str(log), '--from', '4000']) == 1
     assert '--from 4000' in capsys.readouterr().err

@@ -318,13 +318,17 @@ def test_fewer_dwells_than_values_are_refused():
 # a polynomial of the output
 
 def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
-    """On this table 0.1.0 stated 46 deg/s for t0w1 = 0.097 deg/s, beside a residual of 0.045 deg/s."""
-    fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')), [rate_temperature_polynomial(3, 2)])
+    """
+    On this table 0.1.0 stated 46 deg/s for t0w1 = 0.097 deg/s, beside a residual of 0.045 deg/s.
+    """
+    fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
+                      [rate_temperature_polynomial(3, 2)])
     assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms
 
 
 def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
-    intervals = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'polynomial_intervals.py'))
+    intervals = runpy.run_path(
+        str(Path(__file__).parents[1] / 'benchmarks' / 'polynomial_intervals.py'))
     held = []
     for seed in range(10):
         table, output = intervals['table'](np.random.default_rng(seed))
@@ -332,6 +336,8 @@ def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
         at = channels_of(table).moving(table.rate, output)
         rows = np.array(model.terms[0].sensitivity(at))
         off = model.error(at) - (output - table.rate)
-        held.append(np.abs(off) < 1.96 * np.sqrt(np.einsum('ik,ij,jk->k', rows, model.covariance, rows)))
-    # errors at the rates of one table go together: 10 tables of 12 values each show the share to 0.02
+        held.append(
+            np.abs(off) < 1.96 * np.sqrt(np.einsum('ik,ij,jk->k', rows, model.covariance, rows)))
+    # errors at the rates of one table go together: 10 tables of 12 values each show the share to
+    # 0.02
     assert np.mean(held) > 0.95 - 4.0 * 0.02

@@ -73,8 +73,10 @@ def test_the_files_hold_what_they_say(log, run, tmp_path):
     assert code == 0 and 'warm up' in text and not errors
     assert set(os.listdir(tmp_path / 'found')) == FILES
     told = json.loads((tmp_path / 'found/diagnosis.json').read_text())
-    assert told['schema'] == 'gyro_calibration/diagnosis/2' and told['verdict'] == 'extended' and told['false_alarm_rate'] == 0.01
-    assert [finding['effect'] for finding in told['findings']] == ['warm_up'] and told['unexplained'] == []
+    assert told['schema'] == 'gyro_calibration/diagnosis/2' and told[
+        'verdict'] == 'extended' and told['false_alarm_rate'] == 0.01
+    assert [finding['effect']
+            for finding in told['findings']] == ['warm_up'] and told['unexplained'] == []
     check_finding(told['findings'][0])
     assert set(told['noise']) == {'angle_random_walk', 'bias_instability', 'rate_random_walk'}
     gain = told['gain']

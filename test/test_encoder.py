@@ -1,4 +1,8 @@
-"""Calibration against an encoder: what was put in is found, with true intervals, on simulated logs and on measured ones."""
+"""
+Calibration against an encoder.
+
+What was put in is found, with true intervals, on simulated logs and on measured ones.
+"""
 
 import math
 import runpy
@@ -18,7 +22,11 @@ INTERVAL = 0.01
 
 
 def swing(duration, speed=60.0, period=8.0):
-    """Return the motion that turns to and fro at a speed, deg/s, with ramps of 0.3 s and a rest of 0.4 s at each end."""
+    """
+    Return the motion that turns to and fro at a speed, deg/s.
+
+    With ramps of 0.3 s and a rest of 0.4 s at each end.
+    """
     half = np.cumsum([0.0, 0.3, period / 2 - 1.0, 0.3])
     knots = np.concatenate([half + start for start in np.arange(0.0, duration, period / 2)])
     rates = np.concatenate([np.array([0.0, 1.0, 1.0, 0.0]) * sign * speed * DEGREE
@@ -32,7 +40,8 @@ def log_of(motion, duration, noise=None, generator=None, step=0.088 * DEGREE, la
     output = (1 + S) * motion.rate_at(time - late) + B
     if noise is not None:
         output = output + simulate_noise(noise, len(time), INTERVAL, generator)
-    return Log(output=output, time=time, reference_heading=np.round(motion.heading_at(time) / step) * step)
+    return Log(output=output, time=time,
+               reference_heading=np.round(motion.heading_at(time) / step) * step)
 
 
 SWING = swing(120.0)
@@ -56,15 +65,16 @@ def test_the_model_holds_what_was_found():
 LATE = np.arange(len(CLEAN)) < 9990
 REST = from_rates(np.array([0.0, 100.0]), np.array([0.5, 0.5]))
 REFUSED = {
-    'no heading': (replace(CLEAN, reference_heading=None), 'reference_heading_deg'),
-    'no time': (replace(CLEAN, time=None), 'time_s'),
-    'lost reference': (
-        replace(CLEAN, reference_heading=np.where(LATE, np.nan, CLEAN.reference_heading)), 'the reference has a value in 10'),
-    'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)), 'the gyro has a value in 10'),
-    'short': (log_of(SWING, 5.0), 'at least 10 s'),
+    'no heading': (replace(
+        CLEAN, reference_heading=None), 'reference_heading_deg'), 'no time': (replace(
+            CLEAN, time=None), 'time_s'), 'lost reference': (replace(
+                CLEAN, reference_heading=np.where(LATE, np.nan, CLEAN.reference_heading)), 'the '
+                                                             'reference has a value in 10'),
+    'lost gyro': (replace(CLEAN, output=np.where(LATE, np.nan, CLEAN.output)), 'the gyro has a '
+                  'value in 10'), 'short': (log_of(SWING, 5.0), 'at least 10 s'),
     'one speed': (log_of(REST, 100.0), 'in both senses, or at another speed too, or with a rest'),
-    'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'),
-    'dead': (replace(CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead'),
+    'other way': (replace(CLEAN, output=-CLEAN.output), '--invert'), 'dead': (replace(
+        CLEAN, output=0.0 * CLEAN.output), 'the gyro is dead'),
 }
 
 
@@ -77,9 +87,15 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason(log, reason, metho
 
 
 def test_lost_samples_are_counted_and_do_not_look_like_bias():
-    """A hundred samples lost while turning one way would be 60 deg/s * 1 s over 100 s: 0.6 deg/s, were the stamps not believed."""
+    """
+    A hundred samples lost while turning one way would be 60 deg/s * 1 s over 100 s.
+
+    0.6 deg/s, were the stamps not believed.
+    """
     kept = ~((SWING.rate_at(CLEAN.time) > 1.0) & (np.arange(len(CLEAN)) % 40 == 7))
-    log = replace(CLEAN, **{name: getattr(CLEAN, name)[kept] for name in ('time', 'output', 'reference_heading')})
+    log = replace(
+        CLEAN,
+        **{name: getattr(CLEAN, name)[kept] for name in ('time', 'output', 'reference_heading')})
     found = calibrate_encoder(log)
     assert found.lost_samples == np.sum(~kept) > 80
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
@@ -87,28 +103,37 @@ def test_lost_samples_are_counted_and_do_not_look_like_bias():
 
 def test_a_reference_that_is_lost_at_times_is_bridged_by_the_gyro():
     lost = (CLEAN.time > 30.0) & (CLEAN.time < 34.0) | (CLEAN.time > 70.0) & (CLEAN.time < 71.0)
-    found = calibrate_encoder(replace(CLEAN, reference_heading=np.where(lost, np.nan, CLEAN.reference_heading)))
+    found = calibrate_encoder(
+        replace(CLEAN, reference_heading=np.where(lost, np.nan, CLEAN.reference_heading)))
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
     assert len(found.time) == np.sum(~lost)
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():
-    """A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large; the remark says 351."""
-    log = replace(CLEAN, output=(CLEAN.output - B) / (1 + S), reference_heading=CLEAN.reference_heading * 351 / 360)
+    """
+    A firmware that takes 351 for 360 deg makes a perfect gyro look 2.56 % too large.
+
+    The remark says 351.
+    """
+    log = replace(CLEAN, output=(CLEAN.output - B) / (1 + S),
+                  reference_heading=CLEAN.reference_heading * 351 / 360)
     found = calibrate_encoder(log)
     assert found.fit.scale_factor_error == pytest.approx(360 / 351 - 1, abs=5e-5)
     assert '351.0' in found.remarks[0]
 
 
 def test_the_temperature_of_the_log_is_that_of_the_model():
-    model = calibrate_encoder(replace(CLEAN, temperature=np.linspace(20.0, 30.0, len(CLEAN)))).model
-    assert (model.temperature_range, model.reference_temperature) == ((20.0, 30.0), pytest.approx(25.0))
+    model = calibrate_encoder(replace(CLEAN, temperature=np.linspace(20.0, 30.0,
+                                                                     len(CLEAN)))).model
+    assert (model.temperature_range, model.reference_temperature) == ((20.0, 30.0),
+                                                                      pytest.approx(25.0))
 
 
 def test_the_residual_heading_is_what_the_calibration_leaves():
     found = calibrate_encoder(CLEAN)
     assert found.before.largest > 10 * DEGREE
-    assert found.after.rms < 0.05 * DEGREE and found.after.rms < found.after.largest == np.abs(found.after.heading).max()
+    assert found.after.rms < 0.05 * DEGREE and found.after.rms < found.after.largest == np.abs(
+        found.after.heading).max()
 
 
 def benchmark(name):
@@ -116,34 +141,48 @@ def benchmark(name):
 
 
 def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders():
-    """Four standard errors of 40 runs; benchmarks/encoder_intervals.py does this for more noises and 400 runs."""
+    """
+    Four standard errors of 40 runs.
+
+    Benchmarks/encoder_intervals.py does this for more noises and 400 runs.
+    """
     run = benchmark('encoder_intervals')['run']
-    found = np.array([run(('white, flicker, rate random walk', seed, 300.0)) for seed in range(40)])
+    found = np.array([run(('white, flicker, rate '
+                           'random walk', seed, 300.0)) for seed in range(40)])
     within = (np.abs(found[:, 0]) < 1.96 * found[:, 1]).mean(axis=0)
     assert (within > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / 40)).all(), within
-    assert (found[:, 1].mean(axis=0) < 3.0 * np.sqrt((found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
+    assert (found[:, 1].mean(axis=0) < 3.0 * np.sqrt(
+        (found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
 @pytest.mark.parametrize('step, noise', [(0.088, 0.02), (5.0, 0.5)])
 def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(step, noise):
-    """Within three standard errors of 40 runs of a ratio of 1.1; benchmarks/efficiency.py does this for more cases and runs."""
+    """
+    Within three standard errors of 40 runs of a ratio of 1.1.
+
+    Benchmarks/efficiency.py does this for more cases and runs.
+    """
     of = benchmark('efficiency')
     found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2] for seed in range(40)])
     ratios = (found ** 2).mean(axis=0) / of['bound'](step * DEGREE, noise * DEGREE, False)
-    assert (ratios[0] < 1.1 * (1.0 + 3.0 * math.sqrt(2.0 / 40))).all() and (ratios[1] > 3.0).all(), ratios
+    assert (ratios[0] < 1.1 *
+            (1.0 + 3.0 * math.sqrt(2.0 / 40))).all() and (ratios[1] > 3.0).all(), ratios
 
 
 def test_the_rate_of_the_encoder_finds_the_truth_where_nothing_is_late():
-    found = calibrate_encoder(log_of(SWING, 100.0, Noise(0.3 * DEGREE / 60), np.random.default_rng(1)), 'rate')
+    found = calibrate_encoder(
+        log_of(SWING, 100.0, Noise(0.3 * DEGREE / 60), np.random.default_rng(1)), 'rate')
     errors = np.abs((found.fit.scale_factor_error - S, found.fit.bias - B))
-    assert (errors < 4.0 * np.sqrt(np.diag(found.fit.covariance))).all() and math.isnan(found.fit.time_offset)
+    assert (errors < 4.0 * np.sqrt(np.diag(found.fit.covariance))).all() and math.isnan(
+        found.fit.time_offset)
 
 
 def test_the_rate_of_the_encoder_takes_a_late_gyro_for_scale_and_the_remark_says_so():
     """By 0.25 % for 50 ms on ramps of 0.3 s; by more where the motion is not smooth."""
     late = log_of(SWING, 100.0, late=0.05)
     by_rate, by_likelihood = (calibrate_encoder(late, method) for method in ('rate', 'likelihood'))
-    assert by_rate.fit.scale_factor_error - S > 0.002 > 50.0 * abs(by_likelihood.fit.scale_factor_error - S)
+    assert by_rate.fit.scale_factor_error - S > 0.002 > 50.0 * abs(
+        by_likelihood.fit.scale_factor_error - S)
     assert 'no time offset' in by_rate.remarks[1]
 
 
@@ -154,7 +193,8 @@ MEASURED = {'yaw_slow': (-1.0, 0.006), 'yaw_fast': (-1.0, 0.006), 'pitch_slow': 
 def measured(data, name, start=0.0, end=1500.0):
     log = read_log(data / 'mems_encoder_turntable' / f'{name}.csv.gz')
     kept = (log.time >= start) & (log.time < end)
-    return Log(output=MEASURED[name][0] * log.output[kept], time=log.time[kept], reference_heading=log.reference_heading[kept])
+    return Log(output=MEASURED[name][0] * log.output[kept], time=log.time[kept],
+               reference_heading=log.reference_heading[kept])
 
 
 @pytest.mark.parametrize('name', MEASURED)
@@ -166,29 +206,45 @@ def test_measured_gyros_are_12_ms_late_and_that_is_not_taken_for_scale(data, nam
 
 
 def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
-    """Ten pieces of 2.5 minutes: the scatter of s and b is between a third and twice of what is stated."""
-    fits = [calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit for start in np.arange(0.0, 1490.0, 150.0)]
+    """
+    Ten pieces of 2.5 minutes.
+
+    The scatter of s and b is between a third and twice of what is stated.
+    """
+    fits = [
+        calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit
+        for start in np.arange(0.0, 1490.0, 150.0)
+    ]
     scatter = np.std([(fit.scale_factor_error, fit.bias) for fit in fits], axis=0, ddof=1)
     stated = np.sqrt(np.mean([np.diag(fit.covariance) for fit in fits], axis=0))
     assert (scatter < 2.0 * stated).all() and (scatter > stated / 3.0).all(), (scatter, stated)
 
 
 def test_one_half_of_a_measured_log_predicts_the_other(data):
-    first, second = (calibrate_encoder(measured(data, 'yaw_slow', start, start + 750.0)).fit for start in (0.0, 750.0))
-    apart = np.abs((first.scale_factor_error - second.scale_factor_error, first.bias - second.bias))
+    first, second = (calibrate_encoder(measured(data, 'yaw_slow', start, start + 750.0)).fit
+                     for start in (0.0, 750.0))
+    apart = np.abs(
+        (first.scale_factor_error - second.scale_factor_error, first.bias - second.bias))
     assert (apart < 2.6 * np.sqrt(np.diag(first.covariance + second.covariance))).all()
 
 
 def shaken(bias, generator):
-    """Return 20 s of a fast swing whose heading is off by 3 deg again and again, as one that wobbles on its mount."""
+    """
+    Return 20 s of a fast swing whose heading is off by 3 deg again and again.
+
+    As one that wobbles on its mount.
+    """
     motion = swing(20.0, 300.0, 2.5)
     log = log_of(motion, 20.0, Noise(0.02 * DEGREE), generator)
-    wobble = 3.0 * DEGREE * np.interp(log.time, np.arange(0.0, 21.0, 0.5), generator.standard_normal(42))
+    wobble = 3.0 * DEGREE * np.interp(log.time, np.arange(0.0, 21.0, 0.5),
+                                      generator.standard_normal(42))
     return replace(log, output=log.output - B + bias + np.gradient(wobble, log.time))
 
 
 def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
-    """Least squares would be off by 0.15 deg/s on such logs, five times as far as no calibration."""
+    """
+    Least squares would be off by 0.15 deg/s on such logs, five times as far as no calibration.
+    """
     errors, refused = [], 0
     for seed in range(20):
         generator = np.random.default_rng(seed)
@@ -203,5 +259,6 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
 
 
 def test_a_bias_that_a_log_shows_stays_as_it_is():
-    found = calibrate_encoder(log_of(SWING, 100.0, Noise(0.005 * DEGREE), np.random.default_rng(3)))
+    found = calibrate_encoder(log_of(SWING, 100.0, Noise(0.005 * DEGREE),
+                                     np.random.default_rng(3)))
     assert found.fit.bias == pytest.approx(B, rel=0.02)

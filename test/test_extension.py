@@ -245,7 +245,8 @@ def test_a_log_without_motion_says_nothing_of_rates(swing):
 def test_an_output_of_the_other_sense_is_the_only_finding_and_the_model_stays_as_it_is():
     log, model = drive(gyro=GyroModel(LINEAR[:1])), GyroModel(LINEAR[:1], noise=NOISE)
     found = diagnosed(replace(log, output=-log.output), model)
-    assert found.verdict == 'mismatched' and names(found) == ['unit_error'] and found.model is model
+    assert found.verdict == 'mismatched' and names(found) == ['unit_error'
+                                                              ] and found.model is model
     assert '--invert' in found.findings[0].remedy
 
 

@@ -17,8 +17,12 @@ Table, SINE = RECOVERY['Table'], RECOVERY['SINE']
 
 def write(path, dwells):
     """Write dwells as a rate table."""
-    columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE, dwells.output / DEGREE, dwells.temperature))
-    lines = ['sweep,reference_rate_dps,gyro_dps,temperature_degc', *(','.join(map(repr, row)) for row in zip(*columns))]
+    columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE,
+                                              dwells.output / DEGREE, dwells.temperature))
+    lines = [
+        'sweep,reference_rate_dps,gyro_dps,temperature_degc',
+        *(','.join(map(repr, row)) for row in zip(*columns))
+    ]
     path.write_text('\n'.join(lines) + '\n')
     return path
 
@@ -26,7 +30,8 @@ def write(path, dwells):
 @pytest.fixture
 def table(tmp_path):
     """Return the file of a simulated rate table."""
-    return write(tmp_path / 'table.csv', Table().measure(GyroModel(SINE), np.random.default_rng(1)))
+    return write(tmp_path / 'table.csv',
+                 Table().measure(GyroModel(SINE), np.random.default_rng(1)))
 
 
 def strict(text):
@@ -37,15 +42,19 @@ def strict(text):
 
 
 def test_the_default_gives_a_model_that_compensates(run, table, tmp_path):
-    code, text, _ = run('fit', table, '--technology', 'open_loop_fog', '--out', tmp_path / 'model.yaml', '--name', 'bench')
-    assert code == 0 and 'sine_response k' in text and 'what the physics of open_loop_fog gives' in ' '.join(text.split())
+    code, text, _ = run('fit', table, '--technology', 'open_loop_fog', '--out',
+                        tmp_path / 'model.yaml', '--name', 'bench')
+    assert code == 0 and 'sine_response k' in text
+    assert 'what the physics of open_loop_fog gives' in ' '.join(text.split())
     model = read_model(tmp_path / 'model.yaml')
-    assert model.gyro == {'name': 'bench', 'technology': 'open_loop_fog'} and model.origin['files'][0]['name'] == 'table.csv'
+    assert model.gyro == {'name': 'bench', 'technology': 'open_loop_fog'}
+    assert model.origin['files'][0]['name'] == 'table.csv'
     truth = GyroModel(SINE)
     assert model.rate(truth.output(1.5, 30.0), 30.0) == pytest.approx(1.5, abs=0.02 * DEGREE)
 
 
-@pytest.mark.parametrize('words', [[], ['--polynomial'], ['--effects', 'bias,scale_factor_error,sine_response']])
+@pytest.mark.parametrize(
+    'words', [[], ['--polynomial'], ['--effects', 'bias,scale_factor_error,sine_response']])
 def test_lines_for_people_are_not_too_long_and_data_are_strict(run, table, words):
     code, text, _ = run('fit', table, *words)
     assert code == 0 and max(map(len, text.splitlines())) <= 120
@@ -64,18 +73,21 @@ def test_the_matrix_is_given_with_a_polynomial_only(run, table):
 
 
 def test_counts_without_a_sensitivity_are_wrong_use(run, tmp_path):
-    (tmp_path / 'player.csv').write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
+    (tmp_path / 'player.csv'
+     ).write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
     code, out, error = run('fit', tmp_path / 'player.csv')
     assert (code, out) == (2, '') and '--sensitivity' in error
 
 
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
-    (tmp_path / 'player.csv').write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
+    (tmp_path / 'player.csv'
+     ).write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
     words = ['fit', tmp_path / 'player.csv', '--sensitivity', '0.07', '--invert', '--json']
     code, text, _ = run(*words)
     effects = strict(text)['effects']
-    assert code == 0 and effects['scale_factor_error']['scale_factor_error']['estimate'] == pytest.approx(6.65e-4, rel=1e-2)
+    assert code == 0 and effects['scale_factor_error']['scale_factor_error'][
+        'estimate'] == pytest.approx(6.65e-4, rel=1e-2)
     low, high = effects['bias']['bias']['ci95']
     assert low < -2.5654 * 0.07 * DEGREE < high
 
@@ -85,7 +97,8 @@ def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path)
     rate = np.array([0.0, 200.0, 270.0])[(time // 30.0).astype(int)]
     output = 0.5 + 1.02 * rate + 0.1 * generator.standard_normal(len(time))
     rows = [f'{t:.2f},{y:.4f},{w:.1f}' for t, y, w in zip(time, output, rate)]
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_dps\n' + '\n'.join(rows) + '\n')
+    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_dps\n' + '\n'.join(rows) +
+                                      '\n')
     code, text, _ = run('fit', tmp_path / 'log.csv', '--json')
     answer = strict(text)
     low, high = answer['effects']['scale_factor_error']['scale_factor_error']['ci95']
@@ -94,8 +107,11 @@ def test_three_steady_speeds_in_a_log_in_time_give_scale_and_bias(run, tmp_path)
 
 def test_tables_in_several_files_are_one_calibration(run, tmp_path):
     generator = np.random.default_rng(3)
-    paths = [write(tmp_path / f'{degc}.csv', Table(sweeps=1, temperatures=(degc, degc)).measure(GyroModel(SINE), generator))
-             for degc in (20.0, 35.0, 50.0)]
+    paths = [
+        write(tmp_path / f'{degc}.csv',
+              Table(sweeps=1, temperatures=(degc, degc)).measure(GyroModel(SINE), generator))
+        for degc in (20.0, 35.0, 50.0)
+    ]
     code, text, _ = run('fit', *paths, '--json')
     answer = strict(text)
     assert code == 0 and answer['sweeps'] == 3 and 'scale_factor_temperature' in answer['effects']
@@ -117,9 +133,11 @@ def test_as_many_values_as_dwells_are_fitted_but_nothing_says_how_sure_they_are(
 
 
 @pytest.mark.parametrize('rows, words, code, said', [
-    ('0.5,0.51\n-0.5,-0.49\n0.5,0.511\n-0.5,-0.491\n', ['--effects', 'bias,scale_factor_error,scale_factor_asymmetry'], 1,
-     'scale_factor_asymmetry'),
-    ('0,0.1\n10,10\n20,20.1\n', ['--effects', 'bias,bias_temperature'], 1, 'holds no temperature; record temperature_degc'),
+    ('0.5,0.51\n-0.5,-0.49\n0.5,0.511\n-0.5,-0.491\n',
+     ['--effects', 'bias,scale_factor_error,scale_factor_asymmetry'], 1, 'scale_factor_asymmetry'),
+    ('0,0.1\n10,10\n20,20.1\n', ['--effects', 'bias,bias_temperature'], 1, 'holds no temperature; '
+     'record '
+     'temperature_degc'),
     ('0,0.1\n10,10\n', ['--polynomial', '3,0'], 1, '2 dwells do not determine 4 values'),
     ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is no effect"),
     ('0,0.1\n10,10\n', ['--polynomial', '3'], 2, 'is not two orders'),

@@ -295,7 +295,7 @@ def test_among_several_causes_a_set_is_in_brackets():
     assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
 
 
-def test_a_diagnosis_of_another_kind_says_how_it_was_computed_and_leaves_out_what_it_did_not_measure():
+def test_a_diagnosis_of_another_kind_leaves_out_what_it_did_not_measure():
     text = Page(report(replace(adequate(), method='the dwells of a table were fitted',
                                noise=Noise(), simulated=Noise()))).text
     assert ('The dwells of a table were fitted.' in text and 'replayed' not in text
@@ -572,12 +572,17 @@ def test_arrow_keys_read_values_too(browser, whole_path):
 
 #: Least contrast of any text and any stroke with its background (WCAG 2, 1.4.3 and 1.4.11).
 CONTRAST = """(() => {
-  const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number).map(each => each / 255)
-    .map(each => each > 0.04045 ? ((each + 0.055) / 1.055) ** 2.4 : each / 12.92); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number)
+    .map(each => each / 255)
+    .map(each => each > 0.04045 ? ((each + 0.055) / 1.055) ** 2.4 : each / 12.92);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
   const behind = each => { const colour = getComputedStyle(each).backgroundColor;
-    return colour.startsWith('rgba') && each.parentElement ? behind(each.parentElement) : colour; };
-  const contrast = (a, b) => { const [low, high] = [light(a), light(b)].sort((x, y) => x - y); return (high + 0.05) / (low + 0.05); };
-  const least = (selector, name) => Math.min(...[...document.querySelectorAll(selector)].map(each =>
+    return colour.startsWith('rgba') && each.parentElement
+      ? behind(each.parentElement) : colour; };
+  const contrast = (a, b) => { const [low, high] = [light(a), light(b)].sort((x, y) => x - y);
+    return (high + 0.05) / (low + 0.05); };
+  const least = (selector, name) => Math.min(...[...document.querySelectorAll(selector)]
+    .map(each =>
     contrast(getComputedStyle(each)[name], behind(each))));
   const texts = 'p, h1, h2, h3, li, td, th, dt, dd, summary, figcaption, pre';
   return [least(texts, 'color'), least('svg text', 'fill'), least('.stroke', 'stroke')];

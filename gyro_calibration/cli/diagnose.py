@@ -82,7 +82,9 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
             def say(step: str) -> None:
                 bar.set_description(step)
                 bar.update()
-            found = diagnose(logs, generator, model, names=given.log, say=say, kind=given.reference_kind)
+
+            found = diagnose(logs, generator, model, names=given.log, say=say,
+                             kind=given.reference_kind)
     return _with_origin(replace(found, logs=tuple(given.log)), model)
 
 

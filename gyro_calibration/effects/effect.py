@@ -55,7 +55,9 @@ class Channels:
 
     @staticmethod
     def of(rate: Number, output: Number, temperature: Number) -> Channels:
-        """Return channels with these alone, as the constructor does; it takes three times as long."""
+        """
+        Return channels with these alone, as the constructor does; it takes three times as long.
+        """
         other = object.__new__(Channels)
         other.__dict__.update(rate=rate, output=output, temperature=temperature)
         return other
