@@ -1,26 +1,28 @@
-"""Units taken for another: factors and delays that are what they are because somebody forgot or confused something."""
+"""Units taken for another: factors and delays that a confused or forgotten unit explains."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 
-#: What people confuse: degrees and radians, the sense of rotation, one range of a gyro and the next.
+#: What people confuse: degrees and radians, the sense of rotation, two ranges of a gyro.
 _CONFUSED: Mapping[str, float] = {
-    'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi, '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
+    'pi/180': math.pi / 180.0, '180/pi': 180.0 / math.pi,
+    '-pi/180': -math.pi / 180.0, '-180/pi': -180.0 / math.pi,
     '-1': -1.0, '2': 2.0, '1/2': 0.5, '-2': -2.0, '-1/2': -0.5}
 #: Powers of two taken for powers of ten, and the other way round.
 _BINARY: Mapping[str, float] = {
-    **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)}, '1000/1024': 1000.0 / 1024.0,
+    **{f'{2 ** power}/1000': 2 ** power / 1000.0 for power in range(1, 17)},
+    '1000/1024': 1000.0 / 1024.0,
     '1048576/1000000': 1.048576, '1000000/1048576': 1.0 / 1.048576}
 FACTORS: Mapping[str, float] = {**_CONFUSED, **_BINARY}
-#: A gyro of the right unit is no further from 1 than this, as a ratio; nor is it beside another unit.
+#: The largest ratio of a gyro's factor to 1 in the right unit, or to the factor of another unit.
 _OF_A_GYRO = 1.1
 #: Of its own, a factor is no unit unless it is as close as this.
 _CLOSE = 0.005
-#: The standard deviation must be below this part of the distance to 1: nobody's factor far from it, or of an interval for a delay.
+#: The most that the standard deviation may be of the distance to 1, or of an interval for a delay.
 _KNOWN = 0.1
-#: And below this part for a factor near 1, where one that is so by chance would come close too often.
+#: The same for a factor near 1, where a factor that is so by chance would come close too often.
 _WELL_KNOWN = 0.02
 
 
@@ -28,8 +30,9 @@ def unit_of_scale(factor: float, deviation: float) -> str | None:
     """
     Return which confusion of units a factor of output over rate is, such as 'pi/180', or None.
 
-    Far from 1, no gyro has such a scale factor, and its own error of up to a tenth may come on top of a confusion. Near 1, the factor must
-    be close, within two standard deviations, and known to a fiftieth of its distance from 1.
+    Far from 1, no gyro has such a scale factor, and its own error of up to a tenth may come on top
+    of a confusion. Near 1, the factor must be close, within two standard deviations, and known to
+    a fiftieth of its distance from 1.
 
     Parameters
     ----------
@@ -51,8 +54,10 @@ def is_far(factor: float) -> bool:
 
 def _is(factor: float, deviation: float, value: float) -> bool:
     least = _CLOSE if is_far(value) else 1e-4  # far from 1 there is nothing else that it could be
-    near = abs(factor - value) < max(2.0 * deviation, least * abs(value)) and abs(factor / value - 1.0) < _CLOSE
-    return near and deviation < (_KNOWN if is_far(value) else _WELL_KNOWN) * min(abs(value - 1.0), abs(value))
+    near = (abs(factor - value) < max(2.0 * deviation, least * abs(value))
+            and abs(factor / value - 1.0) < _CLOSE)
+    return near and deviation < (_KNOWN if is_far(value) else _WELL_KNOWN) * min(
+        abs(value - 1.0), abs(value))
 
 
 def _ratio(factor: float, value: float) -> float:
@@ -62,7 +67,7 @@ def _ratio(factor: float, value: float) -> float:
 
 def unit_of_offset(estimate: float, deviation: float, interval: float) -> str | None:
     """
-    Return 'one sample' or 'half a sample', if a time offset is that, either way, within two standard deviations; or None.
+    Return 'one sample' or 'half a sample' if a time offset is either within 2 sigma; or None.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Logs as a regression: the residual and the columns in the cosine transform, whitened, with the noises that may be in them."""
+"""Logs as a regression: residual and columns as whitened cosine transforms, and their noises."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
-from gyro_calibration.diagnosis.evidence import Beside, Judged, Noises, Places, Sample, beside, judge, log_sum, sample, sums
+from gyro_calibration.diagnosis.evidence import (Beside, Judged, Noises, Places, Sample, beside,
+                                                 judge, log_sum, sample, sums)
 from gyro_calibration.diagnosis.replay import SMOOTHED, Replay
-from gyro_calibration.diagnosis.spectrum import Shape, angles, bands, fall, inverse, levels, noise_grid
+from gyro_calibration.diagnosis.spectrum import (Shape, angles, bands, fall, inverse, levels,
+                                                 noise_grid)
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array
 
-#: What the causes leave, if it was smoothed, is averaged over intervals of at most so many s; so many times the levels of its noise are
-#: found again, each time beside the noise that was likeliest with those before.
+#: The longest interval, s, over which a smoothed residual is averaged; and how often the levels of
+#: its noise are found again, each time beside the noise that was likeliest with those before.
 _LONGEST, _ROUNDS = 0.1, 3
 #: A shape is changed by this part of itself to see what its column changes by.
 _SMALL = 1e-4
-#: Within its interval of 95 %, so many standard deviations to each side, the score of a shape falls by this.
+#: The ends of an interval of 95 %, in standard deviations, and the fall of a shape's score there.
 _DEVIATIONS, _FALL = 1.96, 1.92
 
 
@@ -50,7 +52,8 @@ class Field:
     ----------
     replays : the logs
     first : the noise by which all is divided at first
-    deviation : what it gives each coefficient, with the levels of the logs, over that of white noise, shape (m,)
+    deviation : what it gives each coefficient, with the levels of the logs, over that of white
+        noise, shape (m,)
     starts : first coefficient of each band
     shapes : noises that are tried
     noises : the same, as weights of the bands
@@ -67,10 +70,11 @@ class Field:
     def angles(self) -> tuple[Array, Array]:
         """Return pi k / n of each coefficient, and the interval of its log, s."""
         parts = [angles(each.points) for each in self.replays]
-        return np.concatenate(parts), np.concatenate([np.full(len(part), each.step) for part, each in zip(parts, self.replays)])
+        return np.concatenate(parts), np.concatenate([
+            np.full(len(part), each.step) for part, each in zip(parts, self.replays)])
 
     def divided(self, noise: int) -> Array:
-        """Return what whitens coefficients that are divided by the first noise already, shape (m,)."""
+        """Return what whitens coefficients divided by the first noise already, shape (m,)."""
         count = np.diff(np.append(self.starts, len(self.deviation)))
         return np.repeat(np.sqrt(self.noises.weights[noise]), count)
 
@@ -83,9 +87,10 @@ def field(replays: Sequence[Replay]) -> Field:
 
 
 def _rounding(replays: Sequence[Replay]) -> float:
-    """Return how strong the rounding of a reference heading is beside white noise, where both are likeliest."""
+    """Return the likeliest rounding of a reference heading, relative to white noise."""
     shapes = [Shape(reference=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))]
-    tried = _field(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes for walk in (0.0, 1e-4, 1e-2)])
+    tried = _field(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes
+                                             for walk in (0.0, 1e-4, 1e-2)])
     done = work(tried, [])
     return tried.shapes[int(done.judged.likelihood[0].argmax())].reference
 
@@ -95,15 +100,21 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
     deviation = np.sqrt(plain * np.concatenate([each.level() for each in replays]))
     offsets = np.cumsum([0, *(len(angle) for angle, _ in parts)])
-    starts = np.concatenate([bands(angle, step) + offset for (angle, step), offset in zip(parts, offsets)])
+    starts = np.concatenate([bands(angle, step) + offset
+                             for (angle, step), offset in zip(parts, offsets)])
     count = np.diff(np.append(starts, offsets[-1])).astype(float)
     # Some coefficients of a band are enough to know its mean variance.
-    few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int)) for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
-    angle, step = np.concatenate([part for part, _ in parts]), np.concatenate([np.full(len(part), step) for part, step in parts])
+    few = [np.unique(np.linspace(begin, end - 1.0, 9).round().astype(int))
+           for begin, end in zip(starts, [*starts[1:], offsets[-1]])]
+    angle, step = (np.concatenate([part for part, _ in parts]),
+                   np.concatenate([np.full(len(part), step) for part, step in parts]))
     chosen, first_of = np.concatenate(few), np.cumsum([0, *(len(part) for part in few)])[:-1]
-    relative = np.array([np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen], first_of)
-                         for shape in shapes]) / [len(part) for part in few]
-    # Each combination of parts has an even chance; that parts come in many sizes must not outweigh that they may not be there.
+    relative = np.array([
+        np.add.reduceat(shape.variance(angle[chosen], step[chosen]) / step[chosen] / plain[chosen],
+                        first_of)
+        for shape in shapes]) / [len(part) for part in few]
+    # Each combination of parts has an even chance; that parts come in many sizes must not outweigh
+    # that they may be absent.
     kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
     rare = [np.log(kinds.count(kind)) for kind in kinds]
     noises = Noises(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
@@ -121,8 +132,10 @@ class Work:
     plain : the logs as they are
     named : causes
     residual : whitened, without what the causes of fixed amplitude make, shape (m,)
-    columns : whitened and independent: scale factor error, those of the causes, what their shapes change, shape (q, m)
-    owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus one less place of its shape)
+    columns : whitened and independent: scale factor error, those of the causes, what their shapes
+        change, shape (q, m)
+    owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus
+        one less place of its shape)
     widths : of each cause, how many columns with free values it has
     sample, by, judged : see `evidence`
 
@@ -144,34 +157,37 @@ class Work:
         """
         Return the logarithm of the likelihood at the best values, averaged over the noises.
 
-        It is the restricted likelihood without what it says of the units of the columns: see `evidence`.
+        This is the restricted likelihood without what it says of the units of the columns: see
+        `evidence`.
 
         """
         judged, best = self.judged, int(self.judged.likelihood[0].argmax())
         _, logarithm = np.linalg.slogdet(self.by.own[best])
-        return float(log_sum(judged.likelihood)[0] + 0.5 * (logarithm - len(self.columns) * np.log(judged.squares[0, best])))
+        return float(log_sum(judged.likelihood)[0] + 0.5 * (
+            logarithm - len(self.columns) * np.log(judged.squares[0, best])))
 
     def white(self) -> list[Array]:
-        """Return what is left of each log by the likeliest noise, as white noise in time of variance 1: shape (points,) each."""
+        """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
         return [inverse(part) for part in self.whitened()]
 
     def whitened(self) -> list[Array]:
-        """Return the coefficients of what is left of each log, by the likeliest noise of variance 1: shape (points - 1,) each."""
+        """Return the whitened coefficients of each log's residual: shape (points - 1,)."""
         best = int(self.judged.likelihood[0].argmax())
         factor = self.field.divided(best) * np.sqrt(self.by.freedom / self.judged.squares[0, best])
         return [part * own for part, own in zip(self.left(), self._parted(factor))]
 
     def left(self) -> list[Array]:
-        """Return the coefficients of what is left of each log, divided by the first noise alone: shape (points - 1,) each."""
+        """Return coefficients of each log's residual over the first noise: shape (points - 1,)."""
         values, _ = self.estimates
         return self._parted(self.residual - values @ self.columns)
 
     def _parted(self, coefficients: Array) -> list[Array]:
-        return np.split(coefficients, np.cumsum([each.points - 1 for each in self.field.replays])[:-1])
+        return np.split(coefficients,
+                        np.cumsum([each.points - 1 for each in self.field.replays])[:-1])
 
     @property
     def estimates(self) -> tuple[Array, Array]:
-        """Return the values of the independent columns and their covariance, averaged over the noises."""
+        """Return the values of the independent columns and covariance, averaged over noises."""
         probable = self.judged.probability[0]
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
@@ -179,7 +195,8 @@ class Work:
         crossed = self.field.noises.weights[kept] @ self.sample.own[0]
         values = np.einsum('gpq,gq->gp', covariance, crossed)
         mean = weights @ values
-        inside = np.einsum('g,gpq->pq', weights * self.judged.squares[0, kept] / self.by.freedom, covariance)
+        inside = np.einsum('g,gpq->pq',
+                           weights * self.judged.squares[0, kept] / self.by.freedom, covariance)
         return mean, inside + np.einsum('g,gp,gq->pq', weights, values - mean, values - mean)
 
 
@@ -213,30 +230,35 @@ def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) 
     replays = [seen(each, named) for each in whole.replays]
     widths = []
     residual = np.concatenate([
-        each.noisy(each.channels.output - each.reference - (new.channels.rate - each.channels.rate))
+        each.noisy(each.channels.output - each.reference
+                   - (new.channels.rate - each.channels.rate))
         for each, new in zip(whole.replays, replays)])
-    columns, owner = [np.concatenate([each.coefficients(each.channels.rate) for each in replays])[None]], [(-1, 0)]
+    columns, owner = [np.concatenate([each.coefficients(each.channels.rate)
+                                      for each in replays])[None]], [(-1, 0)]
     for place, known in enumerate(named):
-        own = columns_of(known.candidate, replays if not is_of_the_rate(known.candidate.cause) else whole.replays)
+        own = columns_of(known.candidate, replays if not is_of_the_rate(known.candidate.cause)
+                         else whole.replays)
         widths.append(len(own) if known.candidate.amplitude is None else 0)
         if known.candidate.amplitude is None:
             columns.append(own)
             owner += [(place, number) for number in range(len(own))]
         elif not is_of_the_rate(known.candidate.cause):
             residual = residual - known.candidate.amplitude * own[0]
-        changes = _changes(known, whole.replays if is_of_the_rate(known.candidate.cause) else replays, own) if known.values else []
+        changes = _changes(known, whole.replays if is_of_the_rate(known.candidate.cause)
+                           else replays, own) if known.values else []
         columns += [change[None] for _, change in changes]
         owner += [(place, -1 - number) for number, _ in changes]
     for candidate in extra:
         own = columns_of(candidate, replays)
         columns.append(own)
         owner += [(-2, 0)] * len(own)
-    return _judged(replace(whole, replays=tuple(replays)), whole.replays, tuple(named), residual / whole.deviation,
-                   np.concatenate(columns) / whole.deviation, tuple(owner), tuple(widths))
+    return _judged(replace(whole, replays=tuple(replays)), whole.replays, tuple(named),
+                   residual / whole.deviation, np.concatenate(columns) / whole.deviation,
+                   tuple(owner), tuple(widths))
 
 
 def _changes(known: Named, replays: Sequence[Replay], own: Array) -> list[tuple[int, Array]]:
-    """Return what the sum of a cause's columns changes by with each shape that is fitted and smooth."""
+    """Return the change of the sum of a cause's columns with each smooth, fitted shape."""
     found: list[tuple[int, Array]] = []
     for place in free_shapes(known.candidate):
         moved = _moved(known.candidate, place, max(each.duration for each in replays))
@@ -249,13 +271,14 @@ def _moved(candidate: Candidate, place: int, duration: float) -> Candidate:
     """Return a cause with a shape changed a little, to the side where its bounds leave room."""
     shape = candidate.shapes[place]
     # A wave that is to change a little must stay in step throughout.
-    step = 1e-3 / duration if candidate.cause == 'interference_tone' else _SMALL * abs(shape) if shape else 1e-6
+    step = (1e-3 / duration if candidate.cause == 'interference_tone'
+            else _SMALL * abs(shape) if shape else 1e-6)
     moved = with_shape(candidate, place, shape + step)
     return with_shape(candidate, place, shape - step) if moved.shapes[place] == shape else moved
 
 
 def free_shapes(candidate: Candidate) -> list[int]:
-    """Return the places of the shapes that a fit may change a little: not those whose columns leap, nor conventions."""
+    """Return the places of shapes that a fit may vary: no conventions, no leaping columns."""
     return [] if candidate.cause in ('bias_step', 'dead_zone') else fitted_shapes(candidate)
 
 
@@ -265,20 +288,23 @@ def leaping_shapes(candidate: Candidate) -> list[int]:
 
 
 def deviation_of_leaping(done: Work, place: int, shape: int) -> float:
-    """Return the standard deviation of a shape whose columns leap: by how far off the score falls, to the side where that is further."""
+    """Return the standard deviation of a shape whose columns leap, by where the score falls."""
     candidate = done.named[place].candidate
-    others = work(replace(done.field, replays=done.plain), done.named[:place] + done.named[place + 1:])
+    others = work(replace(done.field, replays=done.plain),
+                  done.named[:place] + done.named[place + 1:])
     least = with_one_more(others, candidate).score - _FALL
 
     def falls(by: float) -> bool:
-        return with_one_more(others, with_shape(candidate, shape, candidate.shapes[shape] + by)).score < least
+        return with_one_more(others, with_shape(
+            candidate, shape, candidate.shapes[shape] + by)).score < least
 
-    first = done.plain[0].step if candidate.cause == 'bias_step' else 1e-3 * candidate.shapes[shape]
+    first = (done.plain[0].step if candidate.cause == 'bias_step'
+             else 1e-3 * candidate.shapes[shape])
     return max(_until(falls, first), _until(falls, -first)) / _DEVIATIONS
 
 
 def _until(falls: Callable[[float], bool], first: float) -> float:
-    """Return how far off something first happens, to a percent: by doubling, and then by halving."""
+    """Return the distance at which something first happens, to 1 %, by doubling and halving."""
     near, far = 0.0, first
     while not falls(far) and abs(far) < 1e6 * abs(first):
         near, far = far, 2.0 * far
@@ -290,18 +316,22 @@ def _until(falls: Callable[[float], bool], first: float) -> float:
 
 def filtered(done: Work) -> tuple[Replay, ...]:
     """
-    Return the logs with the levels that their noise has where a filter took from it, averaged where it left next to nothing.
+    Return the logs with the levels of their noise, and averaged where a filter left next to none.
 
-    A filter shows in what the causes leave. Before they are found, motion that is seen late or slowly would pass for noise.
+    A filter shows in what the causes leave. Before they are found, motion that is seen late or
+    slowly would pass for noise.
 
     """
     found = [fall(part) < 1.0 for part in done.whitened()]
-    while any(deep := [fall(part) < SMOOTHED and 2.0 * each.step <= _LONGEST for each, part in zip(done.plain, done.whitened())]):
-        done = _again(done, [replace(each, every=each.every * (1 + more)) for each, more in zip(done.plain, deep)])
+    while any(deep := [fall(part) < SMOOTHED and 2.0 * each.step <= _LONGEST
+                       for each, part in zip(done.plain, done.whitened())]):
+        done = _again(done, [replace(each, every=each.every * (1 + more))
+                             for each, more in zip(done.plain, deep)])
     for number in range(_ROUNDS if any(found) else 0):
-        # At first by what is left as it is, or the fastest of the slow noises would stand for a part of the filter.
+        # At first by the residual as it is, or the fastest slow noise would stand for the filter.
         of = zip(done.plain, done.whitened() if number else done.left(), found)
-        done = _again(done, [each.filtered(levels(part)) if falls else each for each, part, falls in of])
+        done = _again(done, [each.filtered(levels(part)) if falls else each
+                             for each, part, falls in of])
     return done.plain
 
 
@@ -311,10 +341,11 @@ def _again(done: Work, replays: Sequence[Replay]) -> Work:
 
 
 def with_one_more(before: Work, candidate: Candidate) -> Work:
-    """Put one cause more into a field, at its shapes as they are; what is there already is not made again."""
+    """Put one cause more into a field, at its present shapes; what is there already is not made again."""
     if is_of_the_rate(candidate.cause):
         return work(replace(before.field, replays=before.plain), [*before.named, Named(candidate)])
-    own, residual, columns = columns_of(candidate, before.field.replays) / before.field.deviation, before.residual, before.columns
+    own, residual, columns = (columns_of(candidate, before.field.replays) / before.field.deviation,
+                              before.residual, before.columns)
     owner, place = before.owner, len(before.named)
     if candidate.amplitude is None:
         columns = np.concatenate([columns, own])
@@ -322,26 +353,27 @@ def with_one_more(before: Work, candidate: Candidate) -> Work:
     else:
         residual = residual - candidate.amplitude * own[0]
     widths = (*before.widths, len(own) if candidate.amplitude is None else 0)
-    return _judged(before.field, before.plain, (*before.named, Named(candidate)), residual, columns, owner, widths)
+    return _judged(before.field, before.plain, (*before.named, Named(candidate)), residual,
+                   columns, owner, widths)
 
 
 def with_columns(before: Work, columns: Array) -> Work:
     """Put whitened columns more into a field, which belong to no cause."""
     owner = (*before.owner, *[(-2, 0)] * len(columns))
-    return _judged(before.field, before.plain, before.named, before.residual, np.concatenate([before.columns, columns]), owner,
-                   before.widths)
+    return _judged(before.field, before.plain, before.named, before.residual,
+                   np.concatenate([before.columns, columns]), owner, before.widths)
 
 
-def _judged(whole: Field, plain: tuple[Replay, ...], named: tuple[Named, ...], residual: Array, columns: Array,
-            owner: tuple[tuple[int, int], ...], widths: tuple[int, ...]) -> Work:
+def _judged(whole: Field, plain: tuple[Replay, ...], named: tuple[Named, ...], residual: Array,
+            columns: Array, owner: tuple[tuple[int, int], ...], widths: tuple[int, ...]) -> Work:
     """Sum whitened residual and columns, those that are independent, and judge them."""
     kept = _independent(columns)
     of = columns[kept]
     nothing = np.empty((0, len(residual)))
     given = sample(residual[None], of, nothing, whole.starts)
     by = beside(sums(of, nothing, (), whole.starts), (), whole.noises)
-    return Work(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths, given, by,
-                judge(given, whole.noises, by))
+    return Work(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths,
+                given, by, judge(given, whole.noises, by))
 
 
 def _independent(columns: Array) -> list[int]:

@@ -61,16 +61,20 @@ class Finding:
     ----------
     effect : its name in the catalogue
     cause : one sentence for people
-    parameters : name -> estimate; of what a model has too, what comes on top of its value, but for figures of the noise
+    parameters : name -> estimate; of what a model has too, what comes on top of its value, but for
+        figures of the noise
     p_value : the chance that a log without it shows as much
-    minimum_detectable : what of its first parameter would have been found, in its unit; None where that has no meaning
+    minimum_detectable : the smallest detectable value of its first parameter, in its unit; None
+        where that has no meaning
     ambiguous_with : the names of those that the data at hand cannot rule out instead
     separate_by : the experiment that would part them; '' where there is nothing to part
     evidence : what in the data shows it, one sentence with numbers in units of people
     along : the variable along which it shows, a key of `Diagnosis.curves`; '' where there is none
-    status : 'established', or 'suspected' where it is not confirmed on stretches that took no part in choice and fit
-    probability : of it and of those that may be in its place, by name; empty where it was not computed
-    share_of_heading_error : part of the mean square of the heading error over 60 s that it explains; None where it was not computed
+    status : 'established', or 'suspected' where it is not confirmed on stretches that took no part
+        in choice and fit
+    probability : of it and of those that may be in its place, by name; empty where not computed
+    share_of_heading_error : part of the mean square of the heading error over 60 s that it
+        explains; None where not computed
     where : from and to, s, of an effect in part of the log; None of the whole log
     remedy : what to do about it
 
@@ -96,14 +100,16 @@ class Finding:
         return {'effect': self.effect, 'cause': self.cause,
                 'parameters': {name: value.figures() for name, value in self.parameters.items()},
                 'p_value': self.p_value, 'minimum_detectable': self.minimum_detectable,
-                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by, 'evidence': self.evidence,
-                'status': self.status, 'probability': dict(self.probability), 'share_of_heading_error': self.share_of_heading_error,
+                'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by,
+                'evidence': self.evidence, 'status': self.status,
+                'probability': dict(self.probability),
+                'share_of_heading_error': self.share_of_heading_error,
                 'where': None if self.where is None else list(self.where), 'remedy': self.remedy}
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure without a name: the variable along which it lies, its share of the residual's variance, and its chance."""
+    """Structure without a name: its variable, its share of the residual's variance, its chance."""
 
     along: str
     share_of_variance: float
@@ -111,7 +117,8 @@ class Unexplained:
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
-        return {'along': self.along, 'share_of_variance': self.share_of_variance, 'p_value': self.p_value}
+        return {'along': self.along, 'share_of_variance': self.share_of_variance,
+                'p_value': self.p_value}
 
 
 @dataclass(frozen=True)
@@ -137,12 +144,14 @@ class Change:
 
     def scaled(self, factor: float) -> Change:
         """Return the errors in another unit."""
-        interval = None if self.interval is None else (factor * self.interval[0], factor * self.interval[1])
+        interval = (None if self.interval is None
+                    else (factor * self.interval[0], factor * self.interval[1]))
         return Change(factor * self.before, factor * self.after, interval)
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
-        return {'before': self.before, 'after': self.after, 'ci95': None if self.interval is None else list(self.interval)}
+        return {'before': self.before, 'after': self.after,
+                'ci95': None if self.interval is None else list(self.interval)}
 
 
 @dataclass(frozen=True)
@@ -154,9 +163,11 @@ class Gain:
     ----------
     held_out : which parts, in words
     rate : of the simulated against the measured rate, rad/s
-    heading : of the simulated against the measured change of heading over windows, rad; None where no window is as long
+    heading : of the simulated against the measured change of heading over windows, rad; None where
+        no window is as long
     window : s
-    models : name -> root mean square of the heading error of given, plain (bias, scale factor and delay alone) and extended model, rad
+    models : name -> root mean square of the heading error of given, plain (bias, scale factor and
+        delay alone) and extended model, rad
 
     """
 
@@ -173,8 +184,10 @@ class Gain:
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
-        heading = None if self.heading is None else {'window_s': self.window, **self.heading.figures()}
-        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(), 'heading_rms': heading, **self.models}
+        heading = (None if self.heading is None
+                   else {'window_s': self.window, **self.heading.figures()})
+        return {'held_out': self.held_out, 'rate_rms': self.rate.figures(),
+                'heading_rms': heading, **self.models}
 
 
 @dataclass(frozen=True)
@@ -187,10 +200,12 @@ class Curve:
     along : rate, temperature, heading, time, frequency ...
     unit : of `at`, SI
     at : middle of each bin
-    before, after : mean of the residual there, against the model that was given and against the extended one, rad/s
-    deviation : standard deviation of these means by the noise alone, slow noise too, rad/s; along the frequency, where amplitudes stand in
-        place of means, the usual one
-    simulated : mean error, output less true rate, that the simulation with the given model has there, rad/s; measured is that and `before`
+    before, after : mean of the residual there, against the model that was given and against the
+        extended one, rad/s
+    deviation : standard deviation of these means by the noise alone, slow noise too, rad/s; along
+        the frequency, where amplitudes stand in place of means, the usual one
+    simulated : mean error, output less true rate, that the simulation with the given model has
+        there, rad/s; the measured one is the sum of this and `before`
 
     """
 
@@ -206,13 +221,14 @@ class Curve:
 @dataclass(frozen=True)
 class Trace:
     """
-    A stretch of the log where simulation and measurement differ most, sample by sample: arrays of shape (n,), s and rad/s.
+    A stretch where simulation and measurement differ most: arrays of shape (n,), s and rad/s.
 
     Attributes
     ----------
     time : s, as in the log
     measured : output of the gyro
-    simulated, extended : output that the given model and the extended one have for the same motion, without noise
+    simulated, extended : output that the given model and the extended one have for the same
+        motion, without noise
 
     """
 
@@ -224,7 +240,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class HeadingCurve:
-    """What the heading is wrong by over the log, if the simulation is believed: arrays of shape (n,), s and rad."""
+    """Heading error over the log, if the simulation is believed: arrays of shape (n,), s, rad."""
 
     time: Array
     before: Array
@@ -233,7 +249,7 @@ class HeadingCurve:
 
 @dataclass(frozen=True)
 class NoiseCurve:
-    """Allan deviation of the residual and of the simulated noise: arrays of shape (n,), s and rad/s; simulated is None without figures."""
+    """Allan deviations, shape (n,), s and rad/s; simulated is None for a model without noise."""
 
     averaging_time: Array
     measured: Array
@@ -250,7 +266,7 @@ class Reference:
     ----------
     kind : rate_command, encoder, motion_capture, course, odometry, gyro or rest
     known : how the kind is known, in words
-    noise : name -> size in SI of the reference's own errors; empty where the reference is taken as exact
+    noise : name -> size in SI of the reference's own errors; empty where it is taken as exact
 
     """
 
@@ -275,7 +291,8 @@ class Diagnosis:
     noise : of the residual
     simulated : noise of the model that was given; all 0 where none was
     gain : None where nothing is offered that could win
-    before, model : the simulation that was put to the test, and the extended one (the same where nothing is offered)
+    before, model : the simulation that was put to the test, and the extended one (the same where
+        nothing is offered)
     cannot_show : cause -> why these logs cannot show it
     curves : the residual along each variable
     heading, noise_curve, trace : for pictures
@@ -285,7 +302,8 @@ class Diagnosis:
     method : how it was computed, for people; where it is empty, as a log in time is
     gates : what was checked before anything was named
     reference : what the log was compared with; None where several logs or a rate table were given
-    heading_shares : cause, 'reference' or 'left' -> part of the mean square of the heading error over 60 s; empty where not computed
+    heading_shares : cause, 'reference' or 'left' -> part of the mean square of the heading error
+        over 60 s; empty where not computed
 
     """
 
@@ -316,20 +334,24 @@ class Diagnosis:
             return 'mismatched'
         if self.unexplained:
             return 'unexplained'
-        return 'extended' if any(each.status == 'established' for each in self.findings) else 'adequate'
+        return ('extended' if any(each.status == 'established' for each in self.findings)
+                else 'adequate')
 
     def figures(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        return {'schema': SCHEMA, 'verdict': self.verdict, 'false_alarm_rate': self.false_alarm_rate,
+        return {'schema': SCHEMA, 'verdict': self.verdict,
+                'false_alarm_rate': self.false_alarm_rate,
                 'findings': [finding.figures() for finding in self.findings],
                 'unexplained': [each.figures() for each in self.unexplained],
                 'noise': _noise(self.noise), 'simulated_noise': _noise(self.simulated),
                 'gain': None if self.gain is None else self.gain.figures(),
-                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks), 'logs': list(self.logs),
-                'gates': [gate.figures() for gate in self.gates], 'heading_shares': dict(self.heading_shares),
+                'cannot_show': dict(self.cannot_show), 'remarks': list(self.remarks),
+                'logs': list(self.logs), 'gates': [gate.figures() for gate in self.gates],
+                'heading_shares': dict(self.heading_shares),
                 'reference': None if self.reference is None else self.reference.figures()}
 
 
 def _noise(noise: Noise) -> dict[str, float]:
-    return {'angle_random_walk': noise.angle_random_walk, 'bias_instability': noise.bias_instability,
+    return {'angle_random_walk': noise.angle_random_walk,
+            'bias_instability': noise.bias_instability,
             'rate_random_walk': noise.rate_random_walk}
