@@ -341,7 +341,7 @@ def _again(done: Work, replays: Sequence[Replay]) -> Work:
 
 
 def with_one_more(before: Work, candidate: Candidate) -> Work:
-    """Put one cause more into a field, at its present shapes; what is there already is not made again."""
+    """Put one more cause into a field at its present shapes, and keep what is there already."""
     if is_of_the_rate(candidate.cause):
         return work(replace(before.field, replays=before.plain), [*before.named, Named(candidate)])
     own, residual, columns = (columns_of(candidate, before.field.replays) / before.field.deviation,
