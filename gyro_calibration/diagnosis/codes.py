@@ -95,7 +95,7 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
 
 
 def _about_the_densest(values: Array) -> tuple[Array, float]:
-    """Return distances from where values are densest, and a first reach, where the step shows."""
+    """Return how far values are from the densest place, and a first reach that gives the step."""
     width = min(2 * _SOME, len(values) - 1)
     span = values[width:] - values[:-width]
     first = int(np.argmin(span))

@@ -111,7 +111,7 @@ def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
 
 
 def _spectra(done: Work) -> list[Array]:
-    """Return the noise variance of each log's coefficients, averaged over the noises."""
+    """Return each log's variances of coefficients, averaged over noises, shape (points - 1,)."""
     whole, judged = done.field, done.judged
     relative = (judged.probability[0] * judged.squares[0] / done.by.freedom) @ (
         1.0 / whole.noises.weights)

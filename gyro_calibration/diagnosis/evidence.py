@@ -128,7 +128,7 @@ def sample(residuals: Array, nuisances: Array, columns: Array, starts: Places) -
 def drawn(noises: Noises, count: Array, probability: Array, draws: int,
           generator: np.random.Generator) -> Array:
     """
-    Draw residuals of nothing but noise, each by one of the probable noises, shape (draws, m).
+    Draw residuals of noise alone, each by a noise chosen with its probability, shape (draws, m).
 
     In single precision, which is enough for what chance shows, and twice as fast.
 
