@@ -160,7 +160,7 @@ def _valued(whole: Field, others: tuple[Named, ...], rival: Named, known: Named)
 # what is left of one cause by another
 
 def _root(question: _Question, replays: Sequence[Replay]) -> Array:
-    """Return a triangle with lengths and angles of whitened columns (see `_apart`), shape (q, q)."""
+    """Return a triangle with lengths and angles of the columns (see `_apart`), shape (q, q)."""
     deviation = np.concatenate([question.deviation(each) for each in replays])
     through = [seen(each, question.others) for each in replays]
     scale = np.concatenate([each.coefficients(each.channels.rate) for each in through])[None]

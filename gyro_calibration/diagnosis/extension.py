@@ -257,7 +257,7 @@ def _is_within(term: Term) -> bool:
 
 def _covariance(model: GyroModel, new: Sequence[Term], spread: Array) -> Array | None:
     """
-    Return the covariance of all fitted values of a model with new terms; None if its own is none.
+    Return the covariance of all fitted values of a model with new terms; None if unknown before.
 
     Parameters
     ----------
