@@ -12,11 +12,13 @@ from gyro_calibration.log import DEGREE
 _HOUR = 3600.0
 
 #: Unit of SI -> unit of people and the factor to it, where it is not simply degrees for radians.
-_UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0), 'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
+_UNITS = {'1': ('%', 100.0), '1/K': ('%/K', 100.0), 'degC': ('°C', 1.0),
+          'rad/√s': ('deg/√h', math.sqrt(_HOUR) / DEGREE),
           'rad/s/√s': ('deg/h/√h', _HOUR ** 1.5 / DEGREE), 'K/s': ('K/min', 60.0)}
 #: Parameters that people read in another unit than others of the same unit of SI.
-_PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE), 'rate_ramp': ('deg/s/h', _HOUR / DEGREE), 'k': ('s', 1.0),
-               'unit_error': ('', 1.0), 'outliers': ('', 1.0), 'stuck_samples': ('', 1.0), 'dropped_samples': ('', 1.0)}
+_PARAMETERS = {'bias_instability': ('deg/h', _HOUR / DEGREE),
+               'rate_ramp': ('deg/s/h', _HOUR / DEGREE), 'k': ('s', 1.0), 'unit_error': ('', 1.0),
+               'outliers': ('', 1.0), 'stuck_samples': ('', 1.0), 'dropped_samples': ('', 1.0)}
 #: (unit, below this many, the finer unit, how many of it).
 _FINER = (('s', 0.5, 'ms', 1e3), ('%', 0.01, 'ppm', 1e4))
 _RADIANS = re.compile(r'(/?)rad([²³]?)')
@@ -53,7 +55,8 @@ class Quantity:
 
     def __str__(self) -> str:
         """Return it for a sentence, such as 20.1 (19.8 to 20.4) ms."""
-        return _joined(self.value, f'({self.interval})' if self.interval else '', self.power, self.unit)
+        return _joined(self.value, f'({self.interval})' if self.interval else '', self.power,
+                       self.unit)
 
     @property
     def estimate(self) -> str:
@@ -63,7 +66,8 @@ class Quantity:
     @property
     def bounds(self) -> str:
         """Return the interval alone, without the unit."""
-        return _joined(f'({self.interval})', self.power) if self.interval and self.power else self.interval
+        return (_joined(f'({self.interval})', self.power) if self.interval and self.power
+                else self.interval)
 
 
 def _joined(*parts: str) -> str:
@@ -91,7 +95,7 @@ def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str,
 
 
 def _power(largest: float) -> int:
-    """Return the power of ten to write beside numbers up to this one: none where they can be read as they are."""
+    """Return the power of ten to write beside numbers up to this one: 0 if readable without."""
     return 0 if largest == 0.0 or 1e-4 <= largest < 1e6 else math.floor(math.log10(largest))
 
 
@@ -128,7 +132,8 @@ def number(value: float, digits: int = 3) -> str:
     if not math.isfinite(value):
         return _fixed(value, None)
     power = _power(abs(value))
-    text = f'{value / 10.0 ** power:.{digits}g}' if abs(value) < 10.0 ** digits or power else f'{value:.0f}'
+    text = (f'{value / 10.0 ** power:.{digits}g}' if abs(value) < 10.0 ** digits or power
+            else f'{value:.0f}')
     return _joined(text, _times(power)).replace('-', '−')
 
 

@@ -22,15 +22,16 @@ _SOON = 10
 _BLOCK = 256
 #: Kinds of motion that are told apart, by how much the expectation changes about a sample.
 _KINDS = 16
-#: Shares of the farthest samples that the scatter is measured at, so that the tail of a rough motion is seen.
+#: Shares of the farthest samples at which the scatter is measured, for the tail of rough motion.
 _TAILS = (0.05, 0.01)
 #: So many side by side are no single samples any more.
 _LONGEST = 2
-#: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on the motion.
+#: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on it.
 _TIED = 0.85
 #: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
 _FEW, _BY_CHANCE = 3, 1e-3
-#: From here to wild there must be half as many samples as wild ones at most, in standard deviations: else they are a tail of the noise.
+#: From here to wild there must be half as many samples as wild ones at most, in standard
+#: deviations: else they are a tail of the noise.
 _NEAR = 4.5
 
 
@@ -59,7 +60,8 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
     Parameters
     ----------
     seen : output and expectation
-    good : samples that count; beside three and more of six that do not, as after a stuck run, one is not judged
+    good : samples that count; beside three and more of six that do not, as after a stuck run, one
+        is not judged
     floor : the scatter is at least this, rad/s: half a code
     level : chance of a false alarm
 
@@ -73,8 +75,10 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
         far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
     judged = good & (np.count_nonzero(_neighbours(~good, _SIDE), axis=1) < _SIDE)
     wild = _single((far > limit) & judged)
-    count, near = int(np.count_nonzero(wild)), int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged))
-    if not count or near > 0.5 * count + stats.poisson.isf(0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen):
+    count, near = (int(np.count_nonzero(wild)),
+                   int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
+    if (not count or near > 0.5 * count + stats.poisson.isf(
+            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen)):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
     return Wild(wild, float(far[wild].max()), p_value) if p_value < level else None
@@ -83,12 +87,14 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
 def _neighbours(values: Array | Mask, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
     # Turned over about the first and last sample, a slope goes on as it is.
-    window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'), 2 * side + 1)
+    window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'),
+                                 2 * side + 1)
     return np.delete(window, side, axis=1)
 
 
 def _known(seen: Compared) -> Array | None:
-    return None if seen.expected is None or not np.isfinite(seen.expected).any() else bridged(seen.expected)
+    return (None if seen.expected is None or not np.isfinite(seen.expected).any()
+            else bridged(seen.expected))
 
 
 def _moved(expected: Array) -> Array:
@@ -103,25 +109,27 @@ def _off(values: Array) -> Array:
 
 
 def _explained(output: Array, expected: Array) -> Mask:
-    """Mark samples near which the reference jumps half as much: it is a jolt that it tells of sooner or later, or it is wild itself."""
+    """Mark samples near which the reference jumps half as much: a jolt, or it is wild itself."""
     jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
     return jumps > 0.5 * np.minimum(_off(output), _off(output - expected))
 
 
 def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
-    """Return how far each sample is from its neighbours, in standard deviations of such distances about here and in such motion."""
+    """Return distances from neighbours, in standard deviations about here and in such motion."""
     near = _neighbours(values, _SIDE)
     off = np.abs(values - np.median(near, axis=1))
     # A step, a corner or a steep slope leaves the median, but not what its neighbours span.
     outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
-    scale = np.maximum(np.maximum(_about_here(off, good), _in_such_motion(off, moved, good)), max(floor, 1e-300))
+    scale = np.maximum(np.maximum(_about_here(off, good), _in_such_motion(off, moved, good)),
+                       max(floor, 1e-300))
     return np.where(outside > 0.5 * off, off / scale, 0.0)
 
 
 def _about_here(off: Array, good: Mask) -> Array:
-    """Return the robust standard deviation in blocks, the larger of each two that meet about a sample."""
+    """Return the robust standard deviation in blocks, the largest of those next to a sample."""
     blocks = max(1, len(off) // _BLOCK)
-    scales = np.array([_robust(part[kept]) for part, kept in zip(np.array_split(off, blocks), np.array_split(good, blocks))])
+    scales = np.array([_robust(part[kept]) for part, kept in zip(np.array_split(off, blocks),
+                                                                 np.array_split(good, blocks))])
     edged = np.pad(scales, 1, mode='edge')
     scales = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
     return np.repeat(scales, [len(part) for part in np.array_split(off, blocks)])
@@ -132,14 +140,16 @@ def _robust(off: Array) -> float:
 
 
 def _in_such_motion(off: Array, moved: Array, good: Mask) -> Array:
-    """Return the standard deviation among samples with as much motion, by the share of far ones too where there are enough."""
-    edges = np.unique(np.quantile(moved[good], np.linspace(0.0, 1.0, _KINDS + 1)[1:-1])) if good.any() else np.array([])
+    """Return the standard deviation among samples of like motion, by far ones too if enough."""
+    edges = (np.unique(np.quantile(moved[good], np.linspace(0.0, 1.0, _KINDS + 1)[1:-1]))
+             if good.any() else np.array([]))
     kinds = np.searchsorted(edges, moved, side='left')
     scales = np.zeros(len(edges) + 1)
     for kind in range(len(scales)):
         members = off[(kinds == kind) & good]
         if members.size:
-            tails = [np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share) for share in _TAILS if share * members.size > 5]
+            tails = [np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share)
+                     for share in _TAILS if share * members.size > 5]
             scales[kind] = max([_robust(members), *tails])
     return scales[kinds]
 
@@ -154,7 +164,7 @@ def _single(wild: Mask) -> Mask:
 
 
 def _tied(wild: Mask, moved: Array, seen: Compared) -> bool:
-    """Tell whether wild samples stand where the motion changes most, or at certain rates, as at the edges of a dead zone."""
+    """Tell whether wild samples stand where motion changes most, or at certain rates."""
     if np.count_nonzero(wild) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
         return False
     ranks = _ranks(moved[wild], moved)
@@ -164,7 +174,8 @@ def _tied(wild: Mask, moved: Array, seen: Compared) -> bool:
     if np.count_nonzero(wild & turning) < _FEW:
         return False
     speeds = np.abs(seen.expected)
-    return bool(stats.kstest(_ranks(speeds[wild & turning], speeds[turning]), 'uniform').pvalue < _BY_CHANCE)
+    return bool(stats.kstest(_ranks(speeds[wild & turning], speeds[turning]),
+                             'uniform').pvalue < _BY_CHANCE)
 
 
 def _ranks(values: Array, among: Array) -> Array:

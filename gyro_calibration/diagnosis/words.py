@@ -14,13 +14,15 @@ from gyro_calibration.model import Term, same_effects
 _WIDTH = 120
 #: So many causes are named in one sentence.
 _NAMED = 3
-_FIGURES = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s', 'rate_random_walk': 'rad/s/√s'}
+_FIGURES = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
+            'rate_random_walk': 'rad/s/√s'}
 
 
 def clean(text: str) -> str:
-    """Return a text, such as the name of a file, without what could steer a terminal or break a page."""
+    """Return a text, such as a file name, without what steers a terminal or breaks a page."""
     plain = text.encode(errors='replace').decode()
-    return ''.join('\ufffd' if unicodedata.category(each) in ('Cc', 'Cf') else each for each in plain)
+    return ''.join('\ufffd' if unicodedata.category(each) in ('Cc', 'Cf') else each
+                   for each in plain)
 
 
 def spoken(name: str) -> str:
@@ -48,8 +50,8 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
         return found.cause, f'Nothing else can be named before that is mended: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
-                f'The model is left as it is; of logs without any cause, {100.0 * diagnosis.false_alarm_rate:.2g} % would give an alarm '
-                'by chance.')
+                'The model is left as it is; of logs without any cause, '
+                f'{100.0 * diagnosis.false_alarm_rate:.2g} % would give an alarm by chance.')
     named = [f'because of {_named(diagnosis.findings)}'] if diagnosis.findings else []
     left = [_left(diagnosis.unexplained, bool(named))] if diagnosis.unexplained else []
     return f'Simulation and measurement differ {", and ".join(named + left)}.', _won(diagnosis)
@@ -58,7 +60,8 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
 def _named(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
         more = [f'{len(findings) - _NAMED} more'] if len(findings) > _NAMED else []
-        return f'{len(findings)} causes: ' + listed([_beside_others(each) for each in findings[:_NAMED]] + more)
+        return f'{len(findings)} causes: ' + listed(
+            [_beside_others(each) for each in findings[:_NAMED]] + more)
     (found,) = findings
     size = next(iter(sizes(found).values()), None)
     if not found.ambiguous_with:
@@ -82,31 +85,37 @@ def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
     where = listed([spoken(each.along) for each in unexplained[:_NAMED]])
     share = _share(max(each.share_of_variance for each in unexplained))
     what = 'by something' if beside else 'by structure'
-    most = 'up to ' if len(unexplained) > 1 and max(each.share_of_variance for each in unexplained) >= 1e-3 else ''
-    return f'along {where} {what} that no cause in the catalogue explains ({most}{share} of the variance of the residual)'
+    most = ('up to ' if len(unexplained) > 1
+            and max(each.share_of_variance for each in unexplained) >= 1e-3 else '')
+    return (f'along {where} {what} that no cause in the catalogue explains ({most}{share} of the '
+            'variance of the residual)')
 
 
 def _share(share: float) -> str:
-    """Return a part of the whole in percent; the smallest are alike for a person, and none is nothing."""
+    """Return a part of the whole in percent; the smallest ones read alike."""
     return 'less than 0.1 %' if share < 1e-3 else f'{number(100.0 * share, 2)} %'
 
 
 def offered(diagnosis: Diagnosis) -> bool:
     """Tell whether the model was extended: its effects, their values or its noise."""
     before, after = diagnosis.before, diagnosis.model
-    return bool(diagnosis.findings) and not (same_effects(before, after) and before.noise == after.noise)
+    return (bool(diagnosis.findings)
+            and not (same_effects(before, after) and before.noise == after.noise))
 
 
 def is_inside(found: Finding, diagnosis: Diagnosis) -> bool:
-    """Tell whether the extended model has a cause: by a value that is new, and of several of one effect by their shapes."""
-    new = [term for term in diagnosis.model.terms if term.effect.name == found.effect and term not in diagnosis.before.terms]
+    """Tell whether the extended model has a cause: by a new value, and by shapes if several."""
+    new = [term for term in diagnosis.model.terms
+           if term.effect.name == found.effect and term not in diagnosis.before.terms]
     alone = sum(each.effect == found.effect for each in diagnosis.findings) == 1
     return offered(diagnosis) and any(alone or _has_shapes(term, found) for term in new)
 
 
 def _has_shapes(term: Term, found: Finding) -> bool:
-    values = dict(zip((parameter.name for parameter in term.effect.parameters), term.values[:len(term.effect.shapes)]))
-    return all(found.parameters[name].estimate == value for name, value in values.items() if name in found.parameters)
+    values = dict(zip((parameter.name for parameter in term.effect.parameters),
+                      term.values[:len(term.effect.shapes)]))
+    return all(found.parameters[name].estimate == value
+               for name, value in values.items() if name in found.parameters)
 
 
 def _won(diagnosis: Diagnosis) -> str:
@@ -116,9 +125,11 @@ def _won(diagnosis: Diagnosis) -> str:
     if gain is None:
         return 'An extended model is offered; what it wins was not measured.'
     if gain.heading is None:
-        return f'The extended model {change(gain.rate, "rad/s", "the rate error")}, measured on {clean(gain.held_out)}.'
+        return (f'The extended model {change(gain.rate, "rad/s", "the rate error")}, measured on '
+                f'{clean(gain.held_out)}.')
     what = f'the heading error over {gain.window:g} s'
-    return f'The extended model {change(gain.heading, "rad", what)}, measured on {clean(gain.held_out)}.'
+    return (f'The extended model {change(gain.heading, "rad", what)}, measured on '
+            f'{clean(gain.held_out)}.')
 
 
 def change(errors: Change, unit: str, what: str) -> str:
@@ -130,7 +141,8 @@ def change(errors: Change, unit: str, what: str) -> str:
         return f'brings {what} down from {before} to {after} rms'
     if errors.worse:
         return f'makes {what} worse, from {before} to {after} rms'
-    return f'brings {what} from {before} to {after} rms, over parts too few or too uneven to promise that for others'
+    return (f'brings {what} from {before} to {after} rms, over parts too few or too uneven to '
+            'promise that for others')
 
 
 # one by one
@@ -141,7 +153,7 @@ def shown_by(found: Finding) -> list[str]:
 
 
 def certainty(found: Finding) -> list[str]:
-    """Return whether a cause is confirmed and by what chance noise alone shows as much; nothing of units, which need no chance."""
+    """Return whether a cause is confirmed, and its chance by noise alone; units need neither."""
     if not found.p_value and found.remedy:
         return []
     suspected = ['It is suspected, not established.'] if found.status == 'suspected' else []
@@ -159,7 +171,8 @@ def doubt(found: Finding) -> str:
         return ''
     others = listed([spoken(name) for name in found.ambiguous_with], 'or')
     experiment = clean(found.separate_by).rstrip('.')
-    remedy = f'To part them: {experiment}.' if experiment else 'No experiment is known that would part them.'
+    remedy = (f'To part them: {experiment}.' if experiment
+              else 'No experiment is known that would part them.')
     return f'These data cannot rule out that it is {others} instead. {remedy}'
 
 
@@ -168,20 +181,23 @@ def smallest(found: Finding) -> str:
     if found.minimum_detectable is None or not found.parameters:
         return ''
     name, first = next(iter(found.parameters.items()))
-    return f'From {amount(found.minimum_detectable, first.unit, name, 2)} on it would have been found.'
+    return (f'From {amount(found.minimum_detectable, first.unit, name, 2)} on it would have been '
+            'found.')
 
 
 def unknown(each: Unexplained) -> str:
     """Return what is known of structure without a name."""
     share = _share(each.share_of_variance)
-    return f'Along {spoken(each.along)}: {share} of the variance of the residual; by noise alone {chance(each.p_value)}.'
+    return (f'Along {spoken(each.along)}: {share} of the variance of the residual; by noise alone '
+            f'{chance(each.p_value)}.')
 
 
 def noise_figures(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Return the name of each noise figure, that of the residual, and that of the simulation."""
     def shown(value: float, name: str) -> str:
         return amount(value, _FIGURES[name], name) if value else 'none'
-    return [(spoken(name), shown(getattr(diagnosis.noise, name), name), shown(getattr(diagnosis.simulated, name), name))
+    return [(spoken(name), shown(getattr(diagnosis.noise, name), name),
+             shown(getattr(diagnosis.simulated, name), name))
             for name in _FIGURES]
 
 
@@ -208,18 +224,23 @@ def lines(diagnosis: Diagnosis) -> Iterator[str]:
 
 def _finding_lines(mark: str, found: Finding) -> Iterator[str]:
     indent = len(mark)
-    parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}' for name, size in sizes(found).items()]
-    yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}{", ".join(parameters)}', indent)
-    for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]), doubt(found), todo(found)):
+    parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}'
+                  for name, size in sizes(found).items()]
+    yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}'
+                   f'{", ".join(parameters)}', indent)
+    for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]),
+                 doubt(found), todo(found)):
         if text:
             yield _wrapped(' ' * indent + text, indent)
 
 
 def _lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
     yield 'Without a name:', [unknown(each) for each in diagnosis.unexplained]
-    yield 'These data cannot show:', [f'{listed(names)}: {reason}' for reason, names in hidden(diagnosis.cannot_show).items()]
+    yield 'These data cannot show:', [f'{listed(names)}: {reason}'
+                                      for reason, names in hidden(diagnosis.cannot_show).items()]
     yield 'To know:', [sentence(remark) for remark in diagnosis.remarks]
 
 
 def _wrapped(text: str, indent: int = 0) -> str:
-    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False, break_on_hyphens=False)
+    return textwrap.fill(text, _WIDTH, subsequent_indent=' ' * indent, break_long_words=False,
+                         break_on_hyphens=False)
