@@ -1,7 +1,7 @@
 """The package for pip and for colcon; name, version and the like are read from package.xml."""
 
-import sys
 from glob import glob
+import sys
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup

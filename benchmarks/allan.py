@@ -15,17 +15,16 @@ Markdown.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import importlib
 import os
-import time
-from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
+import time
 
 from gyro_calibration.allan import allan_deviation, averaging_sizes, fit_noise
 from gyro_calibration.log import read_log
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
 
 INTERVAL = 0.01
 RECORDING = 'mems_static/adis16405_1.csv.gz'

@@ -11,15 +11,14 @@ minute.
 
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
+import math
 
-import numpy as np
-
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import SerialFaults, damaged
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.serial_faults import damaged, SerialFaults
 from gyro_calibration.log import DEGREE
+import numpy as np
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000

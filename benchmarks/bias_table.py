@@ -15,16 +15,15 @@ tables in Markdown, in percent and deg/s. Each row has noise of its own.
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+import sys
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
 from bias_history import answers, carried_answers, coverage, cubic, linear  # noqa: E402
-
 from gyro_calibration.log import DEGREE  # noqa: E402
 
 #: Name, curve, size of the coefficient, and what else is simulated.

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from drives import Drive
-
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.motion import CALIBRATION
+import numpy as np
 
 #: Longest time that is one step of the filter, s.
 _BLOCK = 0.5

@@ -14,16 +14,15 @@ With --long, a hundred million samples are processed in blocks. Prints tables in
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 import resource
 import time as clock
-from collections.abc import Callable, Mapping
-
-import numpy as np
 
 from gyro_calibration.compensation import compensate
 from gyro_calibration.effects import rate_temperature_polynomial
 from gyro_calibration.heading import integrate
 from gyro_calibration.model import GyroModel, Term
+import numpy as np
 
 #: Errors of some 0.01 rad/s, as a fit to a fibre-optic gyro on a rate table gives them.
 C = np.array([[4e-3, 2.1e-2, -6e-4, -1.3e-2], [-8e-4, 3e-3, 2e-4, -5e-4],
@@ -114,8 +113,8 @@ def side_by_side(count: int = 10 ** 7, repeats: int = 9) -> str:
     log = samples(count, np.random.default_rng(0))
     wanted = floor(*log)
     assert all(np.allclose(side(*log), wanted, rtol=0.0, atol=1e-9) for side in SIDES.values())
-    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()]
-                      for _ in range(repeats)])  # noqa: B023
+    taken = np.array([[seconds(lambda: side(*log)) for side in SIDES.values()]  # noqa: B023
+                      for _ in range(repeats)])
     medians, ratios = np.median(taken, axis=0), np.median(taken / taken[:, 1:2], axis=0)
     lines = [f'| {count:.0e} samples | million samples/s | time over the floor |',
              '|:---|---:|---:|']
@@ -128,8 +127,8 @@ def by_length(counts: tuple[int, ...] = (10 ** 4, 10 ** 5, 10 ** 6, 10 ** 7),
               repeats: int = 9) -> str:
     """Return a table of the cost of a sample in logs of several lengths, and of single samples."""
     logs = [samples(count, np.random.default_rng(0)) for count in counts]
-    taken = [[seconds(lambda: package(*log), max(10 ** 6 // len(log[0]), 1)) for log in logs]
-             for _ in range(repeats)]  # noqa: B023
+    taken = [[seconds(lambda: package(*log), max(10 ** 6 // len(log[0]), 1))  # noqa: B023
+              for log in logs] for _ in range(repeats)]
     costs = np.median(taken, axis=0) / counts
     alone = np.median([seconds(lambda: compensate(MODEL, 0.5, 42.0), 10 ** 4)
                        for _ in range(repeats)])

@@ -19,15 +19,14 @@ bias. None of it is code of the package.
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Iterator
+import math
 from pathlib import Path
-
-import numpy as np
+import sys
 
 from gyro_calibration.encoder import calibrate_encoder
 from gyro_calibration.log import Array, DataRefused, Log, read_log
+import numpy as np
 
 DEGREE = math.pi / 180.0
 #: Length and distance of the windows, s; lags that are tried, s; distance of the points, s.

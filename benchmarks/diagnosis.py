@@ -36,28 +36,27 @@ failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 import json
 import math
+from multiprocessing import get_context
 import os
+from pathlib import Path
 import re
 import sys
 import time
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
+import zlib
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
-import numpy as np  # noqa: E402  (after the number of its threads is set)
-from diagnosed import Judged, diagnosis_of, judged, won  # noqa: E402
-from hidden import FORMS, OUTSIDE, TWINS, Cause, HiddenLog, hide, twin  # noqa: E402
-from hidden.effects import AGAINST_A_MODEL  # noqa: E402
-
+from diagnosed import diagnosis_of, Judged, judged, won  # noqa: E402
 from gyro_calibration.diagnosis.finding import Finding  # noqa: E402
+from hidden import Cause, FORMS, HiddenLog, hide, OUTSIDE, twin, TWINS  # noqa: E402
+from hidden.effects import AGAINST_A_MODEL  # noqa: E402
+import numpy as np  # noqa: E402  (after the number of its threads is set)
 
 MULTIPLES = (1.2, 2.0, 5.0)
 #: The false alarms are counted in each of these; whatever else is hidden has them in turn.

@@ -6,16 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import CALIBRATION, ROBOT, Motion
+from gyro_calibration.motion import CALIBRATION, Motion, ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
+import numpy as np
+from numpy.typing import NDArray
 
 #: Motions are made at this interval, s, with corners on multiples of `GRID` after their begin.
 STEP, GRID = 0.01, 0.1

@@ -23,17 +23,16 @@ estimator that uses the steps may be better than both.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-
-import numpy as np
+import sys
 
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.motion import CALIBRATION, Motion, from_headings
+from gyro_calibration.log import Array, DEGREE
+from gyro_calibration.motion import CALIBRATION, from_headings, Motion
 from gyro_calibration.self_calibration import fit_heading
+import numpy as np
 
 INTERVAL = 0.01
 TIME = np.arange(2001) * INTERVAL

@@ -12,16 +12,15 @@ is the best for a model without a term for it.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-
-import numpy as np
+import sys
 
 from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE, Array, Log
-from gyro_calibration.motion import Motion, from_rates
+from gyro_calibration.log import Array, DEGREE, Log
+from gyro_calibration.motion import from_rates, Motion
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
 
 SCALE_FACTOR_ERROR, BIAS, STEP, INTERVAL = 0.02, 0.3 * DEGREE, 0.088 * DEGREE, 0.05
 WHITE, FLICKER, WALK = 0.3 * DEGREE / 60, 20 * DEGREE / 3600, 1.0 * DEGREE / 3600

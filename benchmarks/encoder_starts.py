@@ -17,13 +17,12 @@ often a calibration that was answered is worse than nothing.
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
-
-import numpy as np
+import sys
 
 from gyro_calibration.encoder import calibrate_encoder
 from gyro_calibration.log import Array, DataRefused, Log, read_log
+import numpy as np
 
 DEGREE = math.pi / 180.0
 FOLLOWED, BLOCK = 300.0, 0.5

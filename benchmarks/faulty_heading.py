@@ -17,26 +17,25 @@ error is the root mean square of the difference from the clean run.
 """
 
 import argparse
-import math
-import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+import math
+import os
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import numpy as np
-from drives import GYROS, STEP, Gyro, begun_any_time, of_motion, random_path
-
+from drives import begun_any_time, Gyro, GYROS, of_motion, random_path, STEP
 from gyro_calibration.compensation import covariance, rate_sensitivity
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import simulate_noise
 from gyro_calibration.self_calibration import record, self_calibrate
 from gyro_calibration.tracking import Settings, track
+import numpy as np
 
 BURST = 0.016  # s; what an FTDI adapter collects by default
 WAKE_UP = 2e-4  # s; mean of what a host is late by

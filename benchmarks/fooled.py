@@ -14,20 +14,19 @@ turn of its wheels (0 to 0.1 deg at 0.5 to 2 Hz while it turns) and a shake (0 t
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.signal import lfilter
+import sys
 
 from gyro_calibration.likelihood import UNLIKELY
-from gyro_calibration.log import DEGREE, Array, DataRefused
-from gyro_calibration.motion import CALIBRATION, Motion, from_rates, turns
+from gyro_calibration.log import Array, DataRefused, DEGREE
+from gyro_calibration.motion import CALIBRATION, from_rates, Motion, turns
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
 from gyro_calibration.self_calibration import self_calibrate
+import numpy as np
+from scipy.signal import lfilter
 
 LEVELS = (0.3, 1.0, 3.0)
 INTERVAL = 0.01
@@ -162,7 +161,6 @@ def saturated(run: Run) -> Array:
     """Clip at 20 to 43 deg/s, either way."""
     limit = run.generator.uniform(20.0, 43.0) * DEGREE
     return np.clip(good(run), -limit, limit)
-
 
 
 #: Unit of the gyro's output and unit assumed -> their ratio, and the text of the refusal.

@@ -18,19 +18,19 @@ run once more.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 import contextlib
+from dataclasses import asdict, dataclass
 import io
 import json
 import os
+from pathlib import Path
 import re
 import resource
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 
@@ -44,8 +44,7 @@ FILES = {'decoder': ('protocols/protocol.py', 'protocols/frames.py', 'protocols/
          'bias table': ('bias_table.py', 'settings_file.py'), 'motion profile': ('motion.py',),
          'motion limits': ('settings_file.py',),
          'recording': ('recording.py', 'storage.py', 'messages.py'), 'parameters': ('node.py',),
-         'arguments': ('verbs/verb.py',),
-}
+         'arguments': ('verbs/verb.py',)}
 
 
 @dataclass

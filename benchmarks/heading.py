@@ -26,25 +26,24 @@ row of a missing package says so. Prints tables in Markdown.
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
+import re
 
 import bounds
-import numpy as np
-from drives import COURSES, GYROS, Course, Drive, Gyro, simulate, slow_path
-from peers import PEERS, tuned
-
+from drives import Course, COURSES, Drive, Gyro, GYROS, simulate, slow_path
 from gyro_calibration.compensation import covariance, rate_sensitivity
-from gyro_calibration.heading import Threshold, filter_rates, integrate
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.heading import filter_rates, integrate, Threshold
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
 from gyro_calibration.self_calibration import fit_heading, record, self_calibrate
-from gyro_calibration.tracking import HeadingTracker, Settings, in_hindsight
+from gyro_calibration.tracking import HeadingTracker, in_hindsight, Settings
+import numpy as np
+from peers import PEERS, tuned
 
 #: The variance is looked at so often, s.
 LOOK = 1.0

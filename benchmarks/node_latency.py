@@ -15,37 +15,36 @@ idle cores; nothing leaves the machine.
 
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack, suppress
+from dataclasses import dataclass
 import itertools
 import math
 import os
+from pathlib import Path
 import random
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
-import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from processes import end, processor_time
-from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
-from sensor_msgs.msg import Imu, Temperature
-
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import Sample, find
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, rate_temperature_polynomial
+from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.effects import BIAS, rate_temperature_polynomial, SCALE_FACTOR_ERROR
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros.runner import PUBLISHED_QOS, SENSOR_QOS
+from nav_msgs.msg import Odometry
+import numpy as np
+from processes import end, processor_time
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from sensor_msgs.msg import Imu, Temperature
 
 RATES = (100, 1000)  # Hz
 ROUNDS = 4

@@ -10,20 +10,19 @@ no error. The settings are the published ones, and the best that `tuned` finds.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+import importlib
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 from drives import Drive
-from scipy.signal import lfilter
-
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import SelfCalibration
+import numpy as np
+from scipy.signal import lfilter
 
 GRAVITY = 9.81
 

@@ -19,19 +19,18 @@ Prints a table in Markdown; n runs determine a standard deviation to 1 / sqrt(2 
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-
-import numpy as np
+import sys
 
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array
-from gyro_calibration.motion import CALIBRATION, ROBOT, Motion, turns
+from gyro_calibration.log import Array, DEGREE
+from gyro_calibration.motion import CALIBRATION, Motion, ROBOT, turns
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.plan import Ability, Forecast, best, plain
+from gyro_calibration.plan import Ability, best, Forecast, plain
 from gyro_calibration.reproduction.hong_park import XV3500
+import numpy as np
 
 RATE, DRIVE = 100, 160.0
 #: Lengths of planned motions, s.
@@ -43,8 +42,7 @@ ABILITIES = {'cable, 180 deg': Ability(60.0 * DEGREE, 120.0 * DEGREE, lowest=-18
                                        highest=180.0 * DEGREE),
              'cable, 20 deg': Ability(60.0 * DEGREE, 60.0 * DEGREE, lowest=-20.0 * DEGREE,
                                       highest=20.0 * DEGREE),
-             'free': Ability(60.0 * DEGREE, 120.0 * DEGREE),
-}
+             'free': Ability(60.0 * DEGREE, 120.0 * DEGREE)}
 
 
 def followed(motion: Motion, time: Array, late: float, lag: float) -> Array:

@@ -15,11 +15,10 @@ from __future__ import annotations
 import math
 import sys
 
-import numpy as np
-
 from gyro_calibration.calibration import channels_of, fit_effects
 from gyro_calibration.dwells import Dwells
 from gyro_calibration.effects import rate_temperature_polynomial
+import numpy as np
 
 DEGREE = math.pi / 180.0
 DWELL, DWELL_SCALE, SWEEP_SCALE = 0.01 * DEGREE, 7e-4, 3e-4

@@ -1,9 +1,9 @@
 """Processes that are measured: how they end, and what they use."""
 
+from contextlib import suppress
 import signal
 import subprocess
 import time
-from contextlib import suppress
 
 
 def end(process: subprocess.Popen) -> None:

@@ -11,12 +11,10 @@ the fitted data. Prints a table in Markdown, root mean squares in deg/s.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
+import os
 from pathlib import Path
-
-import numpy as np
 
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.compensation import compensate
@@ -24,16 +22,17 @@ from gyro_calibration.dwells import Dwells, from_table, take
 from gyro_calibration.effects import (
     BIAS,
     CUBIC_NONLINEARITY,
+    Effect,
+    rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
-    Effect,
-    rate_temperature_polynomial,
 )
 from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.scatter import rms
-from gyro_calibration.selection import TECHNOLOGIES, select_effects
+from gyro_calibration.selection import select_effects, TECHNOLOGIES
+import numpy as np
 
 #: Slower dwells are seen, faster ones predicted, rad/s.
 SEEN = 60.0 * DEGREE
@@ -57,8 +56,7 @@ FITS = {'bias': of(BIAS), 'bias, scale factor': of(BIAS, SCALE_FACTOR_ERROR),
         'polynomial 3,2': of(rate_temperature_polynomial(3, 2)),
         'polynomial 5,2': of(rate_temperature_polynomial(5, 2)),
         **{f'default, {technology or "no technology said"}': chosen(technology)
-           for technology in (None, *TECHNOLOGIES)},
-}
+           for technology in (None, *TECHNOLOGIES)}}
 
 
 def table(data: Path) -> Dwells:

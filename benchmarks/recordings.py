@@ -18,21 +18,20 @@ calibration, and the noise of the same kind of gyro at rest.
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 import os
-import sys
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+import sys
 
 from gyro_calibration.compensation import quadratic_form
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, read_log
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.motion import from_headings
 from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import Limits, fit_heading, self_calibrate
+from gyro_calibration.self_calibration import fit_heading, Limits, self_calibrate
+import numpy as np
 
 FOLLOWED = 300.0
 #: The gyro is mounted upside down against the encoder in two of them.

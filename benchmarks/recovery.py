@@ -14,11 +14,9 @@ the compensated rates over the whole range.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
+import sys
 
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
@@ -27,17 +25,18 @@ from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
+    Channels,
     CUBIC_NONLINEARITY,
+    polynomial_from_matrix,
     QUADRATIC_NONLINEARITY,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
-    Channels,
-    polynomial_from_matrix,
 )
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
+import numpy as np
 
 #: An effect of clear size each; those of temperature count from 36 degC.
 TRUTH = {term.effect.name: term for term in (

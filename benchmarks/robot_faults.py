@@ -14,28 +14,28 @@ leaves the machine.
 """
 
 import argparse
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, field
 import math
 import os
+from pathlib import Path
 import random
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test'))
 
-import rclpy  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from processes import end  # noqa: E402
+import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from robot import Robot, RosRobot, SecondCommander, now  # noqa: E402
+from robot import now, Robot, RosRobot, SecondCommander  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -230,7 +230,7 @@ class Stage:
 
 
 def clock_absent(stage):
-    """use_sim_time without /clock, unplugged in mid-run"""
+    """use_sim_time without /clock, unplugged in mid-run."""
     stage.start(parameters={'use_sim_time': True})
     stage.calibrate()
     stage.robot.robot.unplugged = True
@@ -240,7 +240,7 @@ def clock_absent(stage):
 
 
 def clock_paused(stage):
-    """/clock and stamps stop in mid-run, samples come"""
+    """/clock and stamps stop in mid-run, samples come."""
     stage.start(parameters={'use_sim_time': True}, speed=1.0)
     stage.calibrate()
     stage.robot.clock_stands = True
@@ -250,7 +250,7 @@ def clock_paused(stage):
 
 
 def clock_paused_unplugged(stage):
-    """/clock stops and the gyro is unplugged"""
+    """/clock stops and the gyro is unplugged."""
     stage.start(parameters={'use_sim_time': True}, speed=1.0)
     stage.calibrate()
     stage.robot.clock_stands = stage.robot.robot.unplugged = True
@@ -260,7 +260,7 @@ def clock_paused_unplugged(stage):
 
 
 def clock_fast(stage):
-    """/clock at four times the speed: must work"""
+    """/clock at four times the speed: must work."""
     stage.start(parameters={'use_sim_time': True}, speed=4.0)
     stage.fault()
     stage.calibrate()
@@ -269,7 +269,7 @@ def clock_fast(stage):
 
 
 def stamps_stand(stage):
-    """Stamps stop in mid-run"""
+    """Stamps stop in mid-run."""
     stage.start()
     stage.calibrate()
     stage.robot.robot.stamps_stand = True
@@ -279,7 +279,7 @@ def stamps_stand(stage):
 
 
 def unplugged(stage):
-    """The gyro is silent in mid-run"""
+    """Let the gyro be silent in mid-run."""
     stage.start()
     stage.calibrate()
     stage.robot.robot.unplugged = True
@@ -289,7 +289,7 @@ def unplugged(stage):
 
 
 def soft_stop(stage):
-    """Zeros at 20 Hz in mid-run"""
+    """Zeros at 20 Hz in mid-run."""
     stage.start()
     other = stage.others()
     stage.calibrate()
@@ -300,7 +300,7 @@ def soft_stop(stage):
 
 
 def teleop(stage):
-    """Teleop at 20 Hz in mid-run"""
+    """Teleop at 20 Hz in mid-run."""
     stage.start()
     other = stage.others()
     stage.calibrate()
@@ -311,7 +311,7 @@ def teleop(stage):
 
 
 def begun_in_teleop(stage):
-    """A run is asked for while teleop turns the robot"""
+    """Ask for a run while teleop turns the robot."""
     stage.start()
     other = stage.others()
     other.rate = TELEOP
@@ -345,7 +345,7 @@ def _shift(message, seconds):
 
 
 def second_gyro(stage):
-    """Another gyro, which rests, on imu/data_raw"""
+    """Another gyro, which rests, on imu/data_raw."""
     def change(message):
         _shift(message, 0.005)
         message.angular_velocity.z = 0.0001 * random.random()
@@ -353,13 +353,13 @@ def second_gyro(stage):
 
 
 def second_driver(stage):
-    """The same samples once more, 0.3 s old"""
+    """Send the same samples once more, 0.3 s old."""
     return _two_publishers(stage, 'second publisher: stamps 0.3 s older',
                            lambda message: _shift(message, -0.3))
 
 
 def killed(stage):
-    """SIGKILL of the node; the base has no time-out"""
+    """SIGKILL of the node; the base has no time-out."""
     stage.start()
     stage.calibrate()
     stage.process.kill()
@@ -369,7 +369,7 @@ def killed(stage):
 
 
 def killed_with_timeout(stage):
-    """SIGKILL of the node; the base has a time-out"""
+    """SIGKILL of the node; the base has a time-out."""
     stage.start(timeout=0.5)
     stage.calibrate()
     stage.process.kill()
@@ -379,7 +379,7 @@ def killed_with_timeout(stage):
 
 
 def deaf(stage):
-    """The base goes on after a cancel"""
+    """Let the base go on after a cancel."""
     stage.start()
     stage.calibrate()
     stage.robot.robot.deaf = True
@@ -390,7 +390,7 @@ def deaf(stage):
 
 
 def wheels(stage):
-    """Odometry and commands both feed the detection of standstill: must work"""
+    """Odometry and commands both feed the detection of standstill: must work."""
     stage.start(parameters={'wheels': 'both'})
     stage.fault()
     stage.calibrate()
@@ -399,7 +399,7 @@ def wheels(stage):
 
 
 def busy(stage):
-    """Two processes that spin, on this computer"""
+    """Two processes that spin, on this computer."""
     stage.start()
     with ExitStack() as spinning:
         for _ in range(2):

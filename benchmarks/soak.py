@@ -19,11 +19,14 @@ emulated gyro has turned, shows that none of them was lost on the way.
 """
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack, suppress
 import fcntl
 import itertools
 import json
 import math
 import os
+from pathlib import Path
 import random
 import signal
 import statistics
@@ -31,27 +34,23 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from processes import end, processor_time
-from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
-from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import Imu
-
-from gyro_calibration.driver.emulator import Emulator, emulate
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.emulator import emulate, Emulator
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros.runner import SENSOR_QOS
+import numpy as np
+from processes import end, processor_time
+import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Imu
 
 SOAKED, SOAKED_RATE = 'kvh_1750', 1000.0  # Hz
 SMALLEST = 0.5  # rad/s; of a numbered sample
@@ -359,8 +358,7 @@ class Run:
                                           for name, values in self.memory.items()},
                 'load_percent': {name: round(100.0 * used / self.lasted, 1)
                                  for name, used in self.used.items()},
-                'driver_said': gyro_said,
-        }
+                'driver_said': gyro_said}
 
 
 def resident_memory(process: int) -> int:

@@ -14,21 +14,20 @@ robust least squares of bias, scale and lag, which saw the same part.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import json
 import math
 import os
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-from scipy.optimize import least_squares
+import time
 
 from gyro_calibration.diagnosis.finding import Diagnosis, Finding
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.log import DEGREE, QUANTITIES, Array, DataRefused, Log, read_log
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, QUANTITIES, read_log
 from gyro_calibration.log_compensation import compensate_log
+import numpy as np
+from scipy.optimize import least_squares
 
 WINDOW = 60.0
 LAGS = np.arange(-1.5, 1.501, 0.05)

@@ -9,16 +9,15 @@ at which it was known to that of now.
 
 from __future__ import annotations
 
-import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
-
-import numpy as np
+import math
 
 from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.compensation import covariance
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
+import numpy as np
 
 #: Step of the temperatures for which the change of the bias is computed, K; linear between them.
 _STEP = 0.5

@@ -18,21 +18,20 @@ restricted likelihood over a few sizes.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+import hashlib
+import json
+import math
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from gyro_calibration.files import plain, reason, write_atomically
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.settings_file import read_settings, settings_text
+import numpy as np
 
 #: Width of a bin of temperature, K; a run has one entry in each.
 BIN = 1.5

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-
-import numpy as np
-from scipy.linalg import solve_triangular
+import math
 
 from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import Channels, Effect, Parameter
 from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import (
-    SMALLEST_TEMPERATURE_SPREAD,
-    Scatter,
-    Uncertainty,
-    Whitener,
     find_scatter,
     parts_of,
     rms,
+    Scatter,
+    SMALLEST_TEMPERATURE_SPREAD,
     summed,
+    Uncertainty,
+    Whitener,
 )
+import numpy as np
+from scipy.linalg import solve_triangular
 
 #: Beyond this condition number of the columns, each of length one, the effects are not separable.
 LARGEST_CONDITION = 1e3

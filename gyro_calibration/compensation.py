@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import clip
-from gyro_calibration.log import CACHED, Array, Number
+from gyro_calibration.log import Array, CACHED, Number
 from gyro_calibration.model import GyroModel
+import numpy as np
 
 #: A rate of this size, rad/s, comes of a model whose values are too large to be computed with.
 _LARGEST = 1e300

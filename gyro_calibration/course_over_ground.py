@@ -19,16 +19,15 @@ size that is not known (`PriorSize`) but at most what the technology of the gyro
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.heading import integrate
-from gyro_calibration.likelihood import Fit, encoder_step, robust_residual
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.likelihood import encoder_step, Fit, robust_residual
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.motion import Motion
-from gyro_calibration.noise_grid import GridFit, PriorSize, heading_noise, noise_grid, wander
+from gyro_calibration.noise_grid import GridFit, heading_noise, noise_grid, PriorSize, wander
+import numpy as np
 
 #: Largest standard deviations of scale factor error and bias, rad/s, by technology.
 PRIORS = {

@@ -9,32 +9,25 @@ compensation drives the calibration, then a drive follows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, field
 import math
 import os
+from pathlib import Path
 import random
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import rclpy
 from geometry_msgs.msg import Twist
-from rclpy.executors import SingleThreadedExecutor
-from sensor_msgs.msg import Imu
-from std_srvs.srv import Trigger
-from tqdm import tqdm
-
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import Sample, find
+from gyro_calibration.driver.protocols import find, Sample
 from gyro_calibration.files import write_atomically
-from gyro_calibration.heading import Threshold, filter_rates, integrate
-from gyro_calibration.log import DEGREE, Array, Log, write_log
+from gyro_calibration.heading import filter_rates, integrate, Threshold
+from gyro_calibration.log import Array, DEGREE, Log, write_log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import CALIBRATION, Motion, turns
@@ -42,6 +35,12 @@ from gyro_calibration.noise import simulate_noise
 from gyro_calibration.picture import draw_headings
 from gyro_calibration.reproduction.hong_park import TABLE_1
 from gyro_calibration.ros.runner import SENSOR_QOS
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+from tqdm import tqdm
 
 PROTOCOL = 'kvh_dsp3000'
 NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands

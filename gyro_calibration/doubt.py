@@ -9,16 +9,15 @@ longer times: such errors repeat with the motion, and do not add up.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-
-import numpy as np
-from scipy.special import chdtr
+import math
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.motion import Motion
+import numpy as np
+from scipy.special import chdtr
 
 #: A run is looked at again in so many windows.
 _WINDOWS = 16

@@ -18,11 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
+from gyro_calibration.log import Array
+from gyro_calibration.noise import CALIBRATED, known_mean, Noise
 import numpy as np
 from scipy.linalg import pinvh
-
-from gyro_calibration.log import Array
-from gyro_calibration.noise import CALIBRATED, Noise, known_mean
 
 #: Places of the heading and the random walk in the state; the flicker begins after them.
 HEADING, WALK, _FLICKER = 0, 1, 2

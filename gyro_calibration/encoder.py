@@ -8,26 +8,25 @@ headings, and the regression of the encoder's rate on the gyro, sample by sample
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
+import math
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy import stats
-from scipy.fft import dct
-
-from gyro_calibration.course_over_ground import PRIORS, fit_course, is_course
+from gyro_calibration.course_over_ground import fit_course, is_course, PRIORS
 from gyro_calibration.doubt import DRIVE
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, refuse_wrapped
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.mishap import refuse_dead
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import Motion, from_headings
+from gyro_calibration.motion import from_headings, Motion
 from gyro_calibration.noise import ALLAN_FLOOR, Noise
-from gyro_calibration.self_calibration import Limits, fit_rate, refuse_scale
+from gyro_calibration.self_calibration import fit_rate, Limits, refuse_scale
 from gyro_calibration.stamps import lost_samples
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.fft import dct
 
 #: Of a log, s: three years, or stamps in another unit.
 LONGEST = 1e8

@@ -9,16 +9,16 @@ as it is. A file that is replaced keeps its mode, and its owner and group where 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 import errno
 import fcntl
 import os
+from pathlib import Path
 import re
 import secrets
 import select
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import BinaryIO
 
 #: Beyond this no value of a gyro lies, not even a count of 64 bits, and products of some such

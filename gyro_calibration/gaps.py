@@ -14,9 +14,9 @@ them, T² N² / (2 dt) instead of N² T.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
+import math
 
 from gyro_calibration.log import SHORTEST
 from gyro_calibration.noise import Noise

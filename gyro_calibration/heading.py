@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from gyro_calibration.compensation import quadratic_form
 from gyro_calibration.files import LARGEST
 from gyro_calibration.gaps import Gaps
-from gyro_calibration.log import CACHED, DEGREE, Array
+from gyro_calibration.log import Array, CACHED, DEGREE
 from gyro_calibration.noise import Noise
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class ThresholdFilter:
         self._newer.clear()
         self._sum = self._squares = 0.0
 
-    def filter(self, time: float, rate: float) -> float:
+    def filter(self, time: float, rate: float) -> float:  # noqa: A003
         """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
         if not self.settings.rate:
             return rate

@@ -9,21 +9,20 @@ what rests show of it goes into the table for the next run.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
+import math
 
-import numpy as np
-
-from gyro_calibration.assumptions import Assumptions, Way, assumed, sensitive, uncertain
+from gyro_calibration.assumptions import assumed, Assumptions, sensitive, uncertain, Way
 from gyro_calibration.bias_table import BiasTable, carry
-from gyro_calibration.compensation import Compensated, compensate, quadratic_form, rate_sensitivity
+from gyro_calibration.compensation import compensate, Compensated, quadratic_form, rate_sensitivity
 from gyro_calibration.effects import Channels
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.tracking import HeadingTracker, Settings
+import numpy as np
 
 #: Means over so long at rest go into the table, s.
 STRETCH = 10.0
@@ -140,7 +139,7 @@ class HeadingEstimator:
         self._this_run = False
         self._begin(now)
 
-    def set(self, settings: Settings) -> None:
+    def set(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings of the tracker."""
         self._settings = settings
         self.tracker.set(settings)

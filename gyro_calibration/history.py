@@ -9,15 +9,14 @@ then.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+import math
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.effects import Channels
 from gyro_calibration.effects.lag import lag_ahead
 from gyro_calibration.log import Log, Number
+import numpy as np
 
 #: Vibration is what deviates from the mean over so many seconds.
 VIBRATION_TIME = 1.0

@@ -8,16 +8,15 @@ trapezoid rule against the reference.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
+import math
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.motion import Motion
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
 
 
 @dataclass(frozen=True)

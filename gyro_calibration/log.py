@@ -8,33 +8,32 @@ names each column with its unit.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 import csv
+from dataclasses import dataclass, field
+from functools import partial
 import gzip
 import io
 import itertools
 import math
-import reprlib
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+import reprlib
 from typing import Any, BinaryIO
-
-import numpy as np
-from numpy.typing import NDArray
+import zlib
 
 from gyro_calibration.files import (
     GROWN,
     GROWTH,
-    LARGEST,
     InputError,
+    LARGEST,
     opened,
     plain,
     reason,
     replacing,
 )
+import numpy as np
+from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

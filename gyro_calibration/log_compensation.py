@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gyro_calibration.compensation import Compensated, compensate, rate_sensitivity
+from gyro_calibration.compensation import compensate, Compensated, rate_sensitivity
 from gyro_calibration.effects import Channels
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, QUANTITIES, Array, Log, Mask
+from gyro_calibration.log import Array, DEGREE, Log, Mask, QUANTITIES
 from gyro_calibration.model import GyroModel
+import numpy as np
+from numpy.typing import NDArray
 
 #: Where effects look at a heading without reference, it is found for so long at once, s; longer
 #: parts need more passes.

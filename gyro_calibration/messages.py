@@ -9,13 +9,12 @@ then only numbers of eight bytes.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+import struct
 
 from gyro_calibration.log import Number
+import numpy as np
 
 NSEC_PER_SEC = 1_000_000_000
 IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'

@@ -9,16 +9,15 @@ begun late, or ended early.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import unlikeliest
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.motion import Motion
+import numpy as np
 
 #: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
 #: toggles.
@@ -278,7 +277,7 @@ _WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {
 _PENALTIES = {'slip': _SIMPLER}
 _SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
     'early': lambda value, motion: (
-        f'the robot stopped at about {value[0]:.1f} s of the profile\'s {motion.duration:.1f} s: '
+        f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
         'drive the whole profile'),
     'speed': lambda value, motion: (
         f'the robot drove the profile {value[0]:.2f} times as fast as it says, in '

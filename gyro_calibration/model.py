@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+import math
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.effects import Channels, Effect, Number
 from gyro_calibration.history import History
-from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.log import Array, DEGREE, Mask
 from gyro_calibration.noise import Noise
+import numpy as np
 
 #: Largest plausible output, rad/s, where no valid range of rates is stated. Where one is: so many
 #: times its farther end, but at least what robots reach, for a model may have been fitted at rest.

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-import reprlib
 from collections.abc import Mapping, Sequence
+import math
 from pathlib import Path
+import reprlib
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.effects import (
     CATALOGUE,
@@ -16,11 +14,12 @@ from gyro_calibration.effects import (
     polynomial_from_matrix,
     rate_temperature_polynomial,
 )
-from gyro_calibration.files import LARGEST, InputError, reason, write_atomically
+from gyro_calibration.files import InputError, LARGEST, reason, write_atomically
 from gyro_calibration.log import Array, shown
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise
 from gyro_calibration.settings_file import read_settings, settings_text
+import numpy as np
 
 FORMAT = 'gyro_calibration/model'
 VERSION = 1
@@ -66,6 +65,7 @@ _SHORT.maxlevel = 3
 
 
 class _PlaceError(ValueError):
+
     def __init__(self, place: str, given: Any, wanted: str):
         super().__init__(f'{shown(place)} is {_SHORT.repr(given)}; wanted {wanted}')
 

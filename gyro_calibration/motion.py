@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 import csv
+from dataclasses import dataclass
 import io
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
+from gyro_calibration.files import InputError, LARGEST, read_bytes, reason
+from gyro_calibration.log import Array, DEGREE, SHORTEST, shown
 import numpy as np
-
-from gyro_calibration.files import LARGEST, InputError, read_bytes, reason
-from gyro_calibration.log import DEGREE, SHORTEST, Array, shown
 
 #: Bytes of a motion profile: an hour at 100 Hz has half of it.
 BYTES = 16_000_000

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.signal import oaconvolve
+import math
 
 from gyro_calibration.log import Array, Number
+import numpy as np
+from scipy.signal import oaconvolve
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)

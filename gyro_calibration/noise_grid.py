@@ -51,16 +51,15 @@ Example, for headings of a gyro's integral and of a reference, rad, at the same 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+import math
 
+from gyro_calibration.log import Array
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.linalg.lapack import dpttrf, dpttrs
-
-from gyro_calibration.log import Array
 
 #: Points of the grid a size: first over its whole range, and in each further pass around what is
 #: likely.
@@ -87,7 +86,7 @@ class BandedNoise:
     name: str
     diagonal: Array
     neighbours: Array | None
-    range: tuple[float, float]
+    range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class SharedNoise:
 
     name: str
     variance: Array
-    range: tuple[float, float]
+    range: tuple[float, float]  # noqa: A003
     unseen: float = 0.0
 
 
@@ -129,7 +128,7 @@ class PriorSize:
 
     name: str
     value: int
-    range: tuple[float, float]
+    range: tuple[float, float]  # noqa: A003
 
 
 @dataclass(frozen=True)
@@ -327,7 +326,7 @@ class _Regression:
     def precisions(self, sizes: Array) -> Array:
         """Return prior precisions, shape (k, m + q), for sizes of shape (k, parts)."""
         fixed = np.tile(self.precision, (len(sizes), 1))
-        for prior, size in zip(self.priors, sizes[:, len(self.shared) :].T):
+        for prior, size in zip(self.priors, sizes[:, len(self.shared):].T):
             fixed[:, prior.value] = 1.0 / size**2
         if not self.shared:
             return fixed
@@ -424,7 +423,7 @@ def noise_grid(
                 _refined(axis, grid.sizes[:, place], weights) for place, axis in enumerate(axes)
             ]
     if wandering is not None:
-        of_shared = grid.sizes[:, len(banded) : len(banded) + len(shared)]
+        of_shared = grid.sizes[:, len(banded): len(banded) + len(shared)]
         grid.covariance[:, wandering, wandering] += of_shared**2 @ np.array(
             [part.unseen for part in shared]
         )
@@ -487,7 +486,7 @@ def _averaged(
     best = int(grid.log_likelihood.argmax())
     banded, count = len(regression.banded), regression.values
     noise = regression.noise(grid.sizes[best, :banded])
-    precisions = regression.precisions(grid.sizes[best : best + 1, banded:])
+    precisions = regression.precisions(grid.sizes[best: best + 1, banded:])
     _, (all_values,), (inverse,) = regression.solved(noise, precisions)
     names = [part.name for part in regression.parts]
     likely = dict(zip(names, grid.sizes[best].tolist()))

@@ -6,15 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gyro_calibration.allan import AllanChart, NoiseFit
 from gyro_calibration.calibration import Calibration
 from gyro_calibration.dwells import Dwells
 from gyro_calibration.files import replacing
-from gyro_calibration.log import DEGREE, Array, Mask
+from gyro_calibration.log import Array, DEGREE, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.turn import TurnErrors
+import numpy as np
 
 _STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)))
 #: Grey shades from light to dark; neither end vanishes on paper or in ink.

@@ -14,17 +14,16 @@ well as white noise N allows in the time T, N / √T, whatever the motion. The m
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+import math
 
-import numpy as np
-from scipy.optimize import differential_evolution
-
-from gyro_calibration.likelihood import BLOCK, DELAY_DEVIATION, LAG_DEVIATION, block_length
-from gyro_calibration.log import DEGREE, Array, DataRefused, Number
-from gyro_calibration.motion import Motion, from_rates
+from gyro_calibration.likelihood import BLOCK, block_length, DELAY_DEVIATION, LAG_DEVIATION
+from gyro_calibration.log import Array, DataRefused, DEGREE, Number
+from gyro_calibration.motion import from_rates, Motion
 from gyro_calibration.noise import Noise
 from gyro_calibration.self_calibration import Limits
+import numpy as np
+from scipy.optimize import differential_evolution
 
 #: Cells in which the noise is counted, in one block of the fit; points of the motion in one cell.
 _CELLS, _POINTS = 5, 5

@@ -9,31 +9,30 @@ as well.
 
 from __future__ import annotations
 
-import os.path
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+import os.path
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gyro_calibration.log import ROWS, Array, Log, LogError, Mask
+from gyro_calibration.log import Array, Log, LogError, Mask, ROWS
 from gyro_calibration.messages import (
+    heading_of,
     IMU,
     LAYOUTS,
+    MessageError,
     NOT_REPORTED,
     NSEC_PER_SEC,
     ODOMETRY,
+    parse,
     POSE,
     TEMPERATURE,
     TWIST,
-    MessageError,
-    heading_of,
-    parse,
 )
 from gyro_calibration.storage import Contents, Heard, Message, read_messages
+import numpy as np
+from numpy.typing import NDArray
 
 Nanoseconds = NDArray[np.int64]
 

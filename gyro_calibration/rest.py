@@ -7,14 +7,13 @@ Each test has its share of the false alarms per hour at rest.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.special import chdtri, ndtri
+import math
 
 from gyro_calibration.noise import Noise
+import numpy as np
+from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is looked at, s.
 BLOCK, WINDOW = 0.1, 0.5

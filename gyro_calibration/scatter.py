@@ -10,17 +10,16 @@ dwells of one sweep do not count as thirty independent ones.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
-from scipy.stats import t as student
+import math
 
 from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.likelihood import robust_residual
 from gyro_calibration.log import Array, DataRefused, Mask
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+from scipy.stats import t as student
 
 #: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
 OUTLYING = 6.0

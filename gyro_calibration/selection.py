@@ -9,11 +9,9 @@ the physics of the instrument gives decides, if the instrument is known.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.calibration import Calibration, fit_effects
 from gyro_calibration.dwells import Dwells
@@ -21,15 +19,16 @@ from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
+    Channels,
     CUBIC_NONLINEARITY,
+    Effect,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
     STEADY,
-    Channels,
-    Effect,
 )
 from gyro_calibration.log import Array, DataRefused, Progress
-from gyro_calibration.scatter import Scatter, find_scatter
+from gyro_calibration.scatter import find_scatter, Scatter
+import numpy as np
 
 #: Probability of taking an effect that is not there, in one calibration.
 FALSE_ALARM_RATE = 0.01

@@ -9,19 +9,16 @@ does not need the start of the motion to the millisecond.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-
-import numpy as np
-from scipy.special import chdtrc, ndtri
+import math
 
 from gyro_calibration.doubt import allow_asymmetry, look_slower, refuse_repeating, refuse_useless
-from gyro_calibration.likelihood import CHANCE, FOLLOWING, Fit, Goodness, fit_likelihood
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.likelihood import CHANCE, Fit, fit_likelihood, FOLLOWING, Goodness
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.mishap import (
     EXPLAINED,
-    Pieces,
     followed,
+    Pieces,
     pieces,
     refuse_dead,
     refuse_robot,
@@ -33,6 +30,8 @@ from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import Motion
 from gyro_calibration.noise import Noise
 from gyro_calibration.stamps import even_times
+import numpy as np
+from scipy.special import chdtrc, ndtri
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,7 @@ def refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
     """Refuse samples that are too few, no numbers, or too far apart."""
     if len(time) < limits.samples:
         raise DataRefused(f'only {len(time)} samples came; at least {limits.samples} are needed: '
-                          'look at the gyro\'s line and rate')
+                          "look at the gyro's line and rate")
     if not np.isfinite(rate).all():
         raise DataRefused(f'{np.sum(~np.isfinite(rate))} samples are not a finite number: '
                           'leave them out, or mend the line')
@@ -245,14 +244,14 @@ def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
                           'leave those points out, or run again')
     if time[-1] - time[0] < 0.9 * motion.duration - 2.0 * limits.time_offset:
         covered = time[-1] - time[0]
-        raise DataRefused(f'the samples cover {covered:.1f} s of the profile\'s '
+        raise DataRefused(f"the samples cover {covered:.1f} s of the profile's "
                           f'{motion.duration:.1f} s: record the whole motion')
 
 
 def refuse_scale(s: float, reference: str, remedy: str) -> None:
     """Refuse a gyro that saw almost none of the reference's turns, or all with the other sign."""
     if abs(1.0 + s) < 0.5:
-        raise DataRefused(f'the gyro saw {100 * (1 + s):.0f} % of the {reference}\'s turns: '
+        raise DataRefused(f"the gyro saw {100 * (1 + s):.0f} % of the {reference}'s turns: "
                           'did the robot move, and is the gyro alive?')
     if s < -1.5:
         raise DataRefused(f'the gyro turns the other way than the {reference} '
@@ -303,7 +302,7 @@ def _refuse_units(s: float, limits: Limits) -> None:
     unit = unit_error(1.0 + s) if abs(s) > limits.scale_factor_error else ''
     if unit:
         raise DataRefused(unit)
-    refuse_scale(s, 'profile', 'set the driver\'s parameter invert')
+    refuse_scale(s, 'profile', "set the driver's parameter invert")
 
 
 def _refuse_values(fit: Fit, deviation: float, limits: Limits) -> None:
@@ -311,7 +310,7 @@ def _refuse_values(fit: Fit, deviation: float, limits: Limits) -> None:
     if abs(s) > limits.scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.scale_factor_error:.0f} %: look at the sensitivity and '
-                          'at the profile\'s unit')
+                          "at the profile's unit")
     if abs(b) > limits.bias:
         raise DataRefused(f'a bias of {b / DEGREE:.2f} deg/s is beyond '
                           f'{limits.bias / DEGREE:g} deg/s: was the robot turned by hand?')

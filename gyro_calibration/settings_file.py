@@ -8,13 +8,12 @@ They are YAML as people write it, and data alone: nothing in them is run or name
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
+import re
 from typing import Any
 
-import yaml
-
 from gyro_calibration.files import read_bytes
+import yaml
 
 #: Bytes of such a file: a model with the covariance of 150 values has half of it.
 BYTES = 1_000_000

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import History
 from gyro_calibration.log import Array, Log, Number
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import Motion
 from gyro_calibration.noise import simulate_noise
+import numpy as np
 
 
 def simulate(model: GyroModel, motion: Motion, sample_rate: float = 100.0,

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gyro_calibration.log import Array, DataRefused
 import numpy as np
 from numpy.typing import NDArray
-
-from gyro_calibration.log import Array, DataRefused
 
 Integers = NDArray[np.integer]
 

@@ -9,23 +9,23 @@ more memory than `LARGEST`, or grow to more than `GROWTH` times the file.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 import importlib
 import io
 import os
+from pathlib import Path
 import re
 import shutil
 import sqlite3
 import struct
 import sys
 import tempfile
-import zlib
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote
+import zlib
 
 from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
 from gyro_calibration.log import LogError, shown

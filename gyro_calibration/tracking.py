@@ -9,18 +9,17 @@ was taken for bias meanwhile becomes heading again.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field, replace
+import math
 
-import numpy as np
-
-from gyro_calibration.drift import HEADING, WALK, Drift, Turn, begin, smoothed
-from gyro_calibration.gaps import FASTEST, LONGEST, Gaps, Intervals
-from gyro_calibration.heading import Threshold, ThresholdFilter, integrate
-from gyro_calibration.log import DEGREE, SHORTEST, Array, Mask
+from gyro_calibration.drift import begin, Drift, HEADING, smoothed, Turn, WALK
+from gyro_calibration.gaps import FASTEST, Gaps, Intervals, LONGEST
+from gyro_calibration.heading import integrate, Threshold, ThresholdFilter
+from gyro_calibration.log import Array, DEGREE, Mask, SHORTEST
 from gyro_calibration.noise import Noise
-from gyro_calibration.rest import BLOCK, LAGS, WINDOW, Block, Energy, sigmas
+from gyro_calibration.rest import BLOCK, Block, Energy, LAGS, sigmas, WINDOW
+import numpy as np
 
 #: A correction of the heading is taken over with this time constant while the robot moves, s.
 SETTLING = 1.0
@@ -160,7 +159,7 @@ class HeadingTracker:
     def _none(self) -> Turn:
         return Turn(0.0, 0.0, np.zeros(len(self._drift.mean) - self._drift.calibrated))
 
-    def set(self, settings: Settings) -> None:
+    def set(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
         self._settings = settings
         self._seeks = settings.false_alarms > 0.0 and self._claimed.angle_random_walk > 0.0

@@ -9,17 +9,16 @@ and with a model and then the bias that is left at rest.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-
-import numpy as np
+import math
 
 from gyro_calibration.calibration import Calibration, fit_effects
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, Numbers, take
-from gyro_calibration.log import DEGREE, Array, DataRefused, Mask
+from gyro_calibration.log import Array, DataRefused, DEGREE, Mask
 from gyro_calibration.self_calibration import refuse_scale
+import numpy as np
 
 #: rad/s; the error of slower turns is mostly bias, not scale; as published.
 SLOWEST = 5.0 * DEGREE

@@ -8,18 +8,17 @@ reference. The rests give the bias, and the remaining angle over the turns gives
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.special import ndtri
+import math
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import CHANCE, Fit
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.mishap import refuse_dead, refuse_saturated, unit_error
 from gyro_calibration.noise import Noise
 from gyro_calibration.self_calibration import Limits, refuse_samples, refuse_scale
+import numpy as np
+from scipy.special import ndtri
 
 TURN = 2.0 * math.pi
 #: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
@@ -205,7 +204,7 @@ def _refuse_units(scale: float, limits: Limits) -> None:
     if unit:
         raise DataRefused(unit)
     refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
-                 'else set the driver\'s parameter invert')
+                 "else set the driver's parameter invert")
 
 
 def _ambiguous(measured: float, turns: int | None) -> str:

@@ -8,10 +8,8 @@ The logs are simulated here, so that the truth is known. With logs of your own:
 
 """
 
-import sys
 from pathlib import Path
-
-import numpy as np
+import sys
 
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
@@ -25,6 +23,7 @@ from gyro_calibration.model_file import write_model
 from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
+import numpy as np
 
 NOISE = Noise(angle_random_walk=1.5e-4)
 #: The model of the gyro that is in use.

@@ -10,8 +10,6 @@ The table is simulated here, so that the truth is known. With one of your own:
 
 import sys
 
-import numpy as np
-
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import dwells
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE
@@ -19,6 +17,7 @@ from gyro_calibration.log import DEGREE, Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import write_model
 from gyro_calibration.selection import select_effects
+import numpy as np
 
 #: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor
 #: that falls with temperature.

@@ -10,8 +10,6 @@ The log is simulated here, so that the truth is known. With a log of your own:
 
 import sys
 
-import numpy as np
-
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.log import DataRefused
 from gyro_calibration.model import GyroModel, Term, with_self_calibration
@@ -20,6 +18,7 @@ from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
 from gyro_calibration.self_calibration import record, self_calibrate
 from gyro_calibration.simulation import simulate
+import numpy as np
 
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
 TRUE_GYRO = GyroModel((Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=NOISE)

@@ -7,18 +7,17 @@ The numbers are those of docs/self_calibration.md.
 
 """
 
-import sys
 from collections.abc import Callable
-
-import numpy as np
-from scipy.signal import lfilter
+import sys
 
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import CALIBRATION, Motion, from_headings
+from gyro_calibration.motion import CALIBRATION, from_headings, Motion
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.self_calibration import METHODS
+import numpy as np
+from scipy.signal import lfilter
 
 #: What Hong and Park (2008) report of the Epson XV-3500.
 GYRO = GyroModel((Term(BIAS, (2.18e-4,)), Term(SCALE_FACTOR_ERROR, (0.0373,))),

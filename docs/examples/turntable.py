@@ -10,8 +10,6 @@ Both logs are simulated here, so that the truth is known. With logs of your own:
 
 from dataclasses import replace
 
-import numpy as np
-
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.dwells import dwells
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
@@ -21,6 +19,7 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
+import numpy as np
 
 TRUE_GYRO = GyroModel((Term(BIAS, (0.2 * DEGREE,)), Term(SCALE_FACTOR_ERROR, (0.013,))),
                       noise=Noise(angle_random_walk=5e-4))

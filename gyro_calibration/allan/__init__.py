@@ -14,10 +14,10 @@ parts, fitted), `ranking` (of all combinations), `figures` (of the likeliest).
 
 """
 
-from gyro_calibration.allan.chart import AllanChart, Floor, allan_deviation, averaging_sizes
-from gyro_calibration.allan.figures import Figure, NoiseFit, fit_noise
-from gyro_calibration.allan.parts import PARTS, Part
-from gyro_calibration.allan.record import Record, even_record
+from gyro_calibration.allan.chart import allan_deviation, AllanChart, averaging_sizes, Floor
+from gyro_calibration.allan.figures import Figure, fit_noise, NoiseFit
+from gyro_calibration.allan.parts import Part, PARTS
+from gyro_calibration.allan.record import even_record, Record
 
 __all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',
            'allan_deviation', 'averaging_sizes', 'even_record', 'fit_noise']

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.stamps import Integers
+import numpy as np
+from numpy.typing import NDArray
 
 Truths = NDArray[np.bool_]
 

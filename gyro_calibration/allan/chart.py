@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
-import numpy as np
-
-from gyro_calibration.allan.angle import Integers, Truths, angle_of, lost_before, refuse_few, whole
+from gyro_calibration.allan.angle import angle_of, Integers, lost_before, refuse_few, Truths, whole
 from gyro_calibration.allan.freedom import chi_squared_bounds, degrees_of_freedom
 from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.noise import ALLAN_FLOOR
+import numpy as np
 
 #: Samples in a block: its few arrays stay in the cache for all averaging times.
 _BLOCK = 16384

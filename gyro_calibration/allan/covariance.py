@@ -9,17 +9,16 @@ Uncertainty of stability variances based on finite differences, PTTI 2003).
 
 from __future__ import annotations
 
-import numpy as np
-
 from gyro_calibration.allan.angle import Integers
 from gyro_calibration.allan.parts import (
+    Part,
     PARTS,
     QUANTIZATION_PLACE,
     RAMP_PLACE,
     RATE_WALK_PLACE,
-    Part,
 )
 from gyro_calibration.log import Array
+import numpy as np
 
 #: Second difference.
 _WEIGHTS = (1.0, -2.0, 1.0)

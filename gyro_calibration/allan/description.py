@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from scipy.optimize import nnls
-from scipy.special import chdtrc
-
 from gyro_calibration.allan.freedom import chi_squared_bounds
 from gyro_calibration.allan.octaves import Octaves
 from gyro_calibration.allan.parts import BEND_PLACE, RAMP_PLACE
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.optimize import nnls
+from scipy.special import chdtrc
 
 #: What a further part must take off -2 ln likelihood. White noise alone then shows no further part
 #: in 95 of 100 records.

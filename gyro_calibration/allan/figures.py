@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+import math
 
-import numpy as np
-
-from gyro_calibration.allan.chart import AllanChart, allan_deviation
+from gyro_calibration.allan.chart import allan_deviation, AllanChart
 from gyro_calibration.allan.octaves import Octaves
-from gyro_calibration.allan.parts import BEND_PLACE, PARTS, Part
-from gyro_calibration.allan.ranking import Ranking, rank
+from gyro_calibration.allan.parts import BEND_PLACE, Part, PARTS
+from gyro_calibration.allan.ranking import rank, Ranking
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.noise import Noise
+import numpy as np
 
 #: The least number that shows a slope and its end.
 _FEWEST_OCTAVES = 4

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from scipy.special import chdtri
-
 from gyro_calibration.allan.angle import Integers
 from gyro_calibration.allan.covariance import FINE, lag_covariance
 from gyro_calibration.allan.parts import (
     ANGLE_RANDOM_WALK,
     FLICKER,
+    Part,
     QUANTIZATION,
     RATE_RANDOM_WALK,
-    Part,
 )
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.special import chdtri
 
 
 def chi_squared_bounds(mean_square: Any, freedom: Any) -> tuple[Any, Any]:

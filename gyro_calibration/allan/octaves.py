@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import lru_cache
-
-import numpy as np
+import itertools
 
 from gyro_calibration.allan.chart import AllanChart
 from gyro_calibration.allan.covariance import covariance_form
 from gyro_calibration.allan.parts import BEND_PLACE, PARTS, QUANTIZATION
 from gyro_calibration.log import Array
+import numpy as np
 
 
 @dataclass(frozen=True)

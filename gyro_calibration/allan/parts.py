@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.allan.angle import Integers
 from gyro_calibration.log import Array
 from gyro_calibration.noise import ALLAN_FLOOR
+import numpy as np
 
 
 @dataclass(frozen=True)

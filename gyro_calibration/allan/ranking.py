@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cached_property
+import itertools
 
-from gyro_calibration.allan.description import RIVAL, Description, describe
+from gyro_calibration.allan.description import describe, Description, RIVAL
 from gyro_calibration.allan.octaves import Octaves
 from gyro_calibration.allan.parts import ANGLE_WALK_PLACE, BEND_PLACE, PARTS, QUANTIZATION_PLACE
 from gyro_calibration.log import DataRefused

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from gyro_calibration.allan.angle import LOST_SHARE, gaps, refuse_few
+from gyro_calibration.allan.angle import gaps, LOST_SHARE, refuse_few
 from gyro_calibration.allan.rest import leave_out_wild_samples, refuse_dead, refuse_motion
 from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.stamps import Stamps, number_stamps
+from gyro_calibration.stamps import number_stamps, Stamps
+import numpy as np
 
 #: Share of a record that may be lost.
 _MOST_LOST = 0.3

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from scipy.signal import medfilt
-
 from gyro_calibration.allan.angle import (
-    Integers,
-    Truths,
     angle_of,
     filled,
     gaps,
+    Integers,
     lost_before,
     refuse_few,
+    Truths,
     whole,
 )
 from gyro_calibration.likelihood import CHANCE
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.stamps import LONG, Stamps
+import numpy as np
+from scipy.signal import medfilt
 
 
 def refuse_dead(time: Array, output: Array) -> None:

@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import replace
 from functools import partial
+import math
 from typing import Any
 
-import numpy as np
-
 from gyro_calibration.allan import (
+    allan_deviation,
     AllanChart,
+    even_record,
     Figure,
+    fit_noise,
     NoiseFit,
     Record,
-    allan_deviation,
-    even_record,
-    fit_noise,
 )
 from gyro_calibration.cli.verb import (
-    Answer,
-    UsageError,
     add_log,
+    Answer,
     bar,
     output_of,
     picture_file,
     read,
     time_of,
+    UsageError,
     verb,
     with_origin,
 )
-from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.log import DataRefused, DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.picture import draw_allan
+import numpy as np
 
 #: Symbol -> unit that people use, and how many of it are one in SI.
 UNITS = {'N': ('deg/√h', 60.0 / DEGREE), 'B': ('deg/h', 3600.0 / DEGREE),

@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+import math
 from typing import Any
 
-import numpy as np
-
-from gyro_calibration.assumptions import Assumptions, assumed
+from gyro_calibration.assumptions import assumed, Assumptions
 from gyro_calibration.cli.verb import (
-    Answer,
-    UsageError,
     add_log,
+    Answer,
     not_negative,
     output_of,
     read,
     read_blocks,
+    UsageError,
     verb,
 )
 from gyro_calibration.compensation import Compensated, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.gaps import Intervals
 from gyro_calibration.heading import BlockIntegrator, Threshold
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask, write_log_blocks
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.log_compensation import LogCompensation, none_plausible, plausible, rows_of
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
 from gyro_calibration.tracking import Settings, Track, track
+import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:

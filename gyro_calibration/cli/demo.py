@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import secrets
 from pathlib import Path
+import secrets
 from typing import Any
 
 from gyro_calibration.cli.verb import Answer, UsageError, verb, whole

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import replace
+import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from tqdm import tqdm
-
 from gyro_calibration.cli.verb import (
-    Answer,
-    UsageError,
     add_log,
+    Answer,
     origin_of,
     output_of,
     read,
+    UsageError,
     verb,
     whole,
 )
@@ -33,6 +30,8 @@ from gyro_calibration.files import write_atomically
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import model_text, read_model
+import numpy as np
+from tqdm import tqdm
 
 #: Steps of a diagnosis, for the bar that shows how far it is.
 _STEPS = 8

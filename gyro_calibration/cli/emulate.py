@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from itertools import chain, repeat
 import json
 import secrets
 import signal
 import sys
-from collections.abc import Iterator
-from itertools import chain, repeat
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.cli.simulate import add_motion, simulated
 from gyro_calibration.cli.verb import (
-    UsageError,
     add_topics,
     output_of,
     positive,
     read,
     time_of,
+    UsageError,
     verb,
 )
-from gyro_calibration.driver.emulator import Emulator, emulate
-from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings, find
+from gyro_calibration.driver.emulator import emulate, Emulator
+from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.files import plain
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
+import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:

@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gyro_calibration import picture
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.cli.fit_answer import (
@@ -29,23 +27,24 @@ from gyro_calibration.cli.fit_answer import (
     value_lines,
 )
 from gyro_calibration.cli.verb import (
-    Answer,
-    UsageError,
     add_log,
+    Answer,
     bar,
     origin_of,
     output_of,
     picture_file,
     read,
+    UsageError,
     verb,
 )
 from gyro_calibration.dwells import Dwells, dwells, join, take
-from gyro_calibration.effects import STEADY, Effect, rate_temperature_polynomial
-from gyro_calibration.encoder import EncoderCalibration, calibrate_encoder
+from gyro_calibration.effects import Effect, rate_temperature_polynomial, STEADY
+from gyro_calibration.encoder import calibrate_encoder, EncoderCalibration
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import write_model
-from gyro_calibration.selection import TECHNOLOGIES, Selection, select_effects
+from gyro_calibration.selection import select_effects, Selection, TECHNOLOGIES
+import numpy as np
 
 METHODS = ('dwells', 'likelihood', 'course', 'rate')
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
-
-from gyro_calibration.calibration import Bin, Calibration, binned
+from gyro_calibration.calibration import Bin, binned, Calibration
 from gyro_calibration.dwells import listed
 from gyro_calibration.effects import Parameter, polynomial_to_matrix
 from gyro_calibration.encoder import EncoderCalibration
@@ -18,6 +16,7 @@ from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import POLYNOMIAL
 from gyro_calibration.scatter import FEWEST_SWEEPS
 from gyro_calibration.selection import Choice, Selection, Twins
+import numpy as np
 
 #: A heading that is further off after calibration, rad, is worth a word.
 _MUCH_LEFT = 5.0 * DEGREE

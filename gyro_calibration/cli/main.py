@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 import json
 import math
 import os
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 # The matrices of a fit are small; threads that wait for each other make it ten times slower on a
@@ -15,13 +15,12 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # ruff: noqa: E402
-import numpy as np
-
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
-from gyro_calibration.cli.verb import Answer, UsageError, say
-from gyro_calibration.files import InputError, explained, plain, reason
+from gyro_calibration.cli.verb import Answer, say, UsageError
+from gyro_calibration.files import explained, InputError, plain, reason
 from gyro_calibration.log import DataRefused
+import numpy as np
 
 DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
 

@@ -3,36 +3,35 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
-from tqdm import tqdm
-
-from gyro_calibration.cli.verb import Answer, UsageError, positive, say, verb
+from gyro_calibration.cli.verb import Answer, positive, say, UsageError, verb
 from gyro_calibration.driver.connection import AUTO, Connection, State
-from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
+from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
 from gyro_calibration.driver.recorder import (
-    KINDS,
-    PIECE,
+    about,
     CsvRecorder,
     DiskFull,
+    KINDS,
     McapRecorder,
     MessageLog,
     Notes,
-    about,
+    PIECE,
 )
 from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.files import plain
-from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.log import DataRefused, DEGREE
 from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.storage import Message
+from tqdm import tqdm
 
 Recorder = CsvRecorder | McapRecorder
 

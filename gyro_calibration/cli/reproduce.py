@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import textwrap
 from collections.abc import Iterable
 from functools import partial
+import textwrap
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.cli.verb import Answer, bar, verb, whole
 from gyro_calibration.reproduction import SOURCES
 from gyro_calibration.reproduction.finding import Comparison, Reproduction
+import numpy as np
 
 HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 

@@ -3,40 +3,39 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Iterator
 from datetime import datetime, timezone
+import math
 from typing import Any
 
-import numpy as np
-
 from gyro_calibration.cli.verb import (
-    Answer,
-    UsageError,
     add_log,
+    Answer,
     not_negative,
     output_of,
     read,
     time_of,
+    UsageError,
     verb,
     with_origin,
 )
 from gyro_calibration.likelihood import Fit
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.motion import Motion, from_headings, from_rates, read_motion
+from gyro_calibration.motion import from_headings, from_rates, Motion, read_motion
 from gyro_calibration.self_calibration import (
-    METHODS,
-    Reference,
-    RestCheck,
     check_rest,
+    METHODS,
     record,
+    Reference,
     rest_after,
+    RestCheck,
     self_calibrate,
 )
-from gyro_calibration.whole_turns import MARKING, Turns, calibrate_turns
+from gyro_calibration.whole_turns import calibrate_turns, MARKING, Turns
+import numpy as np
 
 #: What --turns takes for a count that the gyro itself is to find.
 NEAREST = 'nearest'

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import os
 import secrets
-from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration.cli.verb import (
     Answer,
-    UsageError,
     degrees_celsius,
     positive,
     time_of,
+    UsageError,
     verb,
     whole,
 )
@@ -23,6 +21,7 @@ from gyro_calibration.log import Log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import NAMED, read_motion
 from gyro_calibration.simulation import simulate
+import numpy as np
 
 #: Samples of a simulation, which takes 100 bytes for each.
 MOST = 20_000_000

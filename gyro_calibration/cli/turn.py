@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 import csv
 import io
 import math
-from collections.abc import Iterator
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from gyro_calibration.cli.verb import (
-    Answer,
     add_log,
+    Answer,
     digest,
     output_of,
     picture_file,
@@ -24,7 +22,7 @@ from gyro_calibration.cli.verb import (
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.files import write_atomically
-from gyro_calibration.log import DEGREE, Array, Log, Mask
+from gyro_calibration.log import Array, DEGREE, Log, Mask
 from gyro_calibration.log_compensation import compensate_log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
@@ -32,7 +30,8 @@ from gyro_calibration.picture import draw_turn_errors
 from gyro_calibration.scatter import not_outlying
 from gyro_calibration.selection import select_effects
 from gyro_calibration.storage import files_of
-from gyro_calibration.turn import SLOWEST, Size, TurnErrors, predicted_rates, size, turn_errors
+from gyro_calibration.turn import predicted_rates, Size, size, SLOWEST, turn_errors, TurnErrors
+import numpy as np
 
 TURN = 2.0 * math.pi
 #: Temperatures go into this many bins at most.

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
-import importlib.util
-import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+import hashlib
+import importlib.util
+import os
 from pathlib import Path
+import sys
 from typing import Any
 
-from tqdm import tqdm
-
 from gyro_calibration import __version__
-from gyro_calibration.files import LARGEST, InputError, opened, plain
-from gyro_calibration.log import DEGREE, Array, Log, read_log, read_log_blocks
+from gyro_calibration.files import InputError, LARGEST, opened, plain
+from gyro_calibration.log import Array, DEGREE, Log, read_log, read_log_blocks
 from gyro_calibration.model import GyroModel
-from gyro_calibration.recording import Topics, blocks_of, read_recording
+from gyro_calibration.recording import blocks_of, read_recording, Topics
 from gyro_calibration.storage import files_of, is_recording
+from tqdm import tqdm
 
 
 class UsageError(InputError):

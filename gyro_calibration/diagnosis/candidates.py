@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array
+import numpy as np
 
 #: A dead zone is looked for where an encoder makes so many steps a second or more.
 STEPS_A_SECOND = 20.0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import math
 
-import numpy as np
-
-from gyro_calibration.diagnosis.markup import Markup, element, joined
+from gyro_calibration.diagnosis.markup import element, joined, Markup
 from gyro_calibration.diagnosis.units import number, raised
 from gyro_calibration.log import Array, Mask
+import numpy as np
 
 #: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gyro_calibration.diagnosis.compared import Compared
+from gyro_calibration.log import Array, Mask
 import numpy as np
 from scipy import stats
 from scipy.special import ndtr
-
-from gyro_calibration.diagnosis.compared import Compared
-from gyro_calibration.log import Array, Mask
 
 #: Values closer than this, relative to the largest, are one: a change of units rounds them.
 _SAME = 1e-12

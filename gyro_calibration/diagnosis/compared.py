@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from scipy import stats
-from scipy.signal import savgol_filter
+import math
 
 from gyro_calibration.log import Array, Log, Mask
 from gyro_calibration.model import GyroModel
+import numpy as np
+from scipy import stats
+from scipy.signal import savgol_filter
 
 #: Length of the parabolas that give a rate from a heading, s: over one sample its steps hide it.
 _SMOOTHING = 0.15

@@ -15,18 +15,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from scipy.stats import f as fisher
-
 from gyro_calibration.diagnosis.regression import (
-    FEWEST_STRETCHES,
-    Column,
-    Fitted,
     all_columns,
+    Column,
+    FEWEST_STRETCHES,
+    Fitted,
     fitted,
     whitening,
 )
 from gyro_calibration.log import Array, Mask
+import numpy as np
+from scipy.stats import f as fisher
 
 #: Most causes that are added, and parts of a log for cross-fitting.
 MOST, FOLDS = 4, 5

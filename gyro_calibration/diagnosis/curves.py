@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.field import Work
 from gyro_calibration.diagnosis.finding import Curve, HeadingCurve, NoiseCurve
-from gyro_calibration.diagnosis.outcome import Outcome, joined
+from gyro_calibration.diagnosis.outcome import joined, Outcome
 from gyro_calibration.diagnosis.replay import Replay, white_deviation
 from gyro_calibration.diagnosis.spectrum import transform
 from gyro_calibration.log import Array
 from gyro_calibration.noise import Noise
+import numpy as np
+from numpy.typing import NDArray
 
 #: Bins of a curve, and points of a line over time.
 BINS, POINTS = 40, 600

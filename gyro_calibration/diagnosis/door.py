@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-
-import numpy as np
+import math
 
 from gyro_calibration.diagnosis.codes import codes_of
-from gyro_calibration.diagnosis.compared import (bridged, line_between, reference_rate, scale_of,
-                                                 white_noise)
+from gyro_calibration.diagnosis.compared import (
+    bridged,
+    line_between,
+    reference_rate,
+    scale_of,
+    white_noise,
+)
 from gyro_calibration.dwells.samples import between_values, output_of, where_lost
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, refuse_wrapped
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.model import GyroModel
+import numpy as np
 
 #: Least samples and seconds of a log in time, rows of a rate table, and part of a log with values.
 FEWEST, SHORTEST, FEWEST_ROWS, LEAST = 100, 20.0, 8, 0.1

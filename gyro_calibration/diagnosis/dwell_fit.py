@@ -13,9 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy.linalg import block_diag
-
 from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
 from gyro_calibration.diagnosis.extension import origins_before, wider
 from gyro_calibration.dwells import Dwells, take
@@ -23,17 +20,19 @@ from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
+    Channels,
     CUBIC_NONLINEARITY,
+    Effect,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
     STEADY,
-    Channels,
-    Effect,
 )
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import Scatter, Uncertainty, Whitener
-from gyro_calibration.selection import TECHNOLOGIES, part_twins, supported_effects
+from gyro_calibration.selection import part_twins, supported_effects, TECHNOLOGIES
+import numpy as np
+from scipy.linalg import block_diag
 
 #: Fitted in any case.
 NUISANCES = (BIAS, SCALE_FACTOR_ERROR)

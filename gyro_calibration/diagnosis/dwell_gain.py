@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
-
-import numpy as np
+import math
 
 from gyro_calibration.diagnosis.dwell_fit import simulated
 from gyro_calibration.diagnosis.finding import Curve, Gain
-from gyro_calibration.diagnosis.gain import WINDOW, change_over
+from gyro_calibration.diagnosis.gain import change_over, WINDOW
 from gyro_calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.log import Array, DataRefused, Mask
 from gyro_calibration.model import GyroModel
-from gyro_calibration.scatter import FEWEST_SWEEPS, Scatter, parts_of, summed
+from gyro_calibration.scatter import FEWEST_SWEEPS, parts_of, Scatter, summed
+import numpy as np
 
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8

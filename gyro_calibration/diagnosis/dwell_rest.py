@@ -13,15 +13,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy.interpolate import BSpline
-from scipy.stats import f as fisher
-
 from gyro_calibration.calibration import Calibration, columns_of
 from gyro_calibration.diagnosis.finding import Unexplained
 from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.log import Array
-from gyro_calibration.scatter import SMALLEST_TEMPERATURE_SPREAD, Uncertainty, Whitener, parts_of
+from gyro_calibration.scatter import parts_of, SMALLEST_TEMPERATURE_SPREAD, Uncertainty, Whitener
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.stats import f as fisher
 
 #: So many columns a curve has at most.
 _MOST_COLUMNS = 9

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.calibration import Calibration, channels_of, columns_of
 from gyro_calibration.diagnosis.causes import CAUSES
@@ -17,15 +15,16 @@ from gyro_calibration.effects import (
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
     CUBIC_NONLINEARITY,
+    Effect,
     SATURATION,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
     STEADY,
-    Effect,
 )
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.scatter import Whitener
 from gyro_calibration.selection import PARTED, separation, swapped_effects
+import numpy as np
 
 #: Of bias and scale factor, what dwells in one pose on one table never rule out.
 _ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}

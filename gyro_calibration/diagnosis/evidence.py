@@ -15,10 +15,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gyro_calibration.log import Array
 import numpy as np
 from numpy.typing import NDArray
-
-from gyro_calibration.log import Array
 
 #: Numbers of coefficients.
 Places = NDArray[np.intp]

@@ -15,16 +15,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
-import numpy as np
-
 from gyro_calibration.diagnosis.candidates import columns_of, with_shape
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.field import Field, Named, free_shapes, is_of_the_rate, seen, work
+from gyro_calibration.diagnosis.field import Field, free_shapes, is_of_the_rate, Named, seen, work
 from gyro_calibration.diagnosis.menu import Conditions, menu, reach
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.spectrum import Shape, angles
+from gyro_calibration.diagnosis.spectrum import angles, Shape
 from gyro_calibration.diagnosis.units import number
 from gyro_calibration.log import Array
+import numpy as np
 
 #: Sigmas that part two causes even if the fitted values are somewhat off; more are not needed.
 ENOUGH = 8.0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+import math
 
 #: What people confuse: degrees and radians, the sense of rotation, two ranges of a gyro.
 _CONFUSED: Mapping[str, float] = {

@@ -5,16 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
-from gyro_calibration.diagnosis.evidence import (Beside, Judged, Noises, Places, Sample, beside,
-                                                 judge, log_sum, sample, sums)
-from gyro_calibration.diagnosis.replay import SMOOTHED, Replay
-from gyro_calibration.diagnosis.spectrum import (Shape, angles, bands, fall, inverse, levels,
-                                                 noise_grid)
+from gyro_calibration.diagnosis.evidence import (
+    Beside,
+    beside,
+    judge,
+    Judged,
+    log_sum,
+    Noises,
+    Places,
+    Sample,
+    sample,
+    sums,
+)
+from gyro_calibration.diagnosis.replay import Replay, SMOOTHED
+from gyro_calibration.diagnosis.spectrum import (
+    angles,
+    bands,
+    fall,
+    inverse,
+    levels,
+    noise_grid,
+    Shape,
+)
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array
+import numpy as np
 
 #: The longest interval, s, over which a smoothed residual is averaged; and how often the levels of
 #: its noise are found again, each time beside the noise that was likeliest with those before.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import chi2
-
 from gyro_calibration.diagnosis.field import Work
 from gyro_calibration.diagnosis.spectrum import angles, differentiated
 from gyro_calibration.log import Array
 from gyro_calibration.noise import Noise
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import chi2
 
 NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 

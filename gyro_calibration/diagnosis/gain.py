@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy.stats import t as student
-
 from gyro_calibration.diagnosis.field import work
 from gyro_calibration.diagnosis.finding import Change, Gain
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.search import Search, relaid, searched
+from gyro_calibration.diagnosis.search import relaid, Search, searched
 from gyro_calibration.log import Array, Mask
+import numpy as np
+from scipy.stats import t as student
 
 #: The heading is compared over so long, s.
 WINDOW = 60.0

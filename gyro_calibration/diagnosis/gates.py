@@ -10,17 +10,16 @@ axis that tilts. A gate that fails is the only finding.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+import math
 
 from gyro_calibration.diagnosis.compared import bridged, scale_of
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding, Gate
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, refuse_wrapped
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.model import GyroModel
+import numpy as np
 
 #: Spans that a log is cut into, and the lags that are tried, in spans, either way.
 _SPANS, _LAGS = 1000, 25
@@ -61,7 +60,7 @@ class Agreement:
     short: float
     long: float
     grown: tuple[float, float]
-    range: float
+    range: float  # noqa: A003
 
 
 def gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-
-import numpy as np
-from scipy.stats import t as student
+import math
 
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.confirmation import LEAST_CHANCE, Confirmed, candidates, search
+from gyro_calibration.diagnosis.confirmation import candidates, Confirmed, LEAST_CHANCE, search
 from gyro_calibration.diagnosis.extension import with_terms
 from gyro_calibration.diagnosis.finding import (
     Curve,
@@ -22,23 +19,25 @@ from gyro_calibration.diagnosis.finding import (
     Reference,
     Trace,
 )
-from gyro_calibration.diagnosis.gain import WINDOW, change_over
+from gyro_calibration.diagnosis.gain import change_over, WINDOW
 from gyro_calibration.diagnosis.hygiene import inspect
 from gyro_calibration.diagnosis.regression import (
+    all_columns,
     FEWEST_STRETCHES,
+    Fitted,
+    fitted,
     PLAIN,
     SPAN,
-    Fitted,
-    all_columns,
-    fitted,
     spans_of,
     whitening,
 )
 from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DEGREE, Array, Log
+from gyro_calibration.log import Array, DEGREE, Log
 from gyro_calibration.log_compensation import compensate_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
+import numpy as np
+from scipy.stats import t as student
 
 #: Parts of a log that are held out in turn: at least, at most, and the least length of one, s.
 _FEWEST_PARTS, _MOST_PARTS, _PART = 2, 6, 80.0
@@ -183,7 +182,7 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
             break
         start += width
     name = each.column.cause
-    values, half = done.values[start : start + width], [done.half(start + k) for k in range(width)]
+    values, half = done.values[start: start + width], [done.half(start + k) for k in range(width)]
     unit = (
         CATALOGUE[name].coefficients[0].unit
         if name in CATALOGUE
@@ -248,7 +247,7 @@ def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
             terms.append(
                 Term(
                     CATALOGUE[cause.cause],
-                    (*cause.shapes, *done.values[start : start + width].tolist()),
+                    (*cause.shapes, *done.values[start: start + width].tolist()),
                 )
             )
             places += [*(None for _ in cause.shapes), *range(start, start + width)]
@@ -282,7 +281,7 @@ def _contributions(done: Fitted) -> dict[str, Array]:
     start = len(PLAIN)
     for cause in done.causes:
         width = done.spans.columns(cause).shape[1]
-        found[cause.cause] = columns[:, start : start + width].sum(axis=1)
+        found[cause.cause] = columns[:, start: start + width].sum(axis=1)
         start += width
     found['left'] = done.spans.observed - columns.sum(axis=1)
     return {name: part[: len(done.spans.time) - 1] for name, part in found.items()}
@@ -349,7 +348,7 @@ def _gain(plain: Fitted, extended: Fitted) -> Gain | None:
             target = np.append(whiten[kept] @ spans.observed, np.zeros(len(priors[name])))
             values = np.linalg.lstsq(rows, target, rcond=None)[0]
             left = (spans.observed - columns @ values)[:count][held]
-            stamps = time[held[0] : held[-1] + 2]
+            stamps = time[held[0]: held[-1] + 2]
             turned = _over(left, stamps, window)
             squares[name].append(
                 (float(np.sum(turned**2)), float(np.sum((left / np.diff(stamps)) ** 2)))

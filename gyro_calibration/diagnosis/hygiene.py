@@ -14,22 +14,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy import stats
-
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.codes import Codes, Limit, codes_of, dead_band, limit_of
-from gyro_calibration.diagnosis.compared import (Compared, Line, compare, line_between,
-                                                 reference_rate, scale_of)
+from gyro_calibration.diagnosis.codes import Codes, codes_of, dead_band, Limit, limit_of
+from gyro_calibration.diagnosis.compared import (
+    compare,
+    Compared,
+    Line,
+    line_between,
+    reference_rate,
+    scale_of,
+)
 from gyro_calibration.diagnosis.door import evened, prepared
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding
 from gyro_calibration.diagnosis.stuck import Stuck, stuck_samples
 from gyro_calibration.diagnosis.wild import Wild, wild_samples
 from gyro_calibration.dwells.samples import output_of
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model import GyroModel
-from gyro_calibration.stamps import Stamps, number_stamps
+from gyro_calibration.stamps import number_stamps, Stamps
+import numpy as np
+from scipy import stats
 
 #: Chance of a false alarm of each check.
 LEVEL = 2e-4

@@ -7,15 +7,14 @@ Each is told in words and planned in numbers, and the words give the numbers tha
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-
-import numpy as np
+import math
 
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.log import DEGREE, Array, Log
+from gyro_calibration.log import Array, DEGREE, Log
+import numpy as np
 
 #: Points of a plan: enough for quick motion over minutes, and few enough to try many plans.
 MOST_POINTS = 8_000

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-from scipy.stats import norm
-
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.factors import unit_of_offset
 from gyro_calibration.diagnosis.field import Named, work
 from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
-from gyro_calibration.diagnosis.outcome import Outcome, Value, joined
+from gyro_calibration.diagnosis.outcome import joined, Outcome, Value
 from gyro_calibration.diagnosis.probes import along, is_named
-from gyro_calibration.diagnosis.search import MOST_SLIPS, Search, evidence_of, price_of_freedom
+from gyro_calibration.diagnosis.search import evidence_of, MOST_SLIPS, price_of_freedom, Search
 from gyro_calibration.effects import CATALOGUE
+import numpy as np
+from scipy.stats import norm
 
 #: Power with which an effect of the minimum detectable size is found.
 _POWER = 0.95

@@ -6,15 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from scipy.linalg import block_diag
-
 from gyro_calibration.diagnosis.candidates import fitted_shapes
-from gyro_calibration.diagnosis.field import (Named, Work, deviation_of_leaping, is_of_the_rate,
-                                              leaping_shapes, seen)
+from gyro_calibration.diagnosis.field import (
+    deviation_of_leaping,
+    is_of_the_rate,
+    leaping_shapes,
+    Named,
+    seen,
+    Work,
+)
 from gyro_calibration.diagnosis.probes import is_named
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.linalg import block_diag
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 
-import numpy as np
-from scipy.interpolate import BSpline
-
 from gyro_calibration.diagnosis.candidates import Candidate, constant
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.interpolate import BSpline
 
 #: Begins the name of what has none; the variable follows along which it lies.
 UNNAMED = '~'

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from gyro_calibration.diagnosis.compared import bridged, white_noise
 from gyro_calibration.diagnosis.finding import Reference
 from gyro_calibration.diagnosis.hygiene import encoder_step
 from gyro_calibration.dwells.samples import where_lost
-from gyro_calibration.log import DEGREE, Array, Log
+from gyro_calibration.log import Array, DEGREE, Log
+import numpy as np
 
 KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro', 'rest')
 #: Kinds that tell a heading, with errors that are not those of a rate.
@@ -69,7 +68,7 @@ def _error_ratio(log: Log) -> float:
     interval = float(np.median(np.diff(log.time)))
     every = max(1, round(_SPAN / interval))
     gap = log.reference_heading - integral_of(log.time, bridged(log.output))
-    change = gap[2 * every :] - 2.0 * gap[every:-every] + gap[: -2 * every]
+    change = gap[2 * every:] - 2.0 * gap[every:-every] + gap[: -2 * every]
     walk = white_noise(log.output) * math.sqrt(interval)
     if not np.isfinite(change).any() or not walk > 0.0:
         return 0.0

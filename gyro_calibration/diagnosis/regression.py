@@ -16,22 +16,21 @@ differences between points, so that a gap of the reference is a long span that t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
-from scipy.ndimage import median_filter
-from scipy.stats import t as student
+import math
 
 from gyro_calibration.diagnosis.compared import bridged, white_noise
 from gyro_calibration.diagnosis.reference import integral_of
 from gyro_calibration.effects import CATALOGUE, Channels
 from gyro_calibration.history import channels_of
-from gyro_calibration.log import DEGREE, Array, Log
-from gyro_calibration.noise_grid import GridFit, SharedNoise, heading_noise, noise_grid, wander
+from gyro_calibration.log import Array, DEGREE, Log
+from gyro_calibration.noise_grid import GridFit, heading_noise, noise_grid, SharedNoise, wander
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.ndimage import median_filter
+from scipy.stats import t as student
 
 #: Names and prior standard deviations of the values that every model has: what gyros on wheels are
 #: sold with (scale 1 %, bias 1 deg/s), and delays of references (1 s).

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cache
+import math
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.fft import dct, idct, next_fast_len
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
-
-from gyro_calibration.diagnosis.door import FEWEST, evened, prepared
+from gyro_calibration.diagnosis.door import evened, FEWEST, prepared
 from gyro_calibration.diagnosis.spectrum import angles, differentiated, inverse, level, transform
 from gyro_calibration.effects import Channels
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Array, DataRefused, Log, Mask
 from gyro_calibration.model import GyroModel
 from gyro_calibration.stamps import number_stamps
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct, idct, next_fast_len
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import binary_opening, maximum_filter1d, uniform_filter1d
 
 #: More points of the grid than this are averaged in neighbours: causes are told apart with fewer.
 MOST_POINTS = 50_000
@@ -323,7 +322,7 @@ def _bridged(known: Array, place: NDArray[np.intp]) -> Array:
 
 
 def numbered(time: Array, kept: Mask) -> tuple[NDArray[np.intp], float]:
-    """Number the kept samples on an even grid, and return its interval, s."""
+    """Return the numbers of the kept samples on an even grid, and its interval, s."""
     interval = float(np.median(np.diff(time)))
     steps = np.maximum(np.rint(np.diff(time) / interval), 1.0)
     place = np.concatenate([[0.0], np.cumsum(steps)]).astype(int)[kept]

@@ -7,13 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from string import Template
 
-import numpy as np
-
 import gyro_calibration
-from gyro_calibration.diagnosis.charts import Chart, Line, draw
-from gyro_calibration.diagnosis.finding import (Change, Curve, Diagnosis, Estimate, Finding, Gain,
-                                                HeadingCurve, NoiseCurve, Trace)
-from gyro_calibration.diagnosis.markup import Markup, element, joined
+from gyro_calibration.diagnosis.charts import Chart, draw, Line
+from gyro_calibration.diagnosis.finding import (
+    Change,
+    Curve,
+    Diagnosis,
+    Estimate,
+    Finding,
+    Gain,
+    HeadingCurve,
+    NoiseCurve,
+    Trace,
+)
+from gyro_calibration.diagnosis.markup import element, joined, Markup
 from gyro_calibration.diagnosis.units import amount, for_people, number, quantity, span
 from gyro_calibration.diagnosis.words import (
     certainty,
@@ -34,9 +41,10 @@ from gyro_calibration.diagnosis.words import (
     todo,
     unknown,
 )
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model_file import model_text
 from gyro_calibration.noise import Noise
+import numpy as np
 
 #: Of a curve, so many points are drawn at most, four to a part: its ends and its extremes stay.
 _PARTS = 90

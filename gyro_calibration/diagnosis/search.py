@@ -15,30 +15,46 @@ from dataclasses import dataclass, replace
 from dataclasses import field as field_of
 from typing import Any, TypeAlias
 
-import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import correlate
-
 from gyro_calibration.diagnosis.candidates import (
-    FASTEST_LAG,
-    Candidate,
     by_cause,
+    Candidate,
     candidates,
     columns_of,
     effect,
+    FASTEST_LAG,
     fitted_shapes,
     pulse,
     spacing_of_steps,
     with_shape,
 )
-from gyro_calibration.diagnosis.evidence import (Places, beside, drawn, evidence, judge, log_sum,
-                                                 sample, sums)
-from gyro_calibration.diagnosis.field import (Field, Named, Work, field, is_of_the_rate, seen,
-                                              with_columns, with_one_more, work)
+from gyro_calibration.diagnosis.evidence import (
+    beside,
+    drawn,
+    evidence,
+    judge,
+    log_sum,
+    Places,
+    sample,
+    sums,
+)
+from gyro_calibration.diagnosis.field import (
+    Field,
+    field,
+    is_of_the_rate,
+    Named,
+    seen,
+    with_columns,
+    with_one_more,
+    Work,
+    work,
+)
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
 from gyro_calibration.log import Array, DataRefused
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
 
 #: Residuals drawn to learn what chance shows.
 DRAWS = 400

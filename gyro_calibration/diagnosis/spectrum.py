@@ -10,13 +10,12 @@ times ``(3 sin / (2 + cos))²``.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.fft import dct, idct
+import math
 
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.fft import dct, idct
 
 #: Parts of the angle in which the noise of a filtered output has levels of its own, at most; the
 #: least number of coefficients in each; and the lowest level, for what is nearly free of noise

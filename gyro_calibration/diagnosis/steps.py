@@ -6,36 +6,54 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-from scipy.stats import chi2, norm
-
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.diagnosis.curves import (beside_model, curves, heading_curve, noise_curve,
-                                               what_is_left)
+from gyro_calibration.diagnosis.curves import (
+    beside_model,
+    curves,
+    heading_curve,
+    noise_curve,
+    what_is_left,
+)
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.experiment import separating
-from gyro_calibration.diagnosis.extension import (calibrated, doubts_scale, extended, left_out,
-                                                  noted, with_findings)
-from gyro_calibration.diagnosis.field import Named, filtered, work
-from gyro_calibration.diagnosis.figures import NAMES, NoiseFigures, noise_figures
+from gyro_calibration.diagnosis.extension import (
+    calibrated,
+    doubts_scale,
+    extended,
+    left_out,
+    noted,
+    with_findings,
+)
+from gyro_calibration.diagnosis.field import filtered, Named, work
+from gyro_calibration.diagnosis.figures import NAMES, noise_figures, NoiseFigures
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
 from gyro_calibration.diagnosis.gain import gain
 from gyro_calibration.diagnosis.gates import gates, mismatch
 from gyro_calibration.diagnosis.heading_reference import diagnose_heading
-from gyro_calibration.diagnosis.hygiene import Hygiene, decided, inspect
+from gyro_calibration.diagnosis.hygiene import decided, Hygiene, inspect
 from gyro_calibration.diagnosis.naming import named_finding, unexplained
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.diagnosis.search import (MOST_OF, Search, alternatives, begin, evidence_of,
-                                               polished, pruned, searched)
+from gyro_calibration.diagnosis.search import (
+    alternatives,
+    begin,
+    evidence_of,
+    MOST_OF,
+    polished,
+    pruned,
+    Search,
+    searched,
+)
 from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.effects import QUANTIZATION
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.noise import Noise
+import numpy as np
+from scipy.stats import chi2, norm
 
 #: Shares of the false-alarm rate: of the causes that are searched for, of each noise figure, of
 #: bias and of scale factor error.

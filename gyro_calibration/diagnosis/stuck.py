@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
-from scipy import stats
-from scipy.special import ndtr
+import math
 
 from gyro_calibration.diagnosis.codes import Codes, DeadBand, doubt_of, steps_about
 from gyro_calibration.diagnosis.compared import Compared
 from gyro_calibration.log import Array, Mask
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.special import ndtr
 
 #: Motions that are told apart, by the change that is expected from one sample to the next.
 _CLASSES = 8

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-
-import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import norm
-from scipy.stats import t as student
+import math
 
 from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.door import refuse
-from gyro_calibration.diagnosis.dwell_fit import (NUISANCES, Named, change_of, doubt, model_after,
-                                                  model_before, name_causes, seen, tried)
+from gyro_calibration.diagnosis.dwell_fit import (
+    change_of,
+    doubt,
+    model_after,
+    model_before,
+    name_causes,
+    Named,
+    NUISANCES,
+    seen,
+    tried,
+)
 from gyro_calibration.diagnosis.dwell_gain import curves, measure_gain
-from gyro_calibration.diagnosis.dwell_rest import RATE, SINGLE_RATES, Left, what_is_left
+from gyro_calibration.diagnosis.dwell_rest import Left, RATE, SINGLE_RATES, what_is_left
 from gyro_calibration.diagnosis.dwell_sets import alternatives
 from gyro_calibration.diagnosis.extension import notes_of
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
@@ -25,14 +29,28 @@ from gyro_calibration.diagnosis.gain import WINDOW
 from gyro_calibration.diagnosis.hygiene import decided, inspect
 from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.dwells import Dwells, from_table, listed, take
-from gyro_calibration.effects import (CUBIC_NONLINEARITY, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE,
-                                      STEADY, Effect)
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.effects import (
+    CUBIC_NONLINEARITY,
+    Effect,
+    SCALE_FACTOR_TEMPERATURE,
+    SINE_RESPONSE,
+    STEADY,
+)
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
-from gyro_calibration.scatter import (SMALLEST_TEMPERATURE_SPREAD, Uncertainty, Whitener,
-                                      freedom_beside_surface, rms)
+from gyro_calibration.scatter import (
+    freedom_beside_surface,
+    rms,
+    SMALLEST_TEMPERATURE_SPREAD,
+    Uncertainty,
+    Whitener,
+)
 from gyro_calibration.selection import supported_effects, swapped_effects
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
+from scipy.stats import t as student
 
 #: Parts of the false-alarm rate: of structure without a name, and of outlying dwells; the rest is
 #: that of causes.

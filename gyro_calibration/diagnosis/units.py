@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 import re
-from dataclasses import dataclass
 
 from gyro_calibration.diagnosis.finding import Estimate
 from gyro_calibration.log import DEGREE

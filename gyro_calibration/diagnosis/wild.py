@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gyro_calibration.diagnosis.compared import bridged, Compared
+from gyro_calibration.log import Array, Mask
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 from scipy.ndimage import maximum_filter1d
-
-from gyro_calibration.diagnosis.compared import Compared, bridged
-from gyro_calibration.log import Array, Mask
 
 #: Wild is beyond so many standard deviations, or more where so many samples reach that by chance.
 _WILD = 6.0

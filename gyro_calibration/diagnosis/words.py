@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 import textwrap
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
 
 from gyro_calibration.diagnosis.finding import Change, Diagnosis, Finding, Unexplained
-from gyro_calibration.diagnosis.units import Quantity, amount, chance, number, quantity
-from gyro_calibration.model import Term, same_effects
+from gyro_calibration.diagnosis.units import amount, chance, number, Quantity, quantity
+from gyro_calibration.model import same_effects, Term
 
 #: Lines for a terminal are not longer.
 _WIDTH = 120

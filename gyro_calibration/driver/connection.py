@@ -7,15 +7,15 @@ No ROS, and no thread: who wants samples takes them from `Connection.chunks`, in
 
 from __future__ import annotations
 
-import glob
-import math
-import os
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+import glob
+import math
 from operator import sub
+import os
+import threading
 
-from gyro_calibration.driver.protocols import Decoder, Protocol, Sample, Settings, find
+from gyro_calibration.driver.protocols import Decoder, find, Protocol, Sample, Settings
 from gyro_calibration.driver.protocols.listening import BAUDS, Recognition, recognize
 from gyro_calibration.driver.serial_port import PortError, SerialPort
 from gyro_calibration.driver.timestamps import SampleClock, steady

@@ -8,21 +8,20 @@ read and ignored.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 import contextlib
+from dataclasses import replace
 import math
 import os
+from pathlib import Path
 import select
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
-from pathlib import Path
-
-import numpy as np
 
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
-from gyro_calibration.driver.serial_faults import SerialFaults, damaged, delivered
+from gyro_calibration.driver.serial_faults import damaged, delivered, SerialFaults
+import numpy as np
 
 _POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
 _SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards

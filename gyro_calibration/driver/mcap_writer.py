@@ -9,10 +9,10 @@ a library for it (mcap), but an installed ROS 2 does not.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping
+import struct
+import zlib
 
 _MAGIC = b'\x89MCAP0\r\n'
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)

@@ -9,19 +9,17 @@ piece, and none before the first. A file that is there already is never written 
 
 from __future__ import annotations
 
-import csv
-import gzip
-import io
-import os
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+import csv
 from datetime import datetime, timezone
+import gzip
+import io
 from io import FileIO
+import os
 from typing import Any
-
-import numpy as np
 
 from gyro_calibration import __version__
 from gyro_calibration.driver.mcap_writer import McapWriter
@@ -33,23 +31,24 @@ from gyro_calibration.messages import (
     DEFINITIONS,
     FORCE_COVARIANCE,
     FORCE_Z,
+    heading_of,
     IMU,
     LAYOUTS,
+    MessageError,
     NOT_REPORTED,
     NSEC_PER_SEC,
     ODOMETRY,
     ORIENTATION_COVARIANCE,
+    parse,
     RATE_COVARIANCE,
     RATE_Z,
+    serialize,
     TEMPERATURE,
     TWIST,
-    MessageError,
-    heading_of,
-    parse,
-    serialize,
 )
 from gyro_calibration.recording import wrong_kind
 from gyro_calibration.storage import ABOUT, MCAP_END, Message
+import numpy as np
 
 KINDS = '.csv', '.csv.gz', '.mcap'
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import errno
 import os
 import select
 import termios
-from collections.abc import Callable
 from typing import TypeVar
 
 import serial

@@ -23,11 +23,11 @@ References
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+import math
+import time
 
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.messages import NSEC_PER_SEC

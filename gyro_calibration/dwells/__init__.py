@@ -11,14 +11,14 @@ outliers and repeated samples), `settling` (after ramps), `stretches` (of a log 
 
 """
 
-from gyro_calibration.dwells.samples import Numbers, listed
+from gyro_calibration.dwells.samples import listed, Numbers
 from gyro_calibration.dwells.table import (
     Dwells,
-    Steadiness,
     dwells,
     find_dwells,
     from_table,
     join,
+    Steadiness,
     take,
 )
 

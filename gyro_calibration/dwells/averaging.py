@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
+import math
 from typing import Any
 
-import numpy as np
-from scipy.special import digamma, polygamma
-
-from gyro_calibration.dwells.samples import Numbers, Samples, code_step, duration, slope
+from gyro_calibration.dwells.samples import code_step, duration, Numbers, Samples, slope
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.special import digamma, polygamma
 
 #: Number of batches of a dwell, whose scatter gives the deviation of the mean, and the least
 #: duration of each beyond the first four, s: a vibration of the table and the response of the

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
+import math
 from typing import NamedTuple
 
-import numpy as np
-
 from gyro_calibration.dwells.samples import (
-    Numbers,
-    Samples,
     code_step,
     inside,
     length,
     listed,
+    Numbers,
     runs,
+    Samples,
     times,
 )
 from gyro_calibration.log import Array, Mask
+import numpy as np
 
 
 class Cleaned(NamedTuple):

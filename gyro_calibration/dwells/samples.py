@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
-from scipy.ndimage import maximum_filter1d
-
 from gyro_calibration.log import Array, DataRefused, Log, Mask
 from gyro_calibration.stamps import Integers as Numbers
 from gyro_calibration.stamps import lost_samples
+import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 #: Least number of samples of a dwell.
 FEWEST = 8
@@ -51,9 +50,9 @@ def usable(log: Log) -> tuple[Samples, list[str]]:
     if len(good) < FEWEST:
         raise DataRefused(f'{len(good)} of {len(time)} samples hold both a gyro output and '
                           'a reference; look at the columns')
-    rate, heading, temperature = (None if values is None else values[good]
-                                 for values in (log.reference_rate, log.reference_heading,
-                                                log.temperature))
+    rate, heading, temperature = (
+        None if values is None else values[good]
+        for values in (log.reference_rate, log.reference_heading, log.temperature))
     return (Samples(time[good], output[good], rate, heading, temperature),
             list(_lost_reference(time, lost)))
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from scipy.ndimage import uniform_filter1d
-
-from gyro_calibration.dwells.samples import Numbers, Samples, duration
+from gyro_calibration.dwells.samples import duration, Numbers, Samples
 from gyro_calibration.dwells.steadiness import Steadiness
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import Array
+import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 #: Dwells that are further apart than this have no common ramp, s.
 _APART = 5.0

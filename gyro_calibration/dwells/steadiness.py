@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
+import math
 
 from gyro_calibration.dwells.samples import count, runs
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
+import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
+import math
 
-import numpy as np
-
-from gyro_calibration.dwells.samples import Numbers, code_step, duration, length, slope
+from gyro_calibration.dwells.samples import code_step, duration, length, Numbers, slope
 from gyro_calibration.dwells.steadiness import Steadiness
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
+import numpy as np
 
 #: Duration of the blocks in which the heading is averaged, s.
 _BLOCK = 0.1

@@ -8,27 +8,26 @@ left out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
+import math
 from typing import NamedTuple
-
-import numpy as np
 
 from gyro_calibration.dwells.cleaning import clean, left_out
 from gyro_calibration.dwells.samples import (
+    duration,
     FEWEST,
+    missing,
     Numbers,
     Samples,
-    duration,
-    missing,
     slope,
     usable,
 )
 from gyro_calibration.dwells.settling import settled
 from gyro_calibration.dwells.steadiness import Steadiness, steady
 from gyro_calibration.dwells.straightness import straight
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log
+import numpy as np
 
 #: Number of parts of a dwell between which its warming is taken.
 _PARTS = 12

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from gyro_calibration.dwells.samples import Numbers
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
+import numpy as np
 
 #: If the median sweep has fewer dwells than this, the order is taken as chance.
 _SHORTEST = 4

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from gyro_calibration.dwells.averaging import averaged
-from gyro_calibration.dwells.samples import Numbers, listed, output_of
+from gyro_calibration.dwells.samples import listed, Numbers, output_of
 from gyro_calibration.dwells.steadiness import Steadiness
 from gyro_calibration.dwells.stretches import find_stretches
 from gyro_calibration.dwells.sweeps import numbered, sweeps
-from gyro_calibration.log import DEGREE, Array, DataRefused, Log, Mask
+from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask
+import numpy as np
 
 
 @dataclass(frozen=True)

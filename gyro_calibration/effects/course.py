@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-
-import numpy as np
+import math
 
 from gyro_calibration.effects.effect import Channels, Effect, Parameter
 from gyro_calibration.log import Number
+import numpy as np
 
 
 def _warm_up(channels: Channels, time_constant: float) -> Sequence[Number]:

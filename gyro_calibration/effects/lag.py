@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from gyro_calibration.log import Array, Number
+import numpy as np
 
 _SMALLEST = 1e-300  # intervals of no length leave the formulas a number
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from gyro_calibration.effects.effect import Channels, Effect, Parameter
-from gyro_calibration.log import DEGREE, Array, Number
+from gyro_calibration.log import Array, DEGREE, Number
+import numpy as np
 
 
 def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effect:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from scipy.interpolate import CubicSpline
-
-from gyro_calibration.effects.effect import Channels, Effect, Parameter, nothing_added
+from gyro_calibration.effects.effect import Channels, Effect, nothing_added, Parameter
 from gyro_calibration.effects.lag import lagged_signal
 from gyro_calibration.log import Array, Number
+import numpy as np
+from scipy.interpolate import CubicSpline
 
 #: Points to each interval of the samples, for a lag.
 FINER = 4

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from gyro_calibration.effects.effect import Channels, Effect, Parameter
 from gyro_calibration.log import Number
+import numpy as np
 
 
 def _heading_sensitivity(channels: Channels) -> Sequence[Number]:

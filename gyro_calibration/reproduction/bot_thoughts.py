@@ -9,23 +9,22 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import linregress
-from scipy.stats import t as student
-
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array, Progress
-from gyro_calibration.motion import CALIBRATION, Motion, from_headings, turns
+from gyro_calibration.log import Array, DEGREE, Progress
+from gyro_calibration.motion import CALIBRATION, from_headings, Motion, turns
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Reproduction,
     from_own_figures,
+    Reproduction,
 )
 from gyro_calibration.self_calibration import fit_rate
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import linregress
+from scipy.stats import t as student
 
 TITLE = 'Bot Thoughts: gyro calibration of an L3G4200D (blog)'
 #: Turns a minute of a record player, and the nominal and the measured frequency of the strobe, Hz.
@@ -165,7 +164,7 @@ def _strobe() -> Contradiction:
                          'differ ({slopes:.2f} %), while the crystal explains {crystal:.3f} %. '
                          'Seen at one scale, reference and gyro cannot be told apart: if the '
                          'strobe was slow, SF is {corrected:.3f} and the solver differs by '
-                         '{left:.2f} %; the first slope alone is the data sheet\'s to '
+                         "{left:.2f} %; the first slope alone is the data sheet's to "
                          '{nominal:.3f} %.')
 
 
@@ -229,7 +228,7 @@ def _method(found: Array) -> Contradiction:
                           'slow': 100.0 * error_by_increments(CALIBRATION),
                           'turntable': 100.0 * (SOLVED_SCALE / SCALE_FACTOR - 1.0),
                           'late': late_enough()},
-                         'Part 2: the two methods differ by {turntable:.2f} % of the turntable\'s '
+                         "Part 2: the two methods differ by {turntable:.2f} % of the turntable's "
                          'SF. Fitting the gradient of a 2 deg encoder at 50 Hz errs by '
                          '{solver:.4f} +- {solver_scatter:.4f} % only, the likelihood by '
                          '{likely:.4f} +- {likely_scatter:.4f} %; the gyro would have to be '

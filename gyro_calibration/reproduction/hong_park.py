@@ -10,22 +10,21 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.heading import Threshold, filter_rates, integrate
+from gyro_calibration.heading import filter_rates, integrate, Threshold
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, Array, Progress
+from gyro_calibration.log import Array, DEGREE, Progress
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.motion import CALIBRATION, ROBOT, Motion, from_rates
+from gyro_calibration.motion import CALIBRATION, from_rates, Motion, ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Reproduction,
     from_own_figures,
+    Reproduction,
 )
 from gyro_calibration.self_calibration import fit_heading, fit_rate, record
+import numpy as np
 
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '
          'robots, Sensors 8, 2008')

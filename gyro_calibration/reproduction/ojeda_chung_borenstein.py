@@ -8,31 +8,30 @@ Published numbers are in their units; ours are computed in SI and converted.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+import math
 
-import numpy as np
-
-from gyro_calibration.calibration import Scatter, fit_effects
+from gyro_calibration.calibration import fit_effects, Scatter
 from gyro_calibration.dwells import Dwells
 from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
+    Effect,
+    rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
-    Effect,
-    rate_temperature_polynomial,
 )
-from gyro_calibration.log import DEGREE, Array, Progress
+from gyro_calibration.log import Array, DEGREE, Progress
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
-    Reproduction,
     from_own_figures,
+    Reproduction,
 )
+import numpy as np
 
 TITLE = ('Ojeda, Chung and Borenstein: Precision calibration of fiber-optics gyroscopes for '
          'mobile robot navigation, ICRA 2000')

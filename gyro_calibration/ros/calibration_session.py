@@ -9,44 +9,43 @@ Samples, odometry and commands go in with the time of the steady clock; commands
 
 from __future__ import annotations
 
-import math
-import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
+import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
-
 from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import DEGREE, Array, DataRefused
+from gyro_calibration.log import Array, DataRefused, DEGREE
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import (
     CALIBRATION,
-    Motion,
-    MotionError,
     from_headings,
     from_rates,
+    Motion,
+    MotionError,
     read_motion,
 )
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros.clock import Clock
-from gyro_calibration.ros.health_monitor import HealthMonitor, changed
+from gyro_calibration.ros.health_monitor import changed, HealthMonitor
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import Velocity
 from gyro_calibration.self_calibration import (
-    SETTLED,
-    Limits,
-    Reference,
     calibrate_bias,
     check_rest,
+    Limits,
     record,
+    Reference,
     rest_after,
     self_calibrate,
+    SETTLED,
 )
 from gyro_calibration.whole_turns import calibrate_turns
+import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'
 #: Length of a calibration of the bias alone, s.

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +23,23 @@ from geometry_msgs.msg import (
     TwistStamped,
     TwistWithCovarianceStamped,
 )
+from gyro_calibration.driver.timestamps import steady
+from gyro_calibration.messages import NSEC_PER_SEC
+from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
+from gyro_calibration.ros.calibration_session import Drive, REST
+from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
+from gyro_calibration.ros.diagnostics import Diagnostics, OK, Report, status_array
+from gyro_calibration.ros.pipeline import Output, PARAMETERS, Pipeline
+from gyro_calibration.ros.runner import (
+    answer_later,
+    call_every,
+    declare,
+    LATCHED_QOS,
+    publish_on,
+    run,
+    subscribe_to,
+)
+from gyro_calibration.ros.wheels import Velocity
 from nav_msgs.msg import Odometry
 from rclpy.clock import ROSClock
 from rclpy.duration import Duration
@@ -32,24 +49,6 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
-
-from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.messages import NSEC_PER_SEC
-from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
-from gyro_calibration.ros.calibration_session import REST, Drive
-from gyro_calibration.ros.compensation_report import CompensationReport, calibration_status
-from gyro_calibration.ros.diagnostics import OK, Diagnostics, Report, status_array
-from gyro_calibration.ros.pipeline import PARAMETERS, Output, Pipeline
-from gyro_calibration.ros.runner import (
-    LATCHED_QOS,
-    answer_later,
-    call_every,
-    declare,
-    publish_on,
-    run,
-    subscribe_to,
-)
-from gyro_calibration.ros.wheels import Velocity
 
 #: Between two looks at who is there and whether time goes on, s.
 _WATCH_INTERVAL = 0.2

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+import math
 
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import DEGREE
-from gyro_calibration.ros.calibration_session import BLIND, STANDING_TIME, Run
+from gyro_calibration.ros.calibration_session import BLIND, Run, STANDING_TIME
 from gyro_calibration.ros.clock import Clock
-from gyro_calibration.ros.diagnostics import ERROR, OK, WARN, Report
+from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN
 from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.pipeline import COUNTED, Pipeline
 from gyro_calibration.ros.state_store import StateStore

@@ -14,9 +14,6 @@ import threading
 import time
 from types import SimpleNamespace
 
-from rclpy.node import Node
-from sensor_msgs.msg import Imu, Temperature
-
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.decimation import Decimation, Mean
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
@@ -27,6 +24,8 @@ from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.runner import call_every, declare, publish_on, run
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, Temperature
 
 # not yes and no, which YAML makes truth values of
 _THREE_WAYS = {'default': None, 'always': True, 'never': False}

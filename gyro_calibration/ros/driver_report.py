@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from gyro_calibration.driver.connection import Connection, Counts
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.ros.diagnostics import ERROR, OK, WARN, Report
+from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN
 
 _LEAST_TIME = 0.5  # s; a rate over less is not meaningful
 _OPENING = {'opening': 'opening the port', 'listening': 'listening for a protocol'}

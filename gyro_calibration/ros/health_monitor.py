@@ -10,16 +10,15 @@ alarms.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-
-import numpy as np
-from scipy.special import chdtr, chdtrc
+import math
 
 from gyro_calibration.files import LARGEST
-from gyro_calibration.log import DEGREE, Array
+from gyro_calibration.log import Array, DEGREE
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.noise import Noise
+import numpy as np
+from scipy.special import chdtr, chdtrc
 
 #: Length of a stretch, of a part that must be steady, and of a block whose mean is compared with
 #: its neighbour's, s.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
-import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
+import reprlib
 from types import SimpleNamespace
 
 _WORDS: dict[type, str] = {

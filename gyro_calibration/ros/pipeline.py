@@ -9,10 +9,10 @@ steady clock.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from gyro_calibration.log import DEGREE
 from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
-from gyro_calibration.ros.calibration_session import BLIND, REST, STANDING_TIME, CalibrationSession
+from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
 from gyro_calibration.ros.clock import Clock, RosTime
 from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.parameters import Parameter

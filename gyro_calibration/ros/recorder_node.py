@@ -9,26 +9,25 @@ ones lose nothing. Publishers may come late, go and come again with another QoS.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import importlib
 import os
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
 from typing import Any
-
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.log import LogError
 from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.ros.runner import call_every
 from gyro_calibration.storage import Message
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 _DEPTH = 5000  # as SENSOR_QOS: 5 s at 1 kHz are kept while a recorder is busy
 _LAST = 2.0  # s; longest time for taking what had come before a recorder is stopped

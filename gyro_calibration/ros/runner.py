@@ -8,21 +8,22 @@ and joins its threads in `destroy_node`. Its ``main`` is ``return run(TheNode)``
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import faulthandler
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
-import rclpy
+from gyro_calibration.ros.parameters import Parameter, record
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
     SetParametersResult,
 )
+import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -35,8 +36,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from rclpy.timer import Timer
-
-from gyro_calibration.ros.parameters import Parameter, record
 
 SENSOR_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT,
                         durability=DurabilityPolicy.VOLATILE)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass
+import math
 
 #: What came longer ago shows nothing, s.
 FRESH = 1.0

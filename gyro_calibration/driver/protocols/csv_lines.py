@@ -11,20 +11,20 @@ a header.
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import re
-from functools import partial
 
-from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
+from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
 from gyro_calibration.driver.protocols.protocol import (
+    check_rates,
     GYRO_COLUMNS,
     KNOWN_COLUMNS,
     Protocol,
     Reading,
     Settings,
-    Written,
-    check_rates,
     stateless,
+    Written,
 )
 
 _NUMBER = re.compile(NUMBER)

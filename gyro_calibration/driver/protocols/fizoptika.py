@@ -19,11 +19,11 @@ from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
+    check_counts,
     Protocol,
     Reading,
     Settings,
     Written,
-    check_counts,
 )
 
 _HEADER = 0xDD

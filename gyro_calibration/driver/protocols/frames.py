@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
+import re
 
 from gyro_calibration.driver.protocols.protocol import Frame
 

@@ -20,19 +20,19 @@ are not read.
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import struct
 import zlib
-from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
-    STANDARD_GRAVITY,
     Protocol,
     Reading,
     Settings,
-    Written,
+    STANDARD_GRAVITY,
     stateless,
+    Written,
 )
 
 _HEADER = b'\xfe\x81\xff\x55'

@@ -14,17 +14,17 @@ unreliable, whatever the valid bit is (table 2).
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import re
-from functools import partial
 
 from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
     Settings,
-    Written,
     stateless,
+    Written,
 )
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')

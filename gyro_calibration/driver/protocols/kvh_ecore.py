@@ -11,16 +11,16 @@ rotation were inferred, not read in a manual.
 
 from __future__ import annotations
 
-import math
 from functools import partial
+import math
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
     Settings,
-    Written,
     stateless,
+    Written,
 )
 
 _COUNT = math.radians(0.00183)

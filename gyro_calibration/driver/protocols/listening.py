@@ -8,12 +8,12 @@ bytes are in no format.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from dataclasses import dataclass
+import re
 
-from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Settings
-from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
+from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
+from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
 
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 """Bits per second to try in this order: first those of new gyros, then others that some can do."""

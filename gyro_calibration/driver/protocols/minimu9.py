@@ -9,17 +9,17 @@ L3G4200D, typical). A line without ``AN`` holds no rate, so it is discarded.
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import re
-from functools import partial
 
 from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
     Settings,
-    Written,
     stateless,
+    Written,
 )
 
 _COUNT = math.radians(0.07)

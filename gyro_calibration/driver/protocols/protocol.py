@@ -10,10 +10,10 @@ counts of what was discarded, refused and lost.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+import math
 from typing import NamedTuple, TypeVar
 from typing import Protocol as Interface
 

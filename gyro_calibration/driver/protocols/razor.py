@@ -15,18 +15,18 @@ then.
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import re
-from functools import partial
 
-from gyro_calibration.driver.protocols.lines import NUMBER, LineSplitter
+from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
 from gyro_calibration.driver.protocols.protocol import (
-    STANDARD_GRAVITY,
     Protocol,
     Reading,
     Settings,
-    Written,
+    STANDARD_GRAVITY,
     stateless,
+    Written,
 )
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')

@@ -14,18 +14,18 @@ a module that lies flat reports +1 g was not verified.
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import struct
-from functools import partial
 
 from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
-    STANDARD_GRAVITY,
     Protocol,
     Reading,
     Settings,
-    Written,
+    STANDARD_GRAVITY,
     stateless,
+    Written,
 )
 
 _COUNT = math.radians(2000.0) / 0x8000
