@@ -1,4 +1,4 @@
-"""From rates to a heading: the trapezoid rule, the threshold filter, and a variance that Monte Carlo runs with known truth confirm."""
+"""Heading from rates: trapezoid rule, threshold filter, and a variance that Monte Carlo checks."""
 
 import math
 
@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
-from gyro_calibration.heading import BlockIntegrator, Threshold, ThresholdFilter, filter_rates, integrate
+from gyro_calibration.heading import (
+    BlockIntegrator,
+    Threshold,
+    ThresholdFilter,
+    filter_rates,
+    integrate,
+)
 from gyro_calibration.log import CACHED, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.motion import CALIBRATION, ROBOT
@@ -20,7 +26,8 @@ XV3500 = Noise(2.5 * DEGREE / 60)
 def noisy_robot(seed=0):
     """Return times and rates of the robot with the XV3500's white noise."""
     time = np.arange(16001) * INTERVAL
-    return time, ROBOT.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(seed))
+    return time, ROBOT.rate_at(time) + simulate_noise(XV3500, len(time), INTERVAL,
+                                                      np.random.default_rng(seed))
 
 
 def filtered_singly(settings, time, rate):
@@ -37,17 +44,20 @@ def test_the_trapezoid_rule_is_exact_for_linear_rates_on_uneven_stamps():
 
 def test_the_calibration_comes_back_to_its_first_heading():
     time = np.arange(2001) * INTERVAL
-    assert integrate(time, CALIBRATION.rate_at(time)) == pytest.approx(CALIBRATION.heading_at(time), abs=1e-12)
+    assert integrate(time, CALIBRATION.rate_at(time)) == pytest.approx(
+        CALIBRATION.heading_at(time), abs=1e-12)
 
 
-SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(), 'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
+SETTINGS = {'published': Threshold(window=0.0), 'mean': Threshold(),
+            'rest test': Threshold(angle_random_walk=XV3500.angle_random_walk),
             'long': Threshold(1.0 * DEGREE, 1.0), 'off': Threshold(0.0)}
 
 
 @pytest.mark.parametrize('settings', SETTINGS.values(), ids=SETTINGS)
 def test_a_log_at_once_is_filtered_as_sample_by_sample(settings):
     time, rate = noisy_robot()
-    assert np.array_equal(filter_rates(settings, time, rate), filtered_singly(settings, time, rate))
+    assert np.array_equal(filter_rates(settings, time, rate),
+                          filtered_singly(settings, time, rate))
 
 
 @pytest.mark.parametrize('settings', SETTINGS.values(), ids=SETTINGS)
@@ -59,9 +69,11 @@ def test_a_log_in_blocks_of_any_size_is_filtered_and_integrated_as_in_one_piece(
     cuts = np.sort(np.random.default_rng(0).choice(len(time), 40))
     cuts = [0, 0, 1, 2, *cuts.tolist(), 9000, 9001, 9001, len(time)]
     integrator = BlockIntegrator(settings, XV3500, covariance(model))
-    pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j]) for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
+    pieces = [integrator.add(time[i:j], rate[i:j], sensitivity[:, i:j])
+              for i, j in zip(sorted(cuts), sorted(cuts)[1:])]
     filtered, heading, deviation = (np.concatenate(parts) for parts in zip(*pieces))
-    assert np.array_equal(filtered, whole[0]) and np.array_equal(filtered, filter_rates(settings, time, rate))
+    assert (np.array_equal(filtered, whole[0])
+            and np.array_equal(filtered, filter_rates(settings, time, rate)))
     assert np.array_equal(heading, whole[1]) and np.array_equal(heading, integrate(time, filtered))
     assert deviation == pytest.approx(whole[2], rel=1e-12)
 
@@ -80,10 +92,11 @@ def test_single_samples_are_filtered_by_equation_12():
 
 
 def test_single_samples_pass_half_of_the_noise_at_rest_and_the_mean_of_0_2_s_little():
-    """0.3 deg/s is 0.72 sigma of a sample at 100 Hz, which 47 % exceed, and 3.2 sigma of the mean of 20, which 0.13 % exceed."""
+    """0.3 deg/s is 0.72 sigma of a 100 Hz sample (47 % beyond), 3.2 of a mean of 20 (0.13 %)."""
     time = np.arange(20001) * INTERVAL
     rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    passed = {window: (filter_rates(Threshold(window=window), time, rate) != 0.0).mean() for window in (0.0, 0.2)}
+    passed = {window: (filter_rates(Threshold(window=window), time, rate) != 0.0).mean()
+              for window in (0.0, 0.2)}
     assert passed[0.0] == pytest.approx(0.472, abs=0.02) and passed[0.2] < 0.01
 
 
@@ -91,7 +104,8 @@ def test_the_mean_over_the_window_decides():
     time = np.arange(100) * INTERVAL
     rate = np.where(np.arange(100) < 50, 0.0, 1.0 * DEGREE)
     kept = filtered_singly(Threshold(0.3 * DEGREE, 0.2), time, rate)
-    assert np.flatnonzero(kept)[0] == 50 + 6 - 1  # six of twenty samples at 1 deg/s have a mean of 0.3 deg/s
+    # Six of twenty samples at 1 deg/s have a mean of 0.3 deg/s.
+    assert np.flatnonzero(kept)[0] == 50 + 6 - 1
 
 
 def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
@@ -105,7 +119,8 @@ def test_an_oscillation_about_zero_is_motion_to_the_rest_test_only():
 def test_the_rest_test_takes_noise_for_rest():
     time = np.arange(20001) * INTERVAL
     rate = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(0))
-    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate) != 0.0).mean() < 0.01
+    assert (filter_rates(Threshold(angle_random_walk=XV3500.angle_random_walk), time, rate)
+            != 0.0).mean() < 0.01
 
 
 def test_a_cleared_window_knows_nothing_of_before():
@@ -121,18 +136,21 @@ UNCERTAIN = ((1e-4, -2e-6), (-2e-6, 1e-6))
 
 
 def test_the_variance_is_that_of_many_runs_with_known_truth():
-    """White noise, and a scale factor error and a bias that are off by what their covariance says, over 60 s of driving."""
+    """60 s of driving with white noise, and s and b drawn from their covariance."""
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, generator, ends = np.arange(6001) * INTERVAL, np.random.default_rng(0), []
     true = ROBOT.rate_at(time)
     for _ in range(400):
         s, b = np.array([S, B]) + generator.multivariate_normal([0.0, 0.0], UNCERTAIN)
         output = (1 + s) * true + b + simulate_noise(XV3500, len(time), INTERVAL, generator)
-        ends.append(integrate(time, compensate(model, output).rate)[[1500, 6000]] - ROBOT.heading_at(time)[[1500, 6000]])
+        ends.append(integrate(time, compensate(model, output).rate)[[1500, 6000]]
+                    - ROBOT.heading_at(time)[[1500, 6000]])
     sensitivity = rate_sensitivity(model, true, true, np.full(len(time), 25.0))
-    deviation = BlockIntegrator(Threshold(0.0), XV3500, covariance(model)).add(time, true, sensitivity)[2]
+    deviation = BlockIntegrator(Threshold(0.0), XV3500, covariance(model)).add(
+        time, true, sensitivity)[2]
     ratios = np.mean(np.square(ends), axis=0) / deviation[[1500, 6000]] ** 2
-    assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)  # to first order in s, 2 % here
+    # To first order in s, 2 % here.
+    assert ratios == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 400) + 0.05)
 
 
 @pytest.mark.parametrize('settings', [Threshold(), Threshold(0.0)], ids=['threshold', 'pure'])
@@ -141,13 +159,17 @@ def test_a_tracker_that_looks_for_no_rests_does_as_the_blocks(settings, offset):
     model = GyroModel(noise=XV3500, self_calibration=SelfCalibration(S, B, UNCERTAIN))
     time, rate = (values[:3000] for values in noisy_robot())
     sensitivity = rate_sensitivity(model, rate, rate, np.full(len(time), 25.0))
-    tracker = HeadingTracker(XV3500, covariance(model), Settings(false_alarms=0.0, threshold=settings))
+    tracker = HeadingTracker(XV3500, covariance(model),
+                             Settings(false_alarms=0.0, threshold=settings))
     headings = []
     for index in range(len(time)):
-        assert not tracker.add(float(time[index]) + offset, float(rate[index]), sensitivity[:, index])
+        assert not tracker.add(float(time[index]) + offset, float(rate[index]),
+                               sensitivity[:, index])
         headings.append(tracker.heading)
-    _, heading, deviation = BlockIntegrator(settings, XV3500, covariance(model)).add(time, rate, sensitivity)
-    assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)  # 1e9 s has steps of 0.1 us
+    _, heading, deviation = BlockIntegrator(settings, XV3500, covariance(model)).add(
+        time, rate, sensitivity)
+    # Stamps near 1e9 s have steps of 0.1 us.
+    assert headings == pytest.approx(heading, abs=1e-9 if not offset else 1e-5)
     tracker.finish()
     assert math.sqrt(tracker.variance) == pytest.approx(deviation[-1], rel=1e-3)
     assert tracker.deleted == pytest.approx(integrate(time, rate)[-1] - heading[-1], abs=1e-5)

@@ -1,5 +1,5 @@
 """
-The heading on a robot as it is followed sample by sample: rests, temperature, what earlier runs taught, and stamps that jump.
+The heading on a robot, sample by sample: rests, temperature, earlier runs, and stamp jumps.
 
 The gyro is simulated with the noise of the XV-3500 at 25 Hz.
 
@@ -26,13 +26,15 @@ from gyro_calibration.tracking import Settings
 INTERVAL, NOW = 0.04, 1.7e9
 NOISE = Noise(2.5 * DEGREE / 60, 18 * DEGREE / 3600)
 DATE = datetime.fromtimestamp(NOW, timezone.utc).isoformat()
-CALIBRATED = SelfCalibration(0.0, 0.1 * DEGREE, ((1e-8, 0.0), (0.0, (0.01 * DEGREE) ** 2)), DATE, 25.0)
+CALIBRATED = SelfCalibration(0.0, 0.1 * DEGREE,
+                             ((1e-8, 0.0), (0.0, (0.01 * DEGREE) ** 2)), DATE, 25.0)
 MODEL = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
 
 
 def begun(model=MODEL, table=None, assumptions=None, settings=None, now=NOW, temperature=25.0):
     """Return a heading that begins; with a temperature, if one is given."""
-    live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(), settings or Settings(), 10.0, now)
+    live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
+                            settings or Settings(), 10.0, now)
     if temperature is not None:
         live.hear_temperature(0.0, temperature)
     return live
@@ -43,21 +45,24 @@ class Gyro:
 
     def __init__(self, live, seed=0, bias=0.1 * DEGREE, coefficient=0.0, now=NOW):
         self.live, self.time, self.now, self.turned = live, 0.0, now, 0.0
-        self._bias, self._coefficient, self._generator = bias, coefficient, np.random.default_rng(seed)
+        self._bias, self._coefficient, self._generator = (bias, coefficient,
+                                                          np.random.default_rng(seed))
         self.headings, self.said, self._rate = [], [], 0.0
 
     def go(self, seconds, rate=0.0, temperature=25.0, wheels=None):
-        """Turn at a rate, rad/s, for some time, at one temperature or along those between two; None brings none."""
+        """Turn at a rate, rad/s, for some time, at one temperature, a ramp of two, or None."""
         count = round(seconds / INTERVAL)
         noise = simulate_noise(NOISE, count, INTERVAL, self._generator)
-        known = np.full(count, np.nan) if temperature is None else np.linspace(*np.broadcast_to(temperature, 2), count)
+        known = (np.full(count, np.nan) if temperature is None
+                 else np.linspace(*np.broadcast_to(temperature, 2), count))
         for degc, wandering in zip(known, noise):
             self.time += INTERVAL
             if temperature is not None:
                 self.live.hear_temperature(self.time, degc)
             offset = self._bias + self._coefficient * (0.0 if temperature is None else degc - 25.0)
             now = self.now + self.time
-            self.said.append(self.live.add(self.time, rate + offset + wandering, now, wheels=wheels))
+            self.said.append(self.live.add(self.time, rate + offset + wandering, now,
+                                           wheels=wheels))
             self.headings.append(self.live.tracker.heading)
             if round(self.time / INTERVAL) % 25 == 0:
                 self.live.learn(now)
@@ -77,7 +82,8 @@ class Gyro:
 
 
 @pytest.mark.parametrize('temperature', [25.0, None])
-def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_been_right(temperature):
+def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_been_right(
+        temperature):
     later, deviations, headings = NOW + 300.0 * 86400.0, [], []
     for begin in (1000.0, later):
         live = begun(now=begin, temperature=temperature)
@@ -88,7 +94,8 @@ def test_a_robot_whose_clock_is_set_late_carries_its_calibration_as_if_it_had_be
         live.add(INTERVAL * 100, 0.3, later)
         deviations.append(live.tracker.bias[1])
         assert live.tracker.heading - headings[-1] == pytest.approx(INTERVAL * 0.3, rel=0.05)
-    assert deviations[0] == pytest.approx(deviations[1], rel=1e-3) and live.age(later) == pytest.approx(300.0 * 86400.0)
+    assert (deviations[0] == pytest.approx(deviations[1], rel=1e-3)
+            and live.age(later) == pytest.approx(300.0 * 86400.0))
 
 
 def test_a_clock_that_is_set_by_seconds_lets_the_tracker_go_on():
@@ -110,7 +117,8 @@ def test_what_nobody_calibrated_is_assumed_and_what_is_known_is_left_alone():
     assert assumed(of_nobody_knows, assumptions).self_calibration.bias == 0.02
     assert assumed(MODEL, assumptions) is MODEL
     model = GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-6]]))
-    assert assumed(model, assumptions) is model and uncertain(model, assumptions) == pytest.approx(np.diag([1e-6, temperature]))
+    assert (assumed(model, assumptions) is model
+            and uncertain(model, assumptions) == pytest.approx(np.diag([1e-6, temperature])))
 
 
 def test_sensitivities_have_the_order_of_the_covariance_and_foretell_what_the_rate_changes_by():
@@ -122,13 +130,15 @@ def test_sensitivities_have_the_order_of_the_covariance_and_foretell_what_the_ra
 
 
 def test_a_way_is_that_of_the_table_at_its_steps_and_in_between_and_does_not_learn():
-    table = BiasTable(MODEL, entries=[Entry(t, 0.001 * t, 1e-10, NOW - 1e5, 0) for t in (20.0, 25.0, 30.0, 35.0)])
+    table = BiasTable(MODEL, entries=[Entry(t, 0.001 * t, 1e-10, NOW - 1e5, 0)
+                                      for t in (20.0, 25.0, 30.0, 35.0)])
     way = Way(table, 25.0, NOW, 0.03 * DEGREE)
     for temperature in (25.0, 25.13, 31.7, 19.9):
         change, variance = table.difference(25.0, temperature, NOW)
         gone, distance = way.at(temperature)
         assert gone == pytest.approx(change, abs=2e-6)
-        assert distance == pytest.approx(math.copysign(math.sqrt(variance) / (0.03 * DEGREE), temperature - 25.0), abs=0.1)
+        assert distance == pytest.approx(
+            math.copysign(math.sqrt(variance) / (0.03 * DEGREE), temperature - 25.0), abs=0.1)
     before = way.at(40.0)
     for number in range(5):
         table.add(40.0, 0.05, 1e-10, NOW + number)
@@ -140,7 +150,8 @@ def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():
     stood = gyro.error
     assert gyro.live.tracker.resting and abs(stood) < 0.5 * DEGREE
     gyro.go(10.0, 0.5).go(5.0)
-    assert abs(gyro.error - stood) < 0.5 * DEGREE and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1)
+    assert (abs(gyro.error - stood) < 0.5 * DEGREE
+            and gyro.deviation == pytest.approx(5.0 * 0.03, rel=0.1))
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -150,7 +161,8 @@ def test_a_drive_with_stops_stands_at_rest_and_stays_inside_what_it_says(seed):
         gyro.go(10.0, rate).go(3.0)
         begin = len(gyro.headings)
         gyro.go(17.0)
-        assert gyro.live.tracker.resting and np.ptp(gyro.headings[begin:]) == 0.0 and gyro.live.rate == 0.0
+        assert (gyro.live.tracker.resting and np.ptp(gyro.headings[begin:]) == 0.0
+                and gyro.live.rate == 0.0)
     assert abs(gyro.error) < 4.0 * gyro.deviation < 4.0 * DEGREE
 
 
@@ -180,7 +192,8 @@ def heated(live, seed=0, now=NOW):
     """Return a gyro that rested from 25 to 45 degC and back."""
     gyro = Gyro(live, seed, coefficient=0.03 * DEGREE, now=now).go(60.0)
     for degc in (25.0, 30.0, 35.0, 40.0, 45.0):
-        gyro.go(20.0, 0.3, (degc, min(degc + 5.0, 45.0))).go(40.0, temperature=min(degc + 5.0, 45.0))
+        gyro.go(20.0, 0.3, (degc, min(degc + 5.0, 45.0))).go(
+            40.0, temperature=min(degc + 5.0, 45.0))
     return gyro
 
 
@@ -195,7 +208,8 @@ def test_what_one_run_learned_of_the_temperature_serves_the_next_without_compens
         before = gyro.error
         gyro.go(60.0, 0.3, (25.0, 44.0))
         errors[name] = abs(gyro.error - before), gyro.deviation
-    assert errors['new'][0] > 10.0 * DEGREE and errors['learned'][0] < 0.1 * errors['new'][0], errors
+    assert (errors['new'][0] > 10.0 * DEGREE
+            and errors['learned'][0] < 0.1 * errors['new'][0]), errors
     for error, deviation in errors.values():
         assert error < 3.0 * deviation
 
@@ -212,10 +226,12 @@ def test_a_stored_calibration_is_worth_what_power_age_and_temperature_leave_of_i
     for days, temperature in ((0.0, 25.0), (300.0, 25.0), (0.0, 45.0)):
         live = begun(now=NOW + 86400.0 * days, temperature=temperature)
         live.add(0.1, 0.0, NOW + 86400.0 * days)
-        assert 'let the robot rest, or calibrate again' in live.sentence and f'{temperature:.1f} degC' in live.sentence
+        assert ('let the robot rest, or calibrate again' in live.sentence
+                and f'{temperature:.1f} degC' in live.sentence)
         deviations.append(math.sqrt(live.covariance[-1, -1]) / DEGREE)
     on, old, far = deviations
-    assert 0.05 < on < old < far  # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
+    # deg/s; a gyro that was turned off and on is at least 0.05 deg/s off
+    assert 0.05 < on < old < far
 
 
 @pytest.mark.parametrize('temperature', [25.0, None])
@@ -235,7 +251,8 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
     assert gyro.live.tracker.heading == heading and gyro.live.covariance[-1, -1] > 9.0 * variance
     gyro._bias += 0.1 * DEGREE
     gyro.go(40.0).go(10.0, 0.3)
-    assert len({each.run for each in gyro.live.table.entries}) == 2 and abs(gyro.error) < 3.0 * gyro.deviation
+    assert (len({each.run for each in gyro.live.table.entries}) == 2
+            and abs(gyro.error) < 3.0 * gyro.deviation)
 
 
 def test_a_rest_mends_an_old_calibration_and_it_is_no_longer_said():
@@ -248,7 +265,8 @@ def test_a_rest_mends_an_old_calibration_and_it_is_no_longer_said():
 def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_doubt_of_it():
     none = Assumptions(bias_temperature_coefficient=0.0)
     table = BiasTable(MODEL, Prior(coefficient=0.0))
-    gyro = Gyro(begun(table=table, assumptions=none)).go(40.0).go(10.0, 0.3, (25.0, 45.0)).go(40.0, temperature=45.0)
+    gyro = Gyro(begun(table=table, assumptions=none)).go(40.0).go(10.0, 0.3, (25.0, 45.0)).go(
+        40.0, temperature=45.0)
     assert len(table.entries) == 2 and abs(gyro.error) < 3.0 * gyro.deviation < 3.0 * DEGREE
 
 
@@ -257,11 +275,13 @@ def test_a_calibrated_model_takes_the_bias_of_earlier_runs():
     table = BiasTable(model, entries=[Entry(25.0, 0.003, 1e-10, NOW - 100.0, 0)])
     live = begun(model, table)
     live.add(0.1, 0.0, NOW)
-    assert live.used.self_calibration.bias == pytest.approx(0.003, abs=1e-4) and live.model.self_calibration is None
+    assert (live.used.self_calibration.bias == pytest.approx(0.003, abs=1e-4)
+            and live.model.self_calibration is None)
 
 
 def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_known():
-    model = GyroModel((Term(BIAS_TEMPERATURE, (25.0, 0.03 * DEGREE)),), np.array([[1e-14]]), noise=NOISE, self_calibration=CALIBRATED)
+    model = GyroModel((Term(BIAS_TEMPERATURE, (25.0, 0.03 * DEGREE)),), np.array([[1e-14]]),
+                      noise=NOISE, self_calibration=CALIBRATED)
     gyro = Gyro(begun(model), coefficient=0.03 * DEGREE).go(30.0, temperature=30.0)
     known, rate = gyro.live.tracker.bias[1], gyro.live.corrected
     assert not gyro.live.temperature_is_lost
@@ -269,27 +289,32 @@ def test_a_temperature_that_comes_no_more_is_held_and_the_bias_becomes_less_know
     gyro._bias += 5.0 * 0.03 * DEGREE  # it stays as warm as it is, but nobody says so
     before = len(gyro.headings)
     gyro.go(60.0, 0.3, None)
-    assert gyro.live.temperature_is_lost and gyro.live.tracker.bias[1] > 2.0 * known and abs(rate) < 2.0 * DEGREE
+    assert (gyro.live.temperature_is_lost and gyro.live.tracker.bias[1] > 2.0 * known
+            and abs(rate) < 2.0 * DEGREE)
     assert np.abs(np.diff(gyro.headings[before:])).max() < 2.0 * 0.3 * INTERVAL
     assert abs(gyro.error) < 3.0 * gyro.deviation
 
 
-@pytest.mark.parametrize('terms', [(), (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)),),
-                                   (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(RATE_RAMP, (1e-9,)))],
-                         ids=['no effect', 'of temperature', 'of temperature and time'])
+@pytest.mark.parametrize('terms', [
+    (), (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)),),
+    (Term(BIAS_TEMPERATURE, (25.0, 0.02 * DEGREE)), Term(RATE_RAMP, (1e-9,)))
+], ids=['no effect', 'of temperature', 'of temperature and time'])
 def test_a_calibration_while_no_temperature_comes_holds_when_one_comes_again(terms):
     model = GyroModel(terms, noise=NOISE)
-    table = BiasTable(model, entries=[Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0) for degc in range(15, 45)])
+    table = BiasTable(model, entries=[Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12,
+                                            NOW - 1e5, 0) for degc in range(15, 45)])
     gyro = Gyro(begun(model, table), bias=0.0).go(20.0)
     gyro._bias = 0.3 * DEGREE  # it has become warmer by 10 K, but nobody says so
     gyro.go(20.0, temperature=None)
     assert gyro.live.temperature_is_lost
-    calibration = SelfCalibration(0.0, 0.3 * DEGREE, ((1e-8, 0.0), (0.0, (0.002 * DEGREE) ** 2)), DATE)
+    calibration = SelfCalibration(0.0, 0.3 * DEGREE,
+                                  ((1e-8, 0.0), (0.0, (0.002 * DEGREE) ** 2)), DATE)
     gyro.live.use(replace(model, self_calibration=calibration), gyro.now + gyro.time)
     before = gyro.go(4.0, 0.3, None).error
     assert not gyro.live.tracker.resting
     gyro.go(40.0, 0.3, 35.0)
-    assert abs(gyro.error - before) < 2.0 * DEGREE, 'what the table knows of 10 K makes 12 degrees of it'
+    assert abs(gyro.error - before) < 2.0 * DEGREE, (
+        'what the table knows of 10 K makes 12 degrees of it')
 
 
 def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is_known():
@@ -305,7 +330,8 @@ def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is
     assert known[0] < 1.1 * (0.01 * DEGREE) ** 2 and 9.0 * known[0] < known[1] < known[2]
 
 
-@pytest.mark.parametrize('jump, words', [(3600.0, 'no samples for 3600.040'), (-3600.0, 'jumps back by 3599.960')])
+@pytest.mark.parametrize('jump, words', [(3600.0, 'no samples for 3600.040'),
+                                         (-3600.0, 'jumps back by 3599.960')])
 def test_a_clock_that_jumps_makes_no_jump_of_the_heading_and_the_variance_says_so(jump, words):
     gyro = Gyro(begun()).go(30.0).go(5.0, 0.3)
     heading, deviation = gyro.headings[-1], gyro.deviation
@@ -332,7 +358,8 @@ def test_a_temperature_that_comes_no_more_is_less_and_less_known_on_either_side(
 
 @pytest.mark.parametrize('known', [False, True], ids=['unknown coefficient', 'known coefficient'])
 def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
-    entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0) for degc in range(15, 45)] if known else []
+    entries = [Entry(float(degc), 0.03 * DEGREE * (degc - 25), 1e-12, NOW - 1e5, 0)
+               for degc in range(15, 45)] if known else []
     live = begun(table=BiasTable(MODEL, entries=entries))
     live.add(0.1, 0.0, NOW)
     live.use(MODEL, NOW)
@@ -341,14 +368,16 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
         live.hear_temperature(INTERVAL * index, 35.0)
         live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
     warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
-    assert not changed(live.claimed, warm, NOISE, 300.0) and changed(CALIBRATED, warm, NOISE, 300.0)
+    assert (not changed(live.claimed, warm, NOISE, 300.0)
+            and changed(CALIBRATED, warm, NOISE, 300.0))
     assert bool(changed(live.claimed, replace(warm, bias=0.1 * DEGREE), NOISE, 300.0)) == known
 
 
 def test_a_model_without_a_calibration_claims_no_scale():
     live = begun(GyroModel((Term(BIAS, (0.01,)),), np.array([[1e-8]]), noise=NOISE))
     live.add(0.1, 0.0, NOW)
-    assert live.claimed.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8))) and live.claimed.bias == 0.0
+    assert (live.claimed.covariance == ((math.inf, 0.0), (0.0, pytest.approx(1e-8)))
+            and live.claimed.bias == 0.0)
 
 
 def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
@@ -364,7 +393,8 @@ def test_a_rest_in_which_the_robot_turned_slowly_does_not_teach_the_table():
     entries = list(table.entries)
     gyro.go(25.0, 0.3 * DEGREE)
     gyro.go(10.0, 0.3)
-    assert len(entries) == 1 and table.entries[0].bias == pytest.approx(0.1 * DEGREE, abs=0.03 * DEGREE)
+    assert (len(entries) == 1
+            and table.entries[0].bias == pytest.approx(0.1 * DEGREE, abs=0.03 * DEGREE))
     assert all(abs(each.bias - 0.1 * DEGREE) < 0.05 * DEGREE for each in table.entries)
 
 
@@ -372,7 +402,9 @@ def test_a_rest_in_which_the_robot_turned_slowly_does_not_teach_the_table():
 def test_a_rest_that_is_judged_when_it_is_warmer_teaches_the_table_all_the_same(rested):
     gyro = Gyro(begun(temperature=25.0), coefficient=0.02 * DEGREE)
     gyro.live.learn = lambda now: ''
-    gyro.go(rested).go(5.0, 0.3, temperature=35.0).go(8.0, temperature=35.0).go(1.0, 0.3, temperature=35.0)
+    gyro.go(rested).go(5.0, 0.3, temperature=35.0).go(8.0, temperature=35.0).go(
+        1.0, 0.3, temperature=35.0)
     del gyro.live.learn
     gyro.live.learn(gyro.now + gyro.time)
-    assert [entry.bias for entry in gyro.live.table.entries] == [pytest.approx(0.1 * DEGREE, abs=0.05 * DEGREE)]
+    assert [entry.bias for entry in gyro.live.table.entries] == [
+        pytest.approx(0.1 * DEGREE, abs=0.05 * DEGREE)]

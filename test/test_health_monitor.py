@@ -1,4 +1,4 @@
-"""The live check against simulated gyros: as few false alarms as it states, over hours at rest, and none missed that matter."""
+"""The live health monitor on simulated gyros: its false alarm rate at rest and its detections."""
 
 import math
 from dataclasses import replace
@@ -19,42 +19,48 @@ FOG = Noise(3e-5, 5e-6, 1e-7)
 
 
 def stretches(noise, hours, generator, scale=1.0):
-    """Return outputs of a gyro at rest as stretches of a check, shape (n, samples), less the mean of one ten minutes before."""
+    """Return outputs at rest in stretches, (n, samples), less the mean of one 600 s before."""
     size, before = round(STRETCH / INTERVAL), round(600.0 / INTERVAL)
     count = round(hours * 3600.0 / INTERVAL) // size * size
-    whole = simulate_noise(Noise(scale * noise.angle_random_walk, noise.bias_instability, noise.rate_random_walk), before + count, INTERVAL,
-                           generator)
+    whole = simulate_noise(Noise(scale * noise.angle_random_walk, noise.bias_instability,
+                                 noise.rate_random_walk), before + count, INTERVAL, generator)
     return (whole[before:] - whole[:size].mean()).reshape(-1, size)
 
 
 def examined(outputs, noise, false_alarms, step=0.0):
-    """Examine each stretch by itself, with the level that a check would take, and return what they showed."""
+    """Examine each stretch alone, at the level of a health monitor, and return the results."""
     time, level = np.arange(outputs.shape[1]) * INTERVAL, 0.25 * false_alarms * STRETCH / 3600.0
     variance = noise.angle_random_walk ** 2 / STRETCH
-    return [examine(time, output, output, noise, level, step, variance, 600.0 + STRETCH * number) for number, output in enumerate(outputs)]
+    return [examine(time, output, output, noise, level, step, variance, 600.0 + STRETCH * number)
+            for number, output in enumerate(outputs)]
 
 
 @pytest.mark.parametrize('noise', [MEMS, FOG, Noise(1e-4)], ids=['MEMS', 'FOG', 'white'])
 @pytest.mark.parametrize('step', [0.0, 1e-4, 3e-3], ids=['fine', 'coarse', 'very coarse'])
 def test_single_stretches_alarm_in_vain_no_more_often_than_stated(noise, step):
-    """Stated are 40 in an hour, so that there would be something to see; within a run they come together, from run to run they do not."""
+    """State 40 alarms an hour, so that some occur; they correlate within a run, not beyond it."""
     stated, minutes, generator, alarms, rests = 40.0, 6.0, np.random.default_rng(11), [], []
     for _ in range(100):
         outputs = stretches(noise, minutes / 60.0, generator)
         if step:
             outputs = (np.round(outputs / step + 0.3) - 0.3) * step
         rests += examined(outputs, noise, stated, step)
-        alarms.append(sum(not rest.noise_fits or not rest.bias_fits for rest in rests[-len(outputs):] if rest is not None))
-    assert np.mean(alarms) <= stated * minutes / 60.0 + 4.0 * np.std(alarms) / math.sqrt(len(alarms))
-    assert sum(rest is not None for rest in rests) > 0.98 * len(rests), 'rest is not taken for motion'
+        alarms.append(sum(not rest.noise_fits or not rest.bias_fits
+                          for rest in rests[-len(outputs):] if rest is not None))
+    assert (np.mean(alarms) <= stated * minutes / 60.0
+            + 4.0 * np.std(alarms) / math.sqrt(len(alarms)))
+    assert sum(rest is not None for rest in rests) > 0.98 * len(rests), (
+        'rest is not taken for motion')
 
 
 def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
-    """White noise, and a bias known to a standard deviation that was drawn each time: half of the stated alarms belong to the bias."""
+    """White noise, and a bias drawn with the stated deviation, which gets half of the alarms."""
     stated, generator, size = 40.0, np.random.default_rng(12), round(STRETCH / INTERVAL)
     level, time, deviation = 0.25 * stated * STRETCH / 3600.0, np.arange(size) * INTERVAL, 1e-4
-    outputs = generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), (4000, size)) + generator.normal(0.0, deviation, (4000, 1))
-    misfits = sum(not examine(time, output, output, Noise(1e-4), level, 0.0, deviation ** 2).bias_fits for output in outputs)
+    outputs = (generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), (4000, size))
+               + generator.normal(0.0, deviation, (4000, 1)))
+    misfits = sum(not examine(time, output, output, Noise(1e-4), level, 0.0,
+                              deviation ** 2).bias_fits for output in outputs)
     assert misfits == pytest.approx(4000 * 2.0 * level, abs=4.0 * math.sqrt(4000 * 2.0 * level))
 
 
@@ -77,14 +83,16 @@ def test_a_check_of_a_day_at_rest_is_silent():
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
 def test_three_times_the_noise_is_found_in_one_stretch_where_rest_was_promised_and_in_three_otherwise(noise):
     outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
-    assert 'the noise at rest is 3.' in fed(HealthMonitor(noise, 0.001), outputs[:2], promised=True).noise_alarm.replace('2.9', '3.0')
+    assert 'the noise at rest is 3.' in fed(HealthMonitor(noise, 0.001), outputs[:2],
+                                            promised=True).noise_alarm.replace('2.9', '3.0')
     assert not fed(HealthMonitor(noise, 0.001), outputs[:2]).noise_alarm
     assert 'or the robot shakes' in fed(HealthMonitor(noise, 0.001), outputs[:5]).noise_alarm
 
 
 def test_twice_the_noise_is_missed_in_hardly_a_stretch_and_a_tenth_more_is_no_misfit():
     generator = np.random.default_rng(15)
-    double, more = (examined(stretches(MEMS, 1.0, generator, scale), MEMS, 0.001) for scale in (2.0, 1.1))
+    double, more = (examined(stretches(MEMS, 1.0, generator, scale), MEMS, 0.001)
+                    for scale in (2.0, 1.1))
     assert sum(rest is None or rest.noise_fits for rest in double) < 0.02 * len(double)
     assert all(rest is None or rest.noise_fits for rest in more)
 
@@ -107,24 +115,28 @@ def test_a_bias_whose_uncertainty_nobody_knows_is_not_judged():
 
 
 def test_motion_is_not_taken_for_a_misfit():
-    """Half of the drive the robot stands, in the other half it turns, and its own wobble is a hundredth of that."""
+    """The robot stands half of the time and turns half of it, with a wobble of 1 % of its rate."""
     time = np.arange(0.0, ROBOT.duration, INTERVAL)
     check, generator = HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(18)
     for drive in range(20):
-        wobble = np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same') * ROBOT.rate_at(time)
-        fed(check, ROBOT.rate_at(time) + wobble + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
+        wobble = (np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same')
+                  * ROBOT.rate_at(time))
+        fed(check, ROBOT.rate_at(time) + wobble
+            + generator.normal(0.0, 1e-4 / math.sqrt(INTERVAL), len(time)), begin=200.0 * drive)
         assert not check.noise_alarm and not check.bias_alarm, drive
 
 
 def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(data):
-    """An ADIS16405 at rest for 10 000 s; the model has the noise of that record and the bias of its first 15 s."""
+    """10 000 s of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
     log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
     record = even_record(log.time, log.output)
-    noise, rate = fit_noise(record.rate, record.interval).noise, log.output - log.output[:1500].mean()
+    noise, rate = (fit_noise(record.rate, record.interval).noise,
+                   log.output - log.output[:1500].mean())
     half = replace(noise, angle_random_walk=0.5 * noise.angle_random_walk)
     for claimed, length in ((noise, len(rate)), (half, 4000)):
         check, alarmed = HealthMonitor(claimed, 0.001, 0.3 * DEGREE), 0
-        for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(), rate[:length].tolist()):
+        for sample in zip(log.time[:length].tolist(), log.output[:length].tolist(),
+                          rate[:length].tolist()):
             if check.add(*sample):
                 check.examine(claimed.angle_random_walk ** 2 / 15.0, sample[0])
                 alarmed += bool(check.noise_alarm or check.bias_alarm)
@@ -133,7 +145,8 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(da
 
 def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged():
     check = HealthMonitor(MEMS, 0.001)
-    assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0) for number in range(600))
+    assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0)
+                   for number in range(600))
     fed(check, np.zeros(2000), begin=100.0)
     assert not check.examined and not check.noise_alarm
 
@@ -146,7 +159,8 @@ def test_a_gyro_that_died_is_said_once_its_codes_are_known():
 
 
 def test_without_noise_figures_there_is_nothing_to_check():
-    assert not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works and HealthMonitor(MEMS, 0.001).works
+    assert (not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works
+            and HealthMonitor(MEMS, 0.001).works)
 
 
 def test_the_step_of_codes_is_their_smallest_difference():
@@ -158,10 +172,13 @@ def test_a_calibration_that_changed_by_more_than_chance_is_said_in_vain_as_often
     covariance, said, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
     wander = math.sqrt(MEMS.wander(age, STRETCH))
     for _ in range(2000):
-        first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(), covariance) for _ in range(2))
-        second = SelfCalibration(second.scale_factor_error, second.bias + wander * generator.normal(), covariance)
+        first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(),
+                                         covariance) for _ in range(2))
+        second = SelfCalibration(second.scale_factor_error,
+                                 second.bias + wander * generator.normal(), covariance)
         said += bool(changed(first, second, MEMS, age, level))
     assert said == pytest.approx(2000 * level, abs=4.0 * math.sqrt(2000 * level))
-    moved = changed(first, SelfCalibration(first.scale_factor_error + 0.02, first.bias + 1.0 * DEGREE, covariance), MEMS, age, 1e-3)
+    moved = changed(first, SelfCalibration(first.scale_factor_error + 0.02,
+                                           first.bias + 1.0 * DEGREE, covariance), MEMS, age, 1e-3)
     assert 'the scale factor error by 2.000 % and the bias by 1.0000 deg/s' in moved
     assert not changed(SelfCalibration(), second, MEMS, age, level), 'nothing was known before'

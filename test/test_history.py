@@ -1,4 +1,4 @@
-"""Channels with a memory: against responses that are known exactly, and the same for a stream, a log, and its blocks."""
+"""Channels with memory: against exact responses, and equal for a stream, a log, and its blocks."""
 
 import time as clock
 
@@ -9,8 +9,8 @@ from gyro_calibration.history import History, channels_of
 from gyro_calibration.log import Log
 
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
-LAGS = [('temperature', 0.01), ('temperature', 20.0), ('temperature', 3000.0), ('specific_force', 1.0), ('vibration', 1.0),
-        ('vibration', 30.0)]
+LAGS = [('temperature', 0.01), ('temperature', 20.0), ('temperature', 3000.0),
+        ('specific_force', 1.0), ('vibration', 1.0), ('vibration', 30.0)]
 BRANCHES = [(10.0, 1e-3), (3.0, 0.0)]
 
 
@@ -24,47 +24,57 @@ def surroundings(time):
 def everything(channels):
     """Return all that a history says, shape (channels, ...)."""
     return np.array([channels.time, channels.temperature, channels.specific_force, channels.supply,
-                     *[channels.lagged(*lag) for lag in LAGS], *[channels.heating(*branch) for branch in BRANCHES]])
+                     *[channels.lagged(*lag) for lag in LAGS],
+                     *[channels.heating(*branch) for branch in BRANCHES]])
 
 
 def ramp_response(time, time_constant):
-    """Return the answer of a lag to a ramp that begins at time zero, by the solution of its equation."""
+    """Return the exact response of a first-order lag to a ramp that begins at time zero."""
     return time - time_constant * (1.0 - np.exp(-time / time_constant))
 
 
 @pytest.mark.parametrize('time_constant', [0.02, 1.0, 25.0, 3000.0])
-@pytest.mark.parametrize('time', [np.arange(2000) * 0.1, UNEVEN - UNEVEN[0]], ids=['even', 'uneven'])
+@pytest.mark.parametrize('time', [np.arange(2000) * 0.1, UNEVEN - UNEVEN[0]],
+                         ids=['even', 'uneven'])
 def test_a_ramp_is_answered_exactly_whatever_the_stamps(time, time_constant):
-    lagged = channels_of(Log(output=time, time=time + 7.0, temperature=20.0 + 0.5 * time)).lagged('temperature', time_constant)
-    assert lagged == pytest.approx(20.0 + 0.5 * ramp_response(time, time_constant), rel=0.0, abs=1e-10)
+    lagged = channels_of(Log(output=time, time=time + 7.0, temperature=20.0 + 0.5 * time)).lagged(
+        'temperature', time_constant)
+    assert lagged == pytest.approx(20.0 + 0.5 * ramp_response(time, time_constant),
+                                   rel=0.0, abs=1e-10)
 
 
 def test_a_corner_between_uneven_stamps_is_answered_exactly():
     time = np.sort(np.concatenate([UNEVEN, [300.0]])) - UNEVEN[0]
     corner = time[np.searchsorted(time, 250.0)]
     temperature = np.minimum(time, corner)
-    expected = ramp_response(time, 40.0) - np.where(time > corner, ramp_response(np.maximum(time - corner, 0.0), 40.0), 0.0)
-    lagged = channels_of(Log(output=time, time=time, temperature=temperature)).lagged('temperature', 40.0)
+    expected = ramp_response(time, 40.0) - np.where(
+        time > corner, ramp_response(np.maximum(time - corner, 0.0), 40.0), 0.0)
+    lagged = channels_of(Log(output=time, time=time, temperature=temperature)).lagged(
+        'temperature', 40.0)
     assert lagged == pytest.approx(expected, rel=0.0, abs=1e-10)
 
 
 def test_a_sine_is_damped_and_delayed_as_its_transfer_function_says():
     time, pulsation, time_constant = np.arange(0.0, 2000.0, 0.05), 0.05, 30.0
-    lagged = channels_of(Log(output=time, time=time, temperature=np.sin(pulsation * time))).lagged('temperature', time_constant)
+    lagged = channels_of(Log(output=time, time=time, temperature=np.sin(pulsation * time))).lagged(
+        'temperature', time_constant)
     gain = 1.0 / (1.0 + 1j * pulsation * time_constant)
     settled = time > 500.0
-    assert lagged[settled] == pytest.approx((gain * np.exp(1j * pulsation * time)).imag[settled], abs=1e-6)
+    assert lagged[settled] == pytest.approx((gain * np.exp(1j * pulsation * time)).imag[settled],
+                                            abs=1e-6)
 
 
 def test_a_lag_starts_in_the_first_value_and_a_constant_stays():
     channels = channels_of(Log(output=UNEVEN, time=UNEVEN, temperature=np.full(len(UNEVEN), 31.7)))
-    assert set(channels.lagged('temperature', 50.0)) == {31.7} and not channels.heating(10.0, 0.0).any()
+    assert (set(channels.lagged('temperature', 50.0)) == {31.7}
+            and not channels.heating(10.0, 0.0).any())
 
 
 def test_vibration_is_the_mean_square_about_the_mean():
     time = np.arange(0.0, 3000.0, 0.01)
     force = 9.81 + 0.3 * np.random.default_rng(2).standard_normal(len(time))
-    vibration = channels_of(Log(output=time, time=time, specific_force=force)).lagged('vibration', 1.0)[1000:]
+    vibration = channels_of(Log(output=time, time=time,
+                                specific_force=force)).lagged('vibration', 1.0)[1000:]
     kept = 1.0 - 0.01 / 2.0  # of a white deviation; the mean over 1 s takes the rest
     assert vibration.mean() == pytest.approx(0.09 * kept, rel=0.01)
 
@@ -81,23 +91,27 @@ def test_the_branch_turns_soon_after_the_temperature_does_and_not_by_noise(noise
 
 def test_a_constant_temperature_has_no_branch_and_afterwards_it_keeps_the_last_one():
     time = np.arange(0.0, 600.0, 0.1)
-    branch = channels_of(Log(output=time, time=time, temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 1e-3)
+    branch = channels_of(Log(output=time, time=time,
+                             temperature=np.clip(time, 200.0, 300.0))).heating(10.0, 1e-3)
     assert not branch[time < 200.0].any() and branch[time > 210.0].min() == 1.0
 
 
-@pytest.mark.parametrize('cuts', [[1, 2, 500, 501, 2999], list(range(1, 3000))], ids=['blocks', 'sample by sample'])
+@pytest.mark.parametrize('cuts', [[1, 2, 500, 501, 2999], list(range(1, 3000))],
+                         ids=['blocks', 'sample by sample'])
 def test_blocks_of_a_log_say_what_the_whole_says(cuts):
     whole = everything(History().follow(UNEVEN, *surroundings(UNEVEN)))
     history, pieces = History(), []
     for block in np.split(np.arange(len(UNEVEN)), cuts):
-        pieces.append(everything(history.follow(UNEVEN[block], *(each[block] for each in surroundings(UNEVEN)))))
+        pieces.append(everything(history.follow(UNEVEN[block],
+                                                *(each[block] for each in surroundings(UNEVEN)))))
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
 def test_a_stream_says_what_the_log_says():
     whole = everything(History().follow(UNEVEN, *surroundings(UNEVEN)))
     history = History()
-    stream = [everything(history.follow(*sample)) for sample in zip(*(each.tolist() for each in (UNEVEN, *surroundings(UNEVEN))))]
+    stream = [everything(history.follow(*sample))
+              for sample in zip(*(each.tolist() for each in (UNEVEN, *surroundings(UNEVEN))))]
     assert np.transpose(stream) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
@@ -106,7 +120,8 @@ def test_a_lag_goes_on_in_blocks_in_which_nobody_asks_for_it():
     history.follow(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
     history.follow(UNEVEN[10:2000], temperature[10:2000])
     last = history.follow(UNEVEN[2000:], temperature[2000:]).lagged('temperature', 20.0)
-    assert last == pytest.approx(History().follow(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
+    assert last == pytest.approx(
+        History().follow(UNEVEN, temperature).lagged('temperature', 20.0)[2000:], rel=1e-12)
 
 
 def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
@@ -114,10 +129,12 @@ def test_while_no_temperature_is_known_one_stands_in_and_nothing_is_lagging():
     early = history.follow(0.0)
     assert early.temperature == early.lagged('temperature', 100.0) == 33.0
     first = history.follow(1.0, 10.0)
-    assert first.temperature == first.lagged('temperature', 100.0) == 10.0, 'a temperature that comes is no change of temperature'
+    assert first.temperature == first.lagged('temperature', 100.0) == 10.0, (
+        'a temperature that comes is no change of temperature')
     ahead = history.follow(2.0, 12.0).lagged('temperature', 100.0) - 12.0
     lost = history.follow(102.0)
-    assert lost.temperature == 33.0 and lost.lagged('temperature', 100.0) - 33.0 == pytest.approx(ahead / np.e, rel=1e-12)
+    assert (lost.temperature == 33.0
+            and lost.lagged('temperature', 100.0) - 33.0 == pytest.approx(ahead / np.e, rel=1e-12))
 
 
 def test_beyond_its_bounds_the_nearest_temperature_is_followed():
@@ -128,7 +145,8 @@ def test_beyond_its_bounds_the_nearest_temperature_is_followed():
 
 def test_what_is_not_known_says_so():
     channels = channels_of(Log(output=UNEVEN))
-    assert channels.supply is None and not channels.time.any() and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN)
+    assert (channels.supply is None and not channels.time.any()
+            and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
 
 
 def test_a_million_samples_take_well_under_a_second():

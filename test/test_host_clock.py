@@ -9,7 +9,7 @@ INTERVAL = 0.01
 
 
 def driven(step, seen=0, lost=0, others=0.0):
-    """Return times of samples and of what comes beside them; the clock is set in the middle, and the node sees it some samples sooner."""
+    """Return times of samples and others; the clock is set midway, seen `seen` samples early."""
     stamps, times, beside = HostClock(), [], []
     for number in range(200):
         now = INTERVAL * number
@@ -26,8 +26,10 @@ def driven(step, seen=0, lost=0, others=0.0):
 @pytest.mark.parametrize('seen', [0, 5])
 def test_times_go_on_where_the_clock_is_set(step, seen):
     times, beside, stamps = driven(step, seen)
-    assert np.diff(times) == pytest.approx(np.full(199, INTERVAL), abs=1e-6) and stamps.steps.count == 1
-    assert beside == pytest.approx(times, abs=1e-6) and stamps.steps.last == pytest.approx(step, abs=1e-6)
+    assert (np.diff(times) == pytest.approx(np.full(199, INTERVAL), abs=1e-6)
+            and stamps.steps.count == 1)
+    assert (beside == pytest.approx(times, abs=1e-6)
+            and stamps.steps.last == pytest.approx(step, abs=1e-6))
 
 
 def test_what_is_lost_while_the_clock_is_set_is_a_gap_of_its_own_length():
@@ -72,10 +74,12 @@ def test_a_step_between_the_first_samples_leaves_times_that_go_on(step):
     stamps.watch(0.1, 1000.1 + step)
     times = [first]
     for stamp in (5.01, 5.02):
-        times.append(stamps.of_sample(stamp + step, times[-1], np.inf if len(times) == 1 else 0.01))
+        times.append(stamps.of_sample(stamp + step, times[-1],
+                                      np.inf if len(times) == 1 else 0.01))
     assert times == pytest.approx([5.0, 5.01, 5.02])
 
 
 @pytest.mark.parametrize('pause, read', [(0.002, (10.001, 1e9)), (0.3, None)])
 def test_clocks_are_not_compared_over_a_pause_between_them(pause, read):
-    assert read_together(iter((10.0, 10.0 + pause)).__next__, lambda: 1e9) == (read and pytest.approx(read))
+    assert read_together(iter((10.0, 10.0 + pause)).__next__, lambda: 1e9) == (
+        read and pytest.approx(read))
