@@ -1,4 +1,4 @@
-"""The launch files as users start them: the nodes come up, the heading follows the gyro, and all ends well."""
+"""The launch files: the nodes start, the heading follows the gyro, and all end cleanly."""
 
 import random
 import time
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-# No import of ROS 2 and no skip at the level of the module: launch_testing imports each test module while it collects, and a skip there
-# would skip every file of this folder.
+# No import of ROS 2 and no skip at module level: launch_testing imports each test module while it
+# collects, and a skip there would skip every file of this folder.
 LAUNCH = Path(__file__).parents[1] / 'launch'
 DOMAIN = random.SystemRandom().randint(1, 101)
 MISSING = [name for name in ('rclpy', 'launch_ros', 'launch_testing') if find_spec(name) is None]
@@ -18,22 +18,24 @@ needs_launch = unittest.skipIf(MISSING, f'{" and ".join(MISSING)} not installed'
 
 @pytest.mark.launch_test
 def generate_test_description():
-    """Start the demo, and besides the nodes alone, in a namespace, with a port that does not exist."""
+    """Start the demo, and the nodes alone in a namespace with a port that does not exist."""
     import launch_testing.actions
     from launch import LaunchDescription
     from launch.actions import SetEnvironmentVariable
     skip_where_not_installed()
     domain = SetEnvironmentVariable('ROS_DOMAIN_ID', str(DOMAIN))
     nodes = include('gyro.launch.py', {
-        'port': '/nonexistent/gyro', 'namespace': 'robot', 'frame_id': 'gyro_link', 'respawn': 'true',
-        'odom_topic': '/base/odom', 'cmd_vel_topic': '/base/cmd_vel'})
-    return LaunchDescription([domain, include('demo.launch.py', {}), nodes, launch_testing.actions.ReadyToTest()])
+        'port': '/nonexistent/gyro', 'namespace': 'robot', 'frame_id': 'gyro_link',
+        'respawn': 'true', 'odom_topic': '/base/odom', 'cmd_vel_topic': '/base/cmd_vel'})
+    return LaunchDescription([domain, include('demo.launch.py', {}), nodes,
+                              launch_testing.actions.ReadyToTest()])
 
 
 def include(name, arguments):
     """Include a launch file whose arguments stay its own."""
     from launch.actions import GroupAction, IncludeLaunchDescription
-    return GroupAction([IncludeLaunchDescription(str(LAUNCH / name), launch_arguments=arguments.items())])
+    return GroupAction(
+        [IncludeLaunchDescription(str(LAUNCH / name), launch_arguments=arguments.items())])
 
 
 def skip_where_not_installed():
@@ -75,14 +77,17 @@ class TestGraph(unittest.TestCase):
 
     def test_both_nodes_are_in_the_namespace(self):
         def names():
-            return {f'{namespace}/{name}' for name, namespace in self.node.get_node_names_and_namespaces()}
-        assert self.spin_until(lambda: {'/robot/driver_node', '/robot/compensation_node'} <= names()), names()
+            return {f'{namespace}/{name}'
+                    for name, namespace in self.node.get_node_names_and_namespaces()}
+        assert self.spin_until(
+            lambda: {'/robot/driver_node', '/robot/compensation_node'} <= names()), names()
 
     def test_a_launch_argument_goes_before_the_file(self):
         from rcl_interfaces.srv import GetParameters
         client = self.node.create_client(GetParameters, '/robot/driver_node/get_parameters')
         assert self.spin_until(client.service_is_ready), 'no driver'
-        answer = client.call_async(GetParameters.Request(names=['port', 'frame_id', 'use_sim_time']))
+        answer = client.call_async(
+            GetParameters.Request(names=['port', 'frame_id', 'use_sim_time']))
         assert self.spin_until(answer.done), 'no answer'
         port, frame, simulated = answer.result().values
         assert (port.string_value, frame.string_value) == ('/nonexistent/gyro', 'gyro_link')
@@ -90,14 +95,15 @@ class TestGraph(unittest.TestCase):
 
     def test_the_topics_of_a_shared_base_are_heard(self):
         for topic in ('/base/odom', '/base/cmd_vel'):
-            assert self.spin_until(lambda: self.node.count_subscribers(topic)), topic  # noqa: B023, at once
+            assert self.spin_until(lambda: self.node.count_subscribers(topic)), topic  # noqa: B023
 
     def test_the_heading_follows_the_raw_output(self):
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import Imu
         headings = self.headings('/robot/heading')
         publisher = self.node.create_publisher(Imu, '/robot/imu/data_raw', qos_profile_sensor_data)
-        assert self.spin_until(lambda: headings, lambda: publisher.publish(self.sample(Imu()))), 'no heading'
+        assert self.spin_until(lambda: headings,
+                               lambda: publisher.publish(self.sample(Imu()))), 'no heading'
 
     def test_the_demo_has_a_heading(self):
         headings = self.headings('/heading')
@@ -108,11 +114,12 @@ class TestGraph(unittest.TestCase):
         from geometry_msgs.msg import PoseWithCovarianceStamped
         from rclpy.qos import qos_profile_sensor_data
         headings = []
-        self.node.create_subscription(PoseWithCovarianceStamped, topic, headings.append, qos_profile_sensor_data)
+        self.node.create_subscription(PoseWithCovarianceStamped, topic, headings.append,
+                                      qos_profile_sensor_data)
         return headings
 
     def sample(self, message):
-        """Fill in a sample of now: 0.1 rad/s, and no acceleration or orientation, as REP-145 wants it said."""
+        """Fill in 0.1 rad/s now, and no acceleration or orientation in the form of REP-145."""
         message.header.stamp = self.node.get_clock().now().to_msg()
         message.angular_velocity.z = 0.1
         message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
@@ -123,7 +130,7 @@ class TestGraph(unittest.TestCase):
 class TestEnd(unittest.TestCase):
     """After SIGINT."""
 
-    __post_shutdown_test__ = True  # what the decorator launch_testing.post_shutdown_test() sets, without importing it
+    __post_shutdown_test__ = True  # as the decorator launch_testing.post_shutdown_test() sets
 
     def test_all_end_with_code_0(self, proc_info):
         import launch_testing.asserts

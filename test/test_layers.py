@@ -1,4 +1,4 @@
-"""The house: imports go in one direction, ROS 2 stays in the nodes, and the core neither prints nor opens sockets nor reads a clock."""
+"""Layers: imports go one way, ROS 2 stays in the nodes, the core has no I/O and reads no clock."""
 
 import ast
 import importlib
@@ -23,13 +23,15 @@ def imports(path):
     """Return the modules that a file imports, anywhere in it."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    return names + [f'{node.module}.{alias.name}' for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
+    return names + [f'{node.module}.{alias.name}'
+                    for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
 
 
 def own(names):
     """Return the modules of this package among imported names."""
     parts = [name.split('.') for name in names if name.startswith('gyro_calibration.')]
-    return {part[1] for part in parts if (PACKAGE / part[1]).is_dir() or (PACKAGE / f'{part[1]}.py').exists()}
+    return {part[1] for part in parts
+            if (PACKAGE / part[1]).is_dir() or (PACKAGE / f'{part[1]}.py').exists()}
 
 
 def files(module):
@@ -40,7 +42,8 @@ def files(module):
 
 def calls(path):
     """Return the names that a file calls without a dot."""
-    functions = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    functions = [node.func
+                 for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
     return {function.id for function in functions if isinstance(function, ast.Name)}
 
 
@@ -49,18 +52,23 @@ def test_a_module_imports_only_what_is_read_before_it(module):
     known = set(ORDER[:ORDER.index(module)]) | {'files', module}
     known |= {'demo', 'picture'} if module == 'cli' else set()
     paths = files(module)
-    assert paths and all(own(imports(path)) <= known for path in paths), [(path.name, own(imports(path)) - known) for path in paths]
+    assert paths and all(own(imports(path)) <= known for path in paths), [
+        (path.name, own(imports(path)) - known) for path in paths]
 
 
 @pytest.mark.parametrize('folder', ['effects', 'allan', 'dwells', 'diagnosis', 'driver', 'ros'])
 def test_a_file_of_a_folder_imports_only_what_is_read_before_it(folder):
-    order = re.findall(r'`(\w+)`', importlib.import_module(f'gyro_calibration.{folder}').__doc__.partition('Reading order')[2])
+    order = re.findall(r'`(\w+)`', importlib.import_module(
+        f'gyro_calibration.{folder}').__doc__.partition('Reading order')[2])
     inside = f'gyro_calibration.{folder}.'
-    assert sorted(order) == sorted(path.stem for path in (PACKAGE / folder).iterdir() if path.suffix == '.py' and path.stem != '__init__' or
-                                  path.is_dir() and path.stem != '__pycache__')
+    assert sorted(order) == sorted(path.stem for path in (PACKAGE / folder).iterdir()
+                                   if path.suffix == '.py' and path.stem != '__init__'
+                                   or path.is_dir() and path.stem != '__pycache__')
     for place, name in enumerate(order):
-        paths = [path for path in (PACKAGE / folder).rglob('*.py') if path.relative_to(PACKAGE / folder).parts[0] in (name, f'{name}.py')]
-        used = {each.removeprefix(inside).split('.')[0] for path in paths for each in imports(path) if each.startswith(inside)}
+        paths = [path for path in (PACKAGE / folder).rglob('*.py')
+                 if path.relative_to(PACKAGE / folder).parts[0] in (name, f'{name}.py')]
+        used = {each.removeprefix(inside).split('.')[0] for path in paths
+                for each in imports(path) if each.startswith(inside)}
         assert used & set(order) <= {name, *order[:place]}, (name, used)
 
 
@@ -79,10 +87,12 @@ def test_the_core_only_computes(module):
     for path in files(module):
         roots = {name.split('.')[0] for name in imports(path)}
         assert not re.search(r'\b(now|utcnow|today)\(\)', path.read_text()), path
-        assert not roots & OUTSIDE_WORLD and not calls(path) & {'print', 'input', 'exec', 'eval'}, path
+        assert (not roots & OUTSIDE_WORLD
+                and not calls(path) & {'print', 'input', 'exec', 'eval'}), path
 
 
 def test_no_random_number_comes_from_a_hidden_source():
     hidden = re.compile(r'np\.random\.(?!Generator)|default_rng')
-    found = [path.name for module in CORE for path in files(module) if hidden.search(path.read_text())]
+    found = [path.name for module in CORE
+             for path in files(module) if hidden.search(path.read_text())]
     assert not found

@@ -41,7 +41,7 @@ def policy():
 
 
 def field(message, names):
-    """Walk along the fields of a message; an array of messages is walked through by its element."""
+    """Return the field of a message at a path; an array stands for its element."""
     for name in names:
         assert hasattr(message, name), f'{type(message).__name__} has no {name}'
         message = getattr(message, name)
@@ -67,7 +67,6 @@ def check_path(path):
             message = float(message[int(index)])
 
 
-
 def test_the_topics_are_those_that_the_nodes_publish():
     assert set(TOPICS) <= policy()
 
@@ -81,7 +80,8 @@ def paths():
     return found
 
 
-@pytest.mark.parametrize('path', [path for path in paths() if not path.startswith('/studio_script/')])
+@pytest.mark.parametrize('path',
+                         [path for path in paths() if not path.startswith('/studio_script/')])
 def test_each_path_of_foxglove_exists(path):
     check_path(path)
 
@@ -93,8 +93,10 @@ def test_the_script_of_foxglove_reads_what_exists_and_gives_what_is_plotted():
     message = PoseWithCovarianceStamped()
     field(message, ['pose', 'pose', 'orientation', 'z'])
     assert len(message.pose.covariance) == 36 and 'pose.covariance[35]' in SCRIPT
-    given = set(re.findall(r'(\w+): number', SCRIPT.partition('type Output = ')[2].partition(';\n')[0]))
-    plotted = {path.removeprefix(f'{output}.') for path in paths() if path.startswith('/studio_script/')}
+    given = set(re.findall(r'(\w+): number',
+                           SCRIPT.partition('type Output = ')[2].partition(';\n')[0]))
+    plotted = {path.removeprefix(f'{output}.')
+               for path in paths() if path.startswith('/studio_script/')}
     assert plotted == given
 
 
@@ -105,12 +107,13 @@ def test_every_panel_of_foxglove_is_shown_once():
 
 
 def test_the_status_panels_of_foxglove_name_a_status():
-    chosen = [config['selectedName'] for config in FOXGLOVE['configById'].values() if 'selectedName' in config]
+    chosen = [config['selectedName']
+              for config in FOXGLOVE['configById'].values() if 'selectedName' in config]
     assert chosen and set(chosen) <= STATUSES
 
 
 def series_exists(name):
-    """Check a series by the names that PlotJuggler's ROS parser gives (read in its source, 2026)."""
+    """Check a series by the names of PlotJuggler's ROS parser (from its source, 2026)."""
     topic = max((topic for topic in TOPICS if name.startswith(f'{topic}/')), key=len)
     rest = name.removeprefix(f'{topic}/')
     if TOPICS[topic] is DiagnosticArray:
@@ -141,5 +144,6 @@ def test_plotjuggler_subscribes_to_what_it_shows():
     topics = PLOTJUGGLER.find('.//selected_topics').get('value').split(';')
     assert set(topics) <= set(TOPICS)
     shown = [element.text for element in PLOTJUGGLER.iter('linked_source')]
-    shown += [curve.get('name') for curve in PLOTJUGGLER.iter('curve') if curve.get('name').startswith('/')]
+    shown += [curve.get('name')
+              for curve in PLOTJUGGLER.iter('curve') if curve.get('name').startswith('/')]
     assert all(any(name.startswith(f'{topic}/') for topic in topics) for name in shown)

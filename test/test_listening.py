@@ -1,4 +1,4 @@
-"""Listening: each format is recognized from few bytes and never taken for another; noise and a wrong baud are none."""
+"""Listening: each format is recognized from few bytes; noise and a wrong baud match none."""
 
 import math
 import random
@@ -21,15 +21,17 @@ MOTIONS = {
 def frames(name, count, rate=MOTIONS['rest'], force=None):
     """Return what a device sends, one sample after the other."""
     encode = find(name).encoder(SETTINGS[name])
-    return [find(name).preamble, *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force)) for k in range(count))]
+    return [find(name).preamble, *(encode(Sample(rate(k), 20.0 + 0.01 * k, 0.01 * k, k, 0, force))
+                                   for k in range(count))]
 
 
 def received(data, ratio, idle=0):
     """
-    Return what a receiver makes of bytes, whose bits are ``ratio`` times shorter than those of the sender.
+    Return the bytes of a receiver whose bits are ``ratio`` times shorter than the sender's.
 
-    Each byte is 10 bits: low, the data from the lowest bit on, high. The receiver waits for a falling edge and takes the middle of each
-    of its bits; a missing stop bit, as in a break, it passes over, as terminals do in raw mode.
+    Each byte is 10 bits: low, the data from the lowest bit on, high. The receiver waits for a
+    falling edge and samples the middle of each of its bits; it ignores a missing stop bit, as in a
+    break, as terminals do in raw mode.
 
     """
     line = [1]
@@ -54,7 +56,8 @@ def test_every_format_is_recognized_from_five_samples_and_as_no_other(name, moti
     for force in (None, 9.8):
         recognition = recognize(b''.join(frames(name, 5, MOTIONS[motion], force)))
         assert recognition.protocol is find(name), recognition.words
-        assert recognition.explained > 0.99 and recognition.words.startswith(f'{name} explains 100% of')
+        assert (recognition.explained > 0.99
+                and recognition.words.startswith(f'{name} explains 100% of'))
 
 
 @pytest.mark.parametrize('name', ALL)
@@ -63,7 +66,8 @@ def test_it_does_not_matter_where_the_bytes_begin_and_end(name):
     generator = random.Random(1)
     length = len(data) // 8
     for _ in range(50):
-        recognition = recognize(data[generator.randrange(2 * length):-generator.randrange(1, length)])
+        recognition = recognize(
+            data[generator.randrange(2 * length):-generator.randrange(1, length)])
         assert recognition.protocol is find(name), recognition.words
 
 
@@ -73,7 +77,8 @@ def test_a_line_that_damages_a_byte_in_a_hundred_is_recognized(name):
     for place in generator.sample(range(len(data)), len(data) // 100):
         data[place] ^= 1 << generator.randrange(8)
     recognition = recognize(bytes(data))
-    assert recognition.protocol is find(name) and 0.5 < recognition.explained < 1.0, recognition.words
+    assert (recognition.protocol is find(name)
+            and 0.5 < recognition.explained < 1.0), recognition.words
 
 
 @pytest.mark.parametrize('name', ALL)
@@ -92,11 +97,12 @@ def test_a_wrong_baud_is_no_format(name, idle):
 
 
 def test_a_device_of_another_kind_is_no_format_at_any_baud():
-    """Frames with zeros in them come closest, since at a wrong baud they look like frames of the E-Core."""
+    """Frames with zeros come closest: at a wrong baud they look like frames of the E-Core."""
     generator = random.Random(7)
     for ratio in (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0):
         for _ in range(10):
-            content = bytes(generator.choice((0x00, 0x00, 0x01, 0x55, 0x80, 0xFF, 0xA5)) for _ in range(generator.randrange(4, 30)))
+            content = bytes(generator.choice((0x00, 0x00, 0x01, 0x55, 0x80, 0xFF, 0xA5))
+                            for _ in range(generator.randrange(4, 30)))
             data = b''.join(content + generator.randbytes(1) for _ in range(30))
             recognition = recognize(received(data[:400], ratio, generator.choice((0, 3, 30))))
             assert recognition.protocol is None, (ratio, content, recognition.words)
@@ -111,7 +117,8 @@ def test_frames_that_are_always_the_same_must_be_almost_all_there_is():
 
 def test_a_few_frames_in_much_noise_are_not_enough():
     recognition = recognize(random.Random(8).randbytes(4000) + b''.join(frames('fizoptika', 50)))
-    assert recognition.protocol is None and 'too few of which are frames of fizoptika' in recognition.words
+    assert (recognition.protocol is None
+            and 'too few of which are frames of fizoptika' in recognition.words)
 
 
 def test_noise_is_no_format():
@@ -130,14 +137,16 @@ def test_one_byte_again_and_again_is_no_format(byte):
 def test_nothing_and_little_are_said_to_be_that():
     assert recognize(b'').words == 'nothing came: check the power and the wires of the gyro'
     recognition = recognize(frames('kvh_1750', 1)[1])
-    assert recognition.protocol is None and recognition.frames == 1 and 'listen longer' in recognition.words
+    assert (recognition.protocol is None and recognition.frames == 1
+            and 'listen longer' in recognition.words)
 
 
 def test_two_formats_at_once_are_said_to_be_ambiguous():
     """Eleven frames of 8 bytes are as many bytes as eight frames of 11."""
     recognition = recognize(b''.join(frames('fizoptika', 11) + frames('witmotion', 8)))
     assert recognition.protocol is None and recognition.runner_up is not None
-    assert 'may be fizoptika or witmotion' in recognition.words or 'may be witmotion or fizoptika' in recognition.words
+    assert ('may be fizoptika or witmotion' in recognition.words
+            or 'may be witmotion or fizoptika' in recognition.words)
 
 
 def test_a_format_in_which_a_tenth_looks_like_another_is_recognized():
@@ -148,15 +157,18 @@ def test_a_format_in_which_a_tenth_looks_like_another_is_recognized():
 
 def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
     recognition = recognize(b'0.1,2.0,3.0,4.0\r\n' * 5)
-    assert recognition.protocol is None and 'lines of 4 numbers came, but columns names 3' in recognition.words
-    assert recognize(b'0.1,2.0,3.0,4.0\r\n' * 5, Settings(columns=('time_s', 'gyro_dps', 'a', 'b'))).protocol is find('csv')
+    assert (recognition.protocol is None
+            and 'lines of 4 numbers came, but columns names 3' in recognition.words)
+    assert recognize(b'0.1,2.0,3.0,4.0\r\n' * 5,
+                     Settings(columns=('time_s', 'gyro_dps', 'a', 'b'))).protocol is find('csv')
     assert recognize(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol is find('csv')
 
 
 def test_columns_that_do_not_fit_are_told_although_noise_at_another_baud_may_look_like_frames():
-    """At a wrong baud text makes some frames of the E-Core; what is said of all bauds is what explains most."""
+    """At a wrong baud, text makes some E-Core frames; the baud that explains most is reported."""
     data = b''.join(b'%d,%f,3.5,4.25\n' % (10 * k, math.sin(k)) for k in range(100))
-    wrong = [recognize(received(data, baud / find('csv').baud)) for baud in set(BAUDS) - {find('csv').baud}]
+    wrong = [recognize(received(data, baud / find('csv').baud))
+             for baud in set(BAUDS) - {find('csv').baud}]
     assert max(each.explained for each in wrong) > 0.0
     assert recognize(data).explained > max(each.explained for each in wrong)
 
