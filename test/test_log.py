@@ -1,4 +1,4 @@
-"""Logs as files: what comes in, in which unit, and what is refused. The claims are those of the log format."""
+"""Logs as files: their columns, their units, and what is refused, as the log format states."""
 
 import gzip
 import math
@@ -6,7 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from gyro_calibration.log import Log, LogError, read_log, read_log_blocks, write_log, write_log_blocks
+from gyro_calibration.log import (
+    Log,
+    LogError,
+    read_log,
+    read_log_blocks,
+    write_log,
+    write_log_blocks,
+)
 
 DEGREE = math.pi / 180.0
 
@@ -19,13 +26,18 @@ def written(folder, text, name='log.csv'):
 
 
 @pytest.mark.parametrize('column, attribute, factor', [
-    ('gyro_dps', 'output', DEGREE), ('gyro_rad_s', 'output', 1.0), ('gyro_counts', 'counts', 1.0), ('temperature_degc', 'temperature', 1.0),
-    ('reference_rate_dps', 'reference_rate', DEGREE), ('reference_rate_rad_s', 'reference_rate', 1.0),
-    ('reference_heading_deg', 'reference_heading', DEGREE), ('reference_heading_rad', 'reference_heading', 1.0),
-    ('acceleration_mps2', 'specific_force', 1.0), ('supply_v', 'supply', 1.0), ('moving', 'moving', 1.0)])
+    ('gyro_dps', 'output', DEGREE), ('gyro_rad_s', 'output', 1.0), ('gyro_counts', 'counts', 1.0),
+    ('temperature_degc', 'temperature', 1.0),
+    ('reference_rate_dps', 'reference_rate', DEGREE),
+    ('reference_rate_rad_s', 'reference_rate', 1.0),
+    ('reference_heading_deg', 'reference_heading', DEGREE),
+    ('reference_heading_rad', 'reference_heading', 1.0),
+    ('acceleration_mps2', 'specific_force', 1.0), ('supply_v', 'supply', 1.0),
+    ('moving', 'moving', 1.0)])
 def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
     gyro = '' if 'gyro' in column else 'gyro_rad_s,'
-    rows = ''.join(f'{"0," if gyro else ""}{value},{second}\n' for second, value in enumerate([1, 0, 2.5]))
+    rows = ''.join(f'{"0," if gyro else ""}{value},{second}\n'
+                   for second, value in enumerate([1, 0, 2.5]))
     log = read_log(written(tmp_path, f'{gyro}{column},time_s\n{rows}'))
     assert getattr(log, attribute).tolist() == [1 * factor, 0, 2.5 * factor]
     assert log.time.tolist() == [0, 1, 2] and len(log) == 3
@@ -33,39 +45,59 @@ def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
 
 def test_counts_become_rates_by_the_sensitivity(tmp_path):
     log = read_log(written(tmp_path, 'gyro_counts\n100\n-50\n'), sensitivity=0.01)
-    assert log.output.tolist() == [1.0, -0.5] and log.counts.tolist() == [100, -50] and log.time is None
+    assert (log.output.tolist() == [1.0, -0.5] and log.counts.tolist() == [100, -50]
+            and log.time is None)
 
 
 REFUSED = {
     'empty': ('', 'line 1 is no header'),
     'only notes': ('# a\n# b\n', 'line 3 is no header'),
     'no header': ('# note\n0.0,1.0\n0.1,1.0\n', 'line 2 is no header'),
-    'no gyro': ('time_s,temperature_degc\n0,1\n1,1\n', 'no gyro column among time_s,temperature_degc'),
-    'two columns': ('gyro_dps,gyro_rad_s\n0,1\n1,1\n', 'columns gyro_dps and gyro_rad_s both give the output'),
+    'no gyro': ('time_s,temperature_degc\n0,1\n1,1\n',
+                'no gyro column among time_s,temperature_degc'),
+    'two columns': ('gyro_dps,gyro_rad_s\n0,1\n1,1\n',
+                    'columns gyro_dps and gyro_rad_s both give the output'),
     'twice the same': ('gyro_dps,gyro_dps\n0,1\n1,1\n', 'columns gyro_dps and gyro_dps both'),
-    'text': ('# note\ntime_s,gyro_dps\n0,1\n1,fast\n', "line 4, column gyro_dps: 'fast' is not a number"),
+    'text': ('# note\ntime_s,gyro_dps\n0,1\n1,fast\n',
+             "line 4, column gyro_dps: 'fast' is not a number"),
     'nothing': ('time_s,gyro_dps\n0,1\n1,\n', "line 3, column gyro_dps: '' is not a number"),
-    'an empty line between': ('time_s,gyro_dps\n0,1\n\n1,1\n', 'line 3 has 0 values where the header has 2'),
-    'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n', 'line 4, column time_s: 1 s does not come after 1 s'),
-    'goes back': ('time_s,gyro_dps\n0,1\n1,1\n0.5,1\n', 'line 4, column time_s: 0.5 s does not come after 1 s'),
-    'lost time': ('time_s,gyro_dps\n0,1\nnan,1\n2,1\n', 'line 3, column time_s: nan is not a finite number'),
-    'lost temperature': ('gyro_dps,temperature_degc\n0,20\n1,nan\n', 'line 3, column temperature_degc: nan is not a finite number'),
-    'infinite': ('time_s,gyro_dps\n0,1\n1,-inf\n', 'line 3, column gyro_dps: -inf is not a finite number'),
-    'infinite reference': ('gyro_dps,reference_heading_deg\n0,1\n1,inf\n', 'line 3, column reference_heading_deg'),
+    'an empty line between': ('time_s,gyro_dps\n0,1\n\n1,1\n',
+                              'line 3 has 0 values where the header has 2'),
+    'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n',
+               'line 4, column time_s: 1 s does not come after 1 s'),
+    'goes back': ('time_s,gyro_dps\n0,1\n1,1\n0.5,1\n',
+                  'line 4, column time_s: 0.5 s does not come after 1 s'),
+    'lost time': ('time_s,gyro_dps\n0,1\nnan,1\n2,1\n',
+                  'line 3, column time_s: nan is not a finite number'),
+    'lost temperature': ('gyro_dps,temperature_degc\n0,20\n1,nan\n',
+                         'line 3, column temperature_degc: nan is not a finite number'),
+    'infinite': ('time_s,gyro_dps\n0,1\n1,-inf\n',
+                 'line 3, column gyro_dps: -inf is not a finite number'),
+    'infinite reference': ('gyro_dps,reference_heading_deg\n0,1\n1,inf\n',
+                           'line 3, column reference_heading_deg'),
     'one row': ('gyro_dps\n0\n', '1 rows of data'),
     'short row': ('time_s,gyro_dps\n0,1\n1\n', 'line 3 has 1 values where the header has 2'),
     'long row': ('time_s,gyro_dps\n0,1\n1,2,3\n', 'line 3 has 3 values where the header has 2'),
-    'text after a text': ('gyro_dps,place\n0,"a\nb"\n1,c\nfast,d\n', "line 5, column gyro_dps: 'fast' is not a number"),
-    'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000, 'cannot be read as a log'),
+    'text after a text': ('gyro_dps,place\n0,"a\nb"\n1,c\nfast,d\n',
+                          "line 5, column gyro_dps: 'fast' is not a number"),
+    'a text without end': ('gyro_dps,place\n0,a\n1,"b\n2,c\n' + '3,d\n' * 50000,
+                           'cannot be read as a log'),
     'binary': (bytes(range(256)), 'cannot be read as a log'),
-    'beyond a gyro': ('time_s,gyro_dps\n0,1\n1,1e300\n', 'line 3, column gyro_dps: 1e300 is beyond 1e+20, which no gyro means; remove the'),
-    'no time between': ('time_s,gyro_dps\n0,1\n1e-300,1\n', 'line 3, column time_s: 1e-300 s does not come after 0 s'),
+    'beyond a gyro': (
+        'time_s,gyro_dps\n0,1\n1,1e300\n',
+        'line 3, column gyro_dps: 1e300 is beyond 1e+20, which no gyro means; remove the'),
+    'no time between': ('time_s,gyro_dps\n0,1\n1e-300,1\n',
+                        'line 3, column time_s: 1e-300 s does not come after 0 s'),
     'a text of lines': ('gyro_dps,place\n1,a\n"1\n\n2",b\n', "'1\\n\\n2' is not a number"),
     'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a\\nb,time_s;'),
-    'a header of 30 000 columns': ('time_s,' + 'x,' * 30000 + '\n1,1\n', 'no gyro column among time_s,x'),
-    'an endless line': ('gyro_dps\n' + '1,' * 40000 + '\n1\n', 'a line has more than 65536 characters'),
-    'an endless row': ('gyro_dps,place\n1,"' + 'a\nb","' * 3_500_000 + '\n', 'has more than 16777216 characters'),
-    'endless notes': ('#\n' * 600_000 + 'gyro_dps\n1\n2\n', 'before the first, has more than 1048576 characters'),
+    'a header of 30 000 columns': ('time_s,' + 'x,' * 30000 + '\n1,1\n',
+                                   'no gyro column among time_s,x'),
+    'an endless line': ('gyro_dps\n' + '1,' * 40000 + '\n1\n',
+                        'a line has more than 65536 characters'),
+    'an endless row': ('gyro_dps,place\n1,"' + 'a\nb","' * 3_500_000 + '\n',
+                       'has more than 16777216 characters'),
+    'endless notes': ('#\n' * 600_000 + 'gyro_dps\n1\n2\n',
+                      'before the first, has more than 1048576 characters'),
     'one endless field': ('gyro_dps\n' + '1' * 200000 + '\n1\n', 'cannot be read as a log'),
 }
 
@@ -92,7 +124,8 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize('read', [read_log, read_in_pairs])
 @pytest.mark.parametrize('path', ['/dev/zero', '/dev/null', '.'])
 def test_a_device_or_a_folder_is_no_log(path, read):
-    with pytest.raises(LogError, match='it is a (device|folder), where a file or a pipe is wanted'):
+    with pytest.raises(LogError,
+                       match='it is a (device|folder), where a file or a pipe is wanted'):
         read(path)
 
 
@@ -108,7 +141,8 @@ def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeyp
 
 def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('gyro_calibration.log._WHOLE', 100)
-    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
+    path = written(tmp_path,
+                   'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
     with pytest.raises(LogError, match='more than 100 numbers.*; cut it into pieces'):
         read_log(path)
     assert len(list(read_log_blocks(path))[0]) == 51
@@ -119,7 +153,8 @@ def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
     log = read_log(path)
     write_log(path, Log(log.output, notes=('one\rtwo\nthree',), others=log.others))
     again = read_log(path)
-    assert again.notes == ('one two three',) and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')}
+    assert (again.notes == ('one two three',)
+            and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')})
 
 
 @pytest.mark.parametrize('cut', [0, 5, -3])
@@ -130,8 +165,10 @@ def test_a_broken_compressed_file_is_refused(tmp_path, cut):
 
 
 def test_a_lost_reference_is_nan(tmp_path):
-    log = read_log(written(tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,nan\n2,180,NaN\n'))
-    assert np.isnan(log.reference_rate).tolist() == [True, False] and np.isnan(log.reference_heading).all()
+    log = read_log(written(
+        tmp_path, 'gyro_dps,reference_rate_dps,reference_heading_deg\n1,nan,nan\n2,180,NaN\n'))
+    assert (np.isnan(log.reference_rate).tolist() == [True, False]
+            and np.isnan(log.reference_heading).all())
 
 
 def test_empty_lines_at_the_end_are_no_rows(tmp_path):
@@ -139,36 +176,43 @@ def test_empty_lines_at_the_end_are_no_rows(tmp_path):
 
 
 def test_a_byte_order_mark_hides_no_column(tmp_path):
-    assert read_log(written(tmp_path, '\ufefftime_s,gyro_dps\r\n0,1\r\n1,1\r\n')).time.tolist() == [0, 1]
+    assert (read_log(written(tmp_path, '\ufefftime_s,gyro_dps\r\n0,1\r\n1,1\r\n')).time.tolist()
+            == [0, 1])
 
 
 @pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
 def test_a_log_is_read_back_as_it_was_written(tmp_path, name):
     generator = np.random.default_rng(0)
-    names = ['output', 'counts', 'temperature', 'reference_rate', 'reference_heading', 'specific_force', 'supply', 'moving']
-    log = Log(time=np.cumsum(generator.random(50)), **{quantity: generator.normal(size=50) for quantity in names}, notes=('a', 'b, c'))
+    names = ['output', 'counts', 'temperature', 'reference_rate', 'reference_heading',
+             'specific_force', 'supply', 'moving']
+    log = Log(time=np.cumsum(generator.random(50)),
+              **{quantity: generator.normal(size=50) for quantity in names}, notes=('a', 'b, c'))
     write_log(tmp_path / name, log)
     again = read_log(tmp_path / name)
     assert again.notes == log.notes
-    assert all(np.array_equal(getattr(again, quantity), getattr(log, quantity)) for quantity in ['time', *names])
+    assert all(np.array_equal(getattr(again, quantity), getattr(log, quantity))
+               for quantity in ['time', *names])
 
 
 def test_columns_that_are_not_ours_are_kept(tmp_path):
     path = written(tmp_path, '# note\noperator,gyro_dps,lap\nAnn,1,"1, 2"\nBob,2,\n')
     write_log(path, read_log(path), {'heading_rad': np.array([0.5, 1.0])})
     again = read_log(path)
-    assert again.others == {'operator': ('Ann', 'Bob'), 'lap': ('1, 2', ''), 'heading_rad': ('0.5', '1.0')}
+    assert again.others == {'operator': ('Ann', 'Bob'), 'lap': ('1, 2', ''),
+                            'heading_rad': ('0.5', '1.0')}
     assert path.read_text().splitlines()[0] == '# note'
 
 
 def test_blocks_are_the_log_piece_by_piece(tmp_path):
-    rows = ''.join(f'{second / 10},{second % 7},"lap, {second}\n of many"\n' for second in range(11))
+    rows = ''.join(f'{second / 10},{second % 7},"lap, {second}\n of many"\n'
+                   for second in range(11))
     path = written(tmp_path, f'# note\ntime_s,gyro_dps,lap\n{rows}\n\n')
     whole, blocks = read_log(path), list(read_log_blocks(path, rows=3))
     assert [len(block) for block in blocks] == [2, 2, 2, 2, 2, 1], 'a row here is two lines'
     assert np.concatenate([block.output for block in blocks]).tolist() == whole.output.tolist()
     assert np.concatenate([block.time for block in blocks]).tolist() == whole.time.tolist()
-    assert sum((block.others['lap'] for block in blocks), ()) == whole.others['lap'] == tuple(f'lap, {n}\n of many' for n in range(11))
+    assert sum((block.others['lap'] for block in blocks), ()) == whole.others['lap'] == tuple(
+        f'lap, {n}\n of many' for n in range(11))
     assert {block.notes for block in blocks} == {('note',)}
 
 
@@ -181,31 +225,38 @@ def test_a_row_that_is_longer_than_a_block_is_not_lost(tmp_path):
 def test_samples_at_a_rate_go_on_from_block_to_block(tmp_path):
     path = written(tmp_path, 'gyro_counts\n' + '1\n' * 7)
     blocks = list(read_log_blocks(path, sensitivity=0.5, rate=100.0, rows=3))
-    assert np.concatenate([block.time for block in blocks]).tolist() == (np.arange(7) / 100.0).tolist()
+    assert (np.concatenate([block.time for block in blocks]).tolist()
+            == (np.arange(7) / 100.0).tolist())
     assert [block.output.tolist() for block in blocks] == [[0.5] * 3, [0.5] * 3, [0.5]]
 
 
 def test_of_strangers_with_one_name_none_is_lost(tmp_path):
     log = read_log(written(tmp_path, 'gyro_dps,lap,lap,lap.1,,\n0,a,b,c,d,e\n1,f,g,h,i,j\n'))
-    assert log.others == {'lap': ('a', 'f'), 'lap.2': ('b', 'g'), 'lap.1': ('c', 'h'), '': ('d', 'i'), '.1': ('e', 'j')}
+    assert log.others == {'lap': ('a', 'f'), 'lap.2': ('b', 'g'), 'lap.1': ('c', 'h'),
+                          '': ('d', 'i'), '.1': ('e', 'j')}
     write_log(tmp_path / 'again.csv', log)
     assert read_log(tmp_path / 'again.csv').others == log.others
 
 
-@pytest.mark.parametrize('stamps', [['nan', 'nan', 'nan'], ['', '', ''], ['12:01', '12:01', '12:00'], ['2', '1', '0']], ids=','.join)
+@pytest.mark.parametrize('stamps', [['nan', 'nan', 'nan'], ['', '', ''],
+                                    ['12:01', '12:01', '12:00'], ['2', '1', '0']], ids=','.join)
 def test_at_a_rate_the_stamps_may_be_broken(tmp_path, stamps):
-    path = written(tmp_path, 'time_s,gyro_rad_s\n' + ''.join(f'{stamp},{row}\n' for row, stamp in enumerate(stamps)))
+    path = written(tmp_path, 'time_s,gyro_rad_s\n' + ''.join(f'{stamp},{row}\n'
+                                                             for row, stamp in enumerate(stamps)))
     log = read_log(path, rate=10.0)
-    assert log.time.tolist() == [0.0, 0.1, 0.2] and log.output.tolist() == [0.0, 1.0, 2.0] and not log.others
+    assert (log.time.tolist() == [0.0, 0.1, 0.2] and log.output.tolist() == [0.0, 1.0, 2.0]
+            and not log.others)
     with pytest.raises(LogError, match='column time_s'):
         read_log(path)
 
 
 def test_numbers_are_the_same_whether_other_columns_stand_beside_them_or_not(tmp_path):
     """Columns of text are read by another parser than columns of numbers alone."""
-    texts = ['1', '-0.1', '1e-7', ' 2.5 ', '+3', 'nan', '0.1000000000000000055511151231257827', '12345678901234567890', '.5', '5.', '1_0']
+    texts = ['1', '-0.1', '1e-7', ' 2.5 ', '+3', 'nan', '0.1000000000000000055511151231257827',
+             '12345678901234567890', '.5', '5.', '1_0']
     alone = read_log(written(tmp_path, 'gyro_rad_s\n' + ''.join(f'{text}\n' for text in texts)))
-    beside = read_log(written(tmp_path, 'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
+    beside = read_log(written(tmp_path,
+                              'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
     assert np.array_equal(alone.output, beside.output, equal_nan=True)
     assert np.array_equal(alone.output, [float(text) for text in texts], equal_nan=True)
 
@@ -221,13 +272,14 @@ def test_the_reader_says_how_far_it_is(tmp_path, name):
 @pytest.mark.parametrize('name', ['log.csv', 'log.csv.gz'])
 def test_a_log_written_in_blocks_is_the_log_written_at_once(tmp_path, name):
     generator = np.random.default_rng(0)
-    log = Log(output=generator.normal(size=9), time=np.arange(9.0), notes=('a',), others={'lap': tuple('abcdefghi')})
+    log = Log(output=generator.normal(size=9), time=np.arange(9.0), notes=('a',),
+              others={'lap': tuple('abcdefghi')})
     more = generator.normal(size=9)
     write_log(tmp_path / f'whole_{name}', log, {'rate_rad_s': more})
     pieces = [slice(0, 4), slice(4, 5), slice(5, 9)]
-    write_log_blocks(tmp_path / name, (
-        (Log(log.output[here], time=log.time[here], notes=('a',), others={'lap': log.others['lap'][here]}), {'rate_rad_s': more[here]})
-        for here in pieces))
+    write_log_blocks(tmp_path / name, ((Log(log.output[here], time=log.time[here], notes=('a',),
+                                            others={'lap': log.others['lap'][here]}),
+                                        {'rate_rad_s': more[here]}) for here in pieces))
     assert read_log(tmp_path / name).others == read_log(tmp_path / f'whole_{name}').others
     opened = gzip.open if name.endswith('.gz') else open
     assert opened(tmp_path / name).read() == opened(tmp_path / f'whole_{name}').read()
@@ -243,7 +295,8 @@ def test_a_log_that_breaks_off_leaves_the_old_file_and_nothing_else(tmp_path, na
         raise LogError('line 1001 is no row')
     with pytest.raises(LogError, match='line 1001'):
         write_log_blocks(tmp_path / name, blocks())
-    assert (tmp_path / name).read_bytes() == before and [path.name for path in tmp_path.iterdir()] == [name]
+    assert ((tmp_path / name).read_bytes() == before
+            and [path.name for path in tmp_path.iterdir()] == [name])
 
 
 def test_the_same_log_gives_the_same_compressed_file(tmp_path):

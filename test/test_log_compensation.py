@@ -1,4 +1,4 @@
-"""A log with its surroundings through the compensation: in one piece, in blocks, as a stream; with a heading, and without one."""
+"""Compensation of logs with surroundings: in one piece, in blocks, and as a stream."""
 
 from dataclasses import replace
 
@@ -16,9 +16,12 @@ from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.simulation import respond
 
 VALUES = {
-    'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05), 'thermal_lag': (120.0, -2e-3),
-    'thermal_hysteresis': (10.0, 2e-3, 3e-4), 'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,), 'bias_step': (200.0, -1e-3),
-    'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4), 'supply_sensitivity': (5.0, 4e-4),
+    'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),
+    'thermal_lag': (120.0, -2e-3),
+    'thermal_hysteresis': (10.0, 2e-3, 3e-4), 'warm_up': (300.0, 0.004), 'rate_ramp': (2e-7,),
+    'bias_step': (200.0, -1e-3),
+    'acceleration_sensitivity': (1e-4,), 'vibration_rectification': (1.0, 2e-4),
+    'supply_sensitivity': (5.0, 4e-4),
     'interference_tone': (0.07, 3e-4, -2e-4)}
 HEADING = {'heading_sensitivity': (1e-3, -5e-4)}
 TIME = np.arange(0.0, 900.0, 0.05) + np.random.default_rng(0).uniform(0.0, 0.02, 18000)
@@ -31,9 +34,11 @@ def model_of(values, **more):
 def drive(model, motion=lambda time: 0.5 * np.sin(time / 7.0)):
     """Return a log of a gyro that is driven, heated and cooled, and shaken."""
     rate = motion(TIME)
-    log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0), reference_rate=rate,
-              reference_heading=integrate(TIME, rate), supply=5.0 + 0.2 * np.sin(TIME / 40.0),
-              specific_force=np.where(TIME > 400.0, 2.0, 0.1) * np.random.default_rng(1).standard_normal(len(TIME)))
+    log = Log(output=rate, time=TIME, temperature=30.0 + 15.0 * np.abs(1.0 - TIME / 300.0),
+              reference_rate=rate, reference_heading=integrate(TIME, rate),
+              supply=5.0 + 0.2 * np.sin(TIME / 40.0),
+              specific_force=(np.where(TIME > 400.0, 2.0, 0.1)
+                              * np.random.default_rng(1).standard_normal(len(TIME))))
     return replace(log, output=respond(model, TIME, channels_of(log).moving(rate, rate)))
 
 
@@ -52,9 +57,12 @@ def test_blocks_are_compensated_as_the_whole(size):
         log = rows_of(log, np.arange(600))
     whole, sensitivity = LogCompensation(model).add(log)
     compensation = LogCompensation(model)
-    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size])) for first in range(0, len(log), size)]
-    np.testing.assert_allclose(np.concatenate([part.rate for part, _ in parts]), whole.rate, rtol=0.0, atol=1e-13)
-    np.testing.assert_allclose(np.hstack([rows for _, rows in parts]), sensitivity, rtol=1e-6, atol=1e-9)
+    parts = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))
+             for first in range(0, len(log), size)]
+    np.testing.assert_allclose(np.concatenate([part.rate for part, _ in parts]), whole.rate,
+                               rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(np.hstack([rows for _, rows in parts]), sensitivity,
+                               rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize('size', [700, 18000])
@@ -62,7 +70,8 @@ def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
     model = model_of(HEADING | {'scale_factor_error': (0.01,)})
     log = replace(drive(model), reference_heading=None)
     compensation = LogCompensation(model)
-    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate for first in range(0, len(log), size)]
+    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate
+             for first in range(0, len(log), size)]
     assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-8)
     plain = compensate_log(model_of({'scale_factor_error': (0.01,)}), log)
     assert np.abs(plain - log.reference_rate).max() > 1e-3, 'the heading did not matter'
@@ -71,20 +80,25 @@ def test_a_heading_that_nobody_measured_is_found_meanwhile(size):
 def test_a_reference_heading_that_is_lost_for_a_while_is_bridged():
     model = model_of(HEADING)
     log = drive(model)
-    torn = replace(log, reference_heading=np.where((TIME > 100.0) & (TIME < 100.5), np.nan, log.reference_heading))
+    torn = replace(log, reference_heading=np.where((TIME > 100.0) & (TIME < 100.5), np.nan,
+                                                   log.reference_heading))
     assert compensate_log(model, torn) == pytest.approx(log.reference_rate, abs=1e-5)
 
 
 @pytest.mark.parametrize('size', [500, 700, 5000, 18000])
-def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_blocks_as_in_one_piece(size):
+def test_a_reference_heading_that_is_lost_for_long_goes_on_by_the_rates_in_blocks_as_in_one_piece(
+        size):
     model = model_of(HEADING | {'scale_factor_error': (0.01,)})
     log = drive(model)
     turned = replace(log, reference_heading=1.5 + log.reference_heading)
-    output = respond(model, TIME, channels_of(turned).moving(log.reference_rate, log.reference_rate))
+    output = respond(model, TIME,
+                     channels_of(turned).moving(log.reference_rate, log.reference_rate))
     lost = (TIME > 0.1) & (TIME < 0.2) | (TIME > 100.0) & (TIME < 400.1) | (TIME > 800.0)
-    log = replace(turned, output=output, reference_heading=np.where(lost, np.nan, turned.reference_heading))
+    log = replace(turned, output=output,
+                  reference_heading=np.where(lost, np.nan, turned.reference_heading))
     compensation = LogCompensation(model)
-    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate for first in range(0, len(log), size)]
+    rates = [compensation.add(rows_of(log, np.arange(len(log))[first:first + size]))[0].rate
+             for first in range(0, len(log), size)]
     assert np.concatenate(rates) == pytest.approx(log.reference_rate, abs=1e-6)
 
 
@@ -92,7 +106,8 @@ def test_before_its_first_value_a_reference_heading_is_that_value():
     model = model_of(HEADING)
     log = drive(model, lambda time: 0.0 * time)
     heading = np.full(len(TIME), 1.5)
-    output = respond(model, TIME, channels_of(replace(log, reference_heading=heading)).moving(log.reference_rate, log.reference_rate))
+    output = respond(model, TIME, channels_of(replace(log, reference_heading=heading)).moving(
+        log.reference_rate, log.reference_rate))
     late = replace(log, output=output, reference_heading=np.where(TIME < 5.0, np.nan, heading))
     assert compensate_log(model, late) == pytest.approx(log.reference_rate, abs=1e-10)
 
@@ -101,16 +116,19 @@ def test_rows_without_output_are_left_out(tmp_path, run):
     model = model_of(VALUES | HEADING)
     log = drive(model)
     write_model(tmp_path / 'model.yaml', model)
-    write_log(tmp_path / 'log.csv', replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output)))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    write_log(tmp_path / 'log.csv',
+              replace(log, output=np.where(np.arange(len(log)) % 1000 == 7, np.nan, log.output)))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+                        '--out', tmp_path / 'out.csv')
     rate = np.array(read_log(tmp_path / 'out.csv').others['rate_rad_s'], float)
     assert code == 0 and '18 rows have no output' in text
     assert np.isnan(rate).sum() == 18 and np.nanmax(np.abs(rate - log.reference_rate)) < 1e-3
-    assert np.array_equal(compensate_log(model, read_log(tmp_path / 'log.csv')), rate, equal_nan=True)
+    assert np.array_equal(compensate_log(model, read_log(tmp_path / 'log.csv')), rate,
+                          equal_nan=True)
 
 
 def test_the_uncertainty_of_a_time_constant_goes_into_the_rate():
-    """Against the difference between models whose time constant differs by a standard deviation."""
+    """Compare with models whose time constants differ by one standard deviation."""
     model = model_of({'thermal_lag': (120.0, -2e-3)}, covariance=np.diag([4.0, 0.0]))
     log = drive(model)
     result, sensitivity = LogCompensation(model).add(log)
@@ -125,36 +143,48 @@ def test_the_verb_compensates_by_the_surroundings_of_a_log(tmp_path, run):
     write_model(tmp_path / 'model.yaml', model)
     assert read_model(tmp_path / 'model.yaml').terms == model.terms
     write_log(tmp_path / 'log.csv', drive(model))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+                        '--out', tmp_path / 'out.csv')
     done = read_log(tmp_path / 'out.csv')
     assert code == 0 and 'no reference heading' not in text
-    assert np.array(done.others['rate_rad_s'], float) == pytest.approx(done.reference_rate, abs=1e-10)
-    assert np.array(done.others['heading_rad'], float) == pytest.approx(done.reference_heading, abs=1e-7)
+    assert np.array(done.others['rate_rad_s'], float) == pytest.approx(
+        done.reference_rate, abs=1e-10)
+    assert np.array(done.others['heading_rad'], float) == pytest.approx(
+        done.reference_heading, abs=1e-7)
 
 
 def test_the_verb_says_what_it_lacks_and_what_it_cannot_undo(tmp_path, run):
-    (tmp_path / 'model.yaml').write_text('effects: {supply_sensitivity: {supply_sensitivity: 1.0e-4}, time_offset: {time_offset: 0.02},'
-                                         'heading_sensitivity: {sine: 0.0, cosine: 0.0}, saturation: {saturation: 1.0}}')
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {supply_sensitivity: {supply_sensitivity: 1.0e-4}, '
+        'time_offset: {time_offset: 0.02},heading_sensitivity: {sine: 0.0, cosine: 0.0}, '
+        'saturation: {saturation: 1.0}}')
     log = drive(GyroModel())
     write_log(tmp_path / 'log.csv', replace(log, supply=None, reference_heading=None))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
-    assert code == 0 and all(words in text for words in ('no supply voltage', 'no reference heading', 'saturation: At the limit'))
+    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+                        '--out', tmp_path / 'out.csv')
+    assert code == 0 and all(words in text for words in (
+        'no supply voltage', 'no reference heading', 'saturation: At the limit'))
 
 
-@pytest.mark.parametrize('name, value', [('time_offset', 0.03), ('time_offset', -0.03), ('clock_rate', 2e-3)])
-def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_time(tmp_path, run, name, value):
-    """Over the border between blocks too; at the ends a little is not known, and between samples rates are taken for linear."""
+@pytest.mark.parametrize('name, value',
+                         [('time_offset', 0.03), ('time_offset', -0.03), ('clock_rate', 2e-3)])
+def test_rates_and_headings_of_a_late_gyro_stand_beside_the_reference_of_their_time(
+        tmp_path, run, name, value):
+    """Across block borders too; rates between samples are linear, and the ends are left out."""
     model, time = model_of({name: (value,)}), np.arange(70_000) * 0.01
     rate = np.sin(1.3 * time)
-    log = Log(output=rate, time=time + 50.0, reference_rate=rate, reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
+    log = Log(output=rate, time=time + 50.0, reference_rate=rate,
+              reference_heading=(1.0 - np.cos(1.3 * time)) / 1.3)
     log = replace(log, output=respond(model, time, channels_of(log).moving(rate, rate)))
     write_model(tmp_path / 'model.yaml', model)
     write_log(tmp_path / 'log.csv', log)
-    code, *_ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv')
+    code, *_ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+                   '--out', tmp_path / 'out.csv')
     done, inside = read_log(tmp_path / 'out.csv'), slice(10, -200)
     heading = np.array(done.others['heading_rad'], float) - done.reference_heading
     assert code == 0 and 'true_time' not in done.others
-    assert np.abs(np.array(done.others['rate_rad_s'], float) - rate)[inside].max() < 1e-4 < np.abs(log.output - rate).max()
+    assert (np.abs(np.array(done.others['rate_rad_s'], float) - rate)[inside].max() < 1e-4
+            < np.abs(log.output - rate).max())
     assert np.ptp(heading[inside]) < 5e-4
 
 
@@ -164,5 +194,6 @@ def test_a_million_samples_that_look_around_take_seconds_and_not_minutes():
     time = np.arange(count) * 0.01
     log = Log(output=np.sin(time), time=time, temperature=25.0 + np.sin(time / 500.0))
     begin = clock.process_time()
-    compensate_log(model_of({'thermal_lag': (120.0, -2e-3), 'warm_up': (300.0, 0.004)} | HEADING), log)
+    compensate_log(model_of({'thermal_lag': (120.0, -2e-3), 'warm_up': (300.0, 0.004)} | HEADING),
+                   log)
     assert clock.process_time() - begin < 6.0

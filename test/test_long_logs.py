@@ -1,4 +1,4 @@
-"""Logs of any length: the verb compensate takes them block by block, and needs no more memory for a longer one."""
+"""Logs of any length: compensate reads them in blocks, with memory independent of the length."""
 
 import itertools
 import math
@@ -12,14 +12,14 @@ from gyro_calibration.cli.main import main
 from gyro_calibration.log import Log, read_log, read_log_blocks, write_log
 from gyro_calibration.motion import ROBOT
 
-MODEL = """
-effects:
-  rate_temperature_polynomial:
-    matrix_dps: [[2.0e-10, -3.0e-9, 1.0e-6, -2.0e-5], [-1.0e-8, 2.0e-7, -4.0e-5, 2.0e-3], [3.0e-7, -4.0e-6, 4.0e-3, -0.05]]
-valid: {rate: [-0.8, 0.8], temperature: [26.0, 45.0]}
-noise: {angle_random_walk: 7.3e-4}
-self_calibration: {scale_factor_error: 0.01, bias: 0.001, covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}
-"""
+MODEL = (
+    '\neffects:\n  rate_temperature_polynomial:\n'
+    '    matrix_dps: [[2.0e-10, -3.0e-9, 1.0e-6, -2.0e-5], [-1.0e-8, 2.0e-7, -4.0e-5, 2.0e-3], '
+    '[3.0e-7, -4.0e-6, 4.0e-3, -0.05]]\n'
+    'valid: {rate: [-0.8, 0.8], temperature: [26.0, 45.0]}\n'
+    'noise: {angle_random_walk: 7.3e-4}\n'
+    'self_calibration: {scale_factor_error: 0.01, bias: 0.001, '
+    'covariance: [[1.0e-6, 0.0], [0.0, 1.0e-8]]}\n')
 
 #: Runs the program and then says how much memory the process had at most, KiB.
 _MEASURED = """
@@ -34,10 +34,12 @@ sys.exit(code)
 def write_robot(path, rows):
     """Write a log of the robot, which drives its way again and again."""
     time = np.arange(16000) * 0.01
-    way = [f',{rate:.6f},{degc:.2f}\n' for rate, degc in zip(ROBOT.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
+    way = [f',{rate:.6f},{degc:.2f}\n'
+           for rate, degc in zip(ROBOT.rate_at(time), 35.0 + 12.0 * np.sin(time / 20.0))]
     with open(path, 'w') as file:
         file.write('time_s,gyro_rad_s,temperature_degc\n')
-        file.writelines(f'{row / 100:.2f}{rest}' for row, rest in zip(range(rows), itertools.cycle(way)))
+        file.writelines(f'{row / 100:.2f}{rest}'
+                        for row, rest in zip(range(rows), itertools.cycle(way)))
 
 
 @pytest.fixture
@@ -51,8 +53,10 @@ def test_the_memory_does_not_grow_with_the_log(model, tmp_path):
     peaks = []
     for rows in (100_000, 400_000):
         write_robot(tmp_path / 'log.csv', rows)
-        words = ['compensate', 'log.csv', '--model', model, '--out', 'out.csv', '--threshold', '0.3']
-        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)], capture_output=True, text=True, cwd=tmp_path)
+        words = ['compensate', 'log.csv', '--model', model, '--out', 'out.csv',
+                 '--threshold', '0.3']
+        done = subprocess.run([sys.executable, '-c', _MEASURED, *map(str, words)],
+                              capture_output=True, text=True, cwd=tmp_path)
         assert done.returncode == 0 and f'{rows} rows compensated' in done.stdout, done.stderr
         assert not done.stderr, 'a bar is for a terminal only'
         peaks.append(int(done.stdout.split()[-1]) / 1024)
@@ -66,56 +70,67 @@ def small_blocks(monkeypatch):
                         lambda *given, **more: read_log_blocks(*given, rows=300, **more))
 
 
-WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'], 'at a rate': ['--rate', '100']}
+WORDS = {'plain': [], 'threshold': ['--threshold', '0.3'], 'inverted': ['--invert'],
+         'at a rate': ['--rate', '100']}
 
 
 @pytest.mark.parametrize('words', WORDS.values(), ids=WORDS)
 def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, request, capsys):
     write_robot(tmp_path / 'log.csv', 4001)
     lines = (tmp_path / 'log.csv').read_text().splitlines()
-    for lost in (1, 2, *range(290, 1300), 4001):  # outputs, among them those of whole blocks and of the last row
+    for lost in (1, 2, *range(290, 1300), 4001):  # outputs of whole blocks and of the last row
         time, _, degc = lines[lost].split(',')
         lines[lost] = f'{time},nan,{degc}'
     (tmp_path / 'log.csv').write_text('\n'.join(lines) + '\n')
     answers = []
     for out in ('whole.csv', 'blocks.csv.gz'):
-        assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / out), '--json', *words]) == 0
+        assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
+                     '--out', str(tmp_path / out), '--json', *words]) == 0
         answers.append(capsys.readouterr().out.replace(out, ''))
         request.getfixturevalue('small_blocks')
     assert answers[0] == answers[1] and '"rows_without_output": 1013' in answers[0]
     whole, blocks = (read_log(tmp_path / out).others for out in ('whole.csv', 'blocks.csv.gz'))
     assert list(whole) == list(blocks) and len(whole) == 6
     for name in whole:
-        np.testing.assert_allclose(np.array(blocks[name], float), np.array(whole[name], float), rtol=1e-12, err_msg=name)
+        np.testing.assert_allclose(np.array(blocks[name], float), np.array(whole[name], float),
+                                   rtol=1e-12, err_msg=name)
 
 
 def test_what_is_refused_late_leaves_no_file(model, tmp_path, small_blocks, capsys):
     write_robot(tmp_path / 'log.csv', 1000)
     with open(tmp_path / 'log.csv', 'a') as file:
         file.write('3.0,0.1,30\n')
-    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / 'out.csv')]) == 2
+    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
+                 '--out', str(tmp_path / 'out.csv')]) == 2
     assert 'line 1002, column time_s: 3 s does not come after 9.99 s' in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ['log.csv', 'model.yaml']
 
 
 def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, capsys):
-    (tmp_path / 'log.csv').write_text('time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
-    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model), '--out', str(tmp_path / 'out.csv')]) == 1
-    assert 'no output of the gyro is a number' in capsys.readouterr().err and not (tmp_path / 'out.csv').exists()
+    (tmp_path / 'log.csv').write_text(
+        'time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
+    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
+                 '--out', str(tmp_path / 'out.csv')]) == 1
+    assert ('no output of the gyro is a number' in capsys.readouterr().err
+            and not (tmp_path / 'out.csv').exists())
 
 
 def test_a_log_may_come_through_a_pipe(model, tmp_path):
     write_robot(tmp_path / 'log.csv', 1000)
-    words = ['-m', 'gyro_calibration', 'compensate', '/dev/stdin', '--model', model, '--out', tmp_path / 'out.csv']
-    done = subprocess.run([sys.executable, *map(str, words)], input=(tmp_path / 'log.csv').read_bytes(), capture_output=True)
+    words = ['-m', 'gyro_calibration', 'compensate', '/dev/stdin', '--model', model,
+             '--out', tmp_path / 'out.csv']
+    done = subprocess.run([sys.executable, *map(str, words)],
+                          input=(tmp_path / 'log.csv').read_bytes(), capture_output=True)
     assert done.returncode == 0 and b'1000 rows compensated' in done.stdout, done.stderr
 
 
 def test_a_rate_is_as_noisy_as_samples_of_the_first_interval(tmp_path, small_blocks):
     (tmp_path / 'model.yaml').write_text('effects: {}\nnoise: {angle_random_walk: 7.3e-4}')
-    time = np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)])  # then samples are lost, and later every other one
+    # A gap of 3 s, then only every other sample.
+    time = np.cumsum([0.0, *np.full(499, 0.01), 3.0, *np.full(500, 0.02)])
     write_log(tmp_path / 'log.csv', Log(output=np.zeros(len(time)), time=time))
-    words = ['compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv']
+    words = ['compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+             '--out', tmp_path / 'out.csv']
     assert main([str(word) for word in words]) == 0
     deviation = np.array(read_log(tmp_path / 'out.csv').others['rate_std_rad_s'], float)
     assert deviation == pytest.approx(np.full(len(time), 7.3e-4 / math.sqrt(0.01)), rel=1e-9)

@@ -1,4 +1,4 @@
-"""The files of a robot: what is read at the start, what is kept, and what is told of files that are damaged or of another model."""
+"""The state files of a robot: what is read and kept, and reports on damaged or foreign files."""
 
 import threading
 
@@ -18,7 +18,8 @@ def remember(tmp_path):
             (tmp_path / 'model.yaml').write_text(model)
         for name, text in files.items():
             (tmp_path / f'{name}.yaml').write_text(text)
-        return StateStore(str(tmp_path / 'model.yaml') if model else '', tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
+        return StateStore(str(tmp_path / 'model.yaml') if model else '',
+                          tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
     return remember
 
 
@@ -40,7 +41,8 @@ def test_what_is_kept_is_there_after_a_restart(remember):
     memory.keep_table(NOW, ending=True)
     assert memory.written == NOW
     again = remember()
-    assert again.model.self_calibration == SelfCalibration(0.01, 0.002) and len(again.table.entries) == 1
+    assert (again.model.self_calibration == SelfCalibration(0.01, 0.002)
+            and len(again.table.entries) == 1)
 
 
 def test_the_table_is_written_seldom_and_only_if_it_learned_something(remember, tmp_path):
@@ -61,12 +63,14 @@ def test_a_damaged_table_is_told_and_kept(remember, tmp_path):
     assert 'cannot be read' in memory.table_hint
     taught(memory)
     memory.keep_table(NOW, ending=True)
-    assert (tmp_path / 'biases.yaml.kept-1').read_text() == 'entries: [' and 'is now in' in memory.table_hint
+    assert ((tmp_path / 'biases.yaml.kept-1').read_text() == 'entries: ['
+            and 'is now in' in memory.table_hint)
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_and_not_tried_each_second(tmp_path):
     (tmp_path / 'file').write_text('')
-    memory = StateStore('', tmp_path / 'calibration.yaml', tmp_path / 'file' / 'biases.yaml', Prior())
+    memory = StateStore('', tmp_path / 'calibration.yaml',
+                        tmp_path / 'file' / 'biases.yaml', Prior())
     taught(memory)
     memory.keep_table(NOW)
     assert 'cannot be written' in memory.table_hint and memory.written is None
@@ -74,15 +78,20 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_not_tried_each_second(tm
 
 
 def test_a_calibration_behind_another_model_is_not_used(remember):
-    memory = remember('effects: {bias: {bias: 0.1}}', calibration='effects: {}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
+    memory = remember(
+        'effects: {bias: {bias: 0.1}}',
+        calibration='effects: {}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
     assert memory.model.self_calibration is None and 'belongs to another model' in memory.hint
 
 
-@pytest.mark.parametrize('of_model, of_calibration, used', [('7', '7', True), ('7', '8', False), ('7', '', False), ('', '8', False)])
+@pytest.mark.parametrize('of_model, of_calibration, used',
+                         [('7', '7', True), ('7', '8', False), ('7', '', False), ('', '8', False)])
 def test_a_calibration_of_another_gyro_is_not_used(remember, of_model, of_calibration, used):
-    model, calibration = (f'effects: {{}}\ngyro: {{serial_number: "{number}"}}\n' if number else 'effects: {}\n'
-                          for number in (of_model, of_calibration))
-    memory = remember(model, calibration=f'{calibration}self_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
+    model, calibration = (f'effects: {{}}\ngyro: {{serial_number: "{number}"}}\n' if number
+                          else 'effects: {}\n' for number in (of_model, of_calibration))
+    memory = remember(
+        model,
+        calibration=f'{calibration}self_calibration: {{scale_factor_error: 0.2, bias: 0.3}}')
     assert (memory.model.self_calibration is not None) == used == (memory.hint == '')
     assert used or f'and the model to {of_model or "one without"}; calibrate again' in memory.hint
 
@@ -108,7 +117,7 @@ def test_what_another_node_writes_to_the_same_file_is_told_until_this_one_writes
 
 
 def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_gone_says_so(remember):
-    """A thread of each keeps calibrations of its own, in step; whoever is not found in the file has to know."""
+    """Two threads keep calibrations in step; the one that is not in the file must report it."""
     memories, step, rounds = (remember(), remember()), threading.Barrier(3, timeout=20.0), 200
 
     def keep(memory, bias):
@@ -116,7 +125,8 @@ def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_gone_says
             step.wait()
             memory.keep(SelfCalibration(0.01, bias))
             step.wait()
-    writers = [threading.Thread(target=keep, args=(memory, bias)) for memory, bias in zip(memories, (0.1, 0.2))]
+    writers = [threading.Thread(target=keep, args=(memory, bias))
+               for memory, bias in zip(memories, (0.1, 0.2))]
     for writer in writers:
         writer.start()
     unknown = 0

@@ -1,4 +1,4 @@
-"""Model files: every good one is read as it was written, every bad one is a ModelError in one sentence and never anything else."""
+"""Model files: a good one is read as written, a bad one is a ModelError of one sentence."""
 
 import math
 import random
@@ -9,16 +9,24 @@ import pytest
 import yaml
 
 from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
-from gyro_calibration.model import GyroModel, SelfCalibration, Term, same_effects, with_self_calibration
+from gyro_calibration.model import (
+    GyroModel,
+    SelfCalibration,
+    Term,
+    same_effects,
+    with_self_calibration,
+)
 from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.noise import Noise
 
-TERMS = (Term(CATALOGUE['bias'], (0.01,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)), Term(CATALOGUE['sine_response'], (0.2, 1.0)),
+TERMS = (Term(CATALOGUE['bias'], (0.01,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)),
+         Term(CATALOGUE['sine_response'], (0.2, 1.0)),
          Term(rate_temperature_polynomial(1, 1), (0.0, 1.7, 35.0, 10.0, 1e-3, 2e-3, 3e-4, 4e-5)))
-FULL = GyroModel(
-    TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0, 50.0), 35.0, Noise(7e-4, 9e-5, 1e-6),
-    {'name': 'Köln', 'serial_number': '0012'}, {'files': ['a.csv'], 'date': '2024-05-01'},
-    SelfCalibration(0.0373, 2e-4, ((1e-8, 1e-10), (1e-10, 4e-8)), '2024-05-01T10:00:00+00:00', 31.5, 'likelihood'))
+FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0, 50.0), 35.0,
+                 Noise(7e-4, 9e-5, 1e-6), {'name': 'Köln', 'serial_number': '0012'},
+                 {'files': ['a.csv'], 'date': '2024-05-01'},
+                 SelfCalibration(0.0373, 2e-4, ((1e-8, 1e-10), (1e-10, 4e-8)),
+                                 '2024-05-01T10:00:00+00:00', 31.5, 'likelihood'))
 
 
 def read(folder, text):
@@ -36,15 +44,18 @@ def full_text(folder):
 
 def test_a_file_written_by_hand_is_enough(tmp_path):
     model = read(tmp_path, 'effects: {bias: {bias: 0.01}}')
-    assert model.rate(0.5, 25.0) == 0.49 and model.covariance is None and model.self_calibration is None
+    assert (model.rate(0.5, 25.0) == 0.49 and model.covariance is None
+            and model.self_calibration is None)
 
 
 def test_a_model_is_read_back_as_it_was_written(tmp_path):
     write_model(tmp_path / 'model.yaml', FULL)
     again = read_model(tmp_path / 'model.yaml')
-    assert [(term.effect.name, term.values) for term in again.terms] == [(term.effect.name, term.values) for term in FULL.terms]
+    assert [(term.effect.name, term.values) for term in again.terms] == [
+        (term.effect.name, term.values) for term in FULL.terms]
     assert np.array_equal(again.covariance, FULL.covariance)
-    for name in ('rate_range', 'temperature_range', 'reference_temperature', 'noise', 'gyro', 'origin', 'self_calibration'):
+    for name in ('rate_range', 'temperature_range', 'reference_temperature', 'noise', 'gyro',
+                 'origin', 'self_calibration'):
         assert getattr(again, name) == getattr(FULL, name), name
 
 
@@ -61,43 +72,67 @@ BAD = {
     'binary': (b'\xff\xfe\x00\x01', 'cannot be read as YAML'),
     'other YAML': ('name: a robot\nwheels: 4\n', 'effects is None'),
     'another format': ('format: a/b\neffects: {}', "format is 'a/b'"),
-    'newer version': ('version: 2\neffects: {}', 'version is 2; wanted at most 1: install a newer'),
+    'newer version': ('version: 2\neffects: {}',
+                      'version is 2; wanted at most 1: install a newer'),
     'version of text': ('version: one\neffects: {}', 'version is'),
     'effects of text': ('effects: bias', "effects is 'bias'"),
     'effects as a list': ('effects: [bias]', 'effects is'),
     'effect as number': ('effects: {bias: 0.01}', 'effects.bias is 0.01'),
-    'unknown effect': ('effects: {magic: {magic: 1.0}}', 'an effect that this version knows: bias'),
+    'unknown effect': ('effects: {magic: {magic: 1.0}}',
+                       'an effect that this version knows: bias'),
     'no value': ('effects: {bias: {}}', 'effects.bias.bias is None; wanted a finite number'),
-    'unknown value': ('effects: {bias: {bias: 1.0, bais: 2.0}}', 'effects.bias.bais is 2.0; wanted one of bias'),
+    'unknown value': ('effects: {bias: {bias: 1.0, bais: 2.0}}',
+                      'effects.bias.bais is 2.0; wanted one of bias'),
     'nan': ('effects: {bias: {bias: .nan}}', 'effects.bias.bias is nan; wanted a finite number'),
     'infinite': ('effects: {bias: {bias: -.inf}}', 'effects.bias.bias is -inf'),
     'true': ('effects: {bias: {bias: true}}', 'effects.bias.bias is True'),
     'text for a number': ('effects: {bias: {bias: "0.01"}}', "effects.bias.bias is '0.01'"),
-    'an integer beyond all floats': ('effects: {bias: {bias: 1' + '0' * 400 + '}}', 'effects.bias.bias'),
-    'an integer of too many digits': ('effects: {bias: {bias: 1' + '0' * 5000 + '}}', 'model.yaml'),
-    'out of bounds': ('effects: {sine_response: {k: -1.0}}', 'effects.sine_response.k is -1.0; wanted 0.001 to 30 s'),
-    'matrix of two lengths': ('effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3]]}}', 'rows of finite numbers'),
-    'matrix with nan': ('effects: {rate_temperature_polynomial: {matrix_dps: [[.nan]]}}', 'matrix_dps[0][0] is nan; wanted a finite'),
-    'polynomial of order -1': ('effects: {rate_temperature_polynomial: {orders: [-1, 2]}}', 'the orders in rate and temperature'),
-    'polynomial of order yes': ('effects: {rate_temperature_polynomial: {orders: [true, 2]}}', 'the orders in rate and temperature'),
-    'polynomial of order 1e9': ('effects: {rate_temperature_polynomial: {orders: [1000000000, 2]}}', 'the orders in rate and temperature'),
-    'covariance too small': ('effects: {bias: {bias: 1.0}}\ncovariance: []', '1 rows of 1 numbers'),
-    'covariance of numbers': ('effects: {bias: {bias: 1.0}}\ncovariance: [1.0]', '1 rows of 1 numbers'),
-    'covariance with a stray number': ('effects: {bias: {bias: 1.0}}\ncovariance: [7, [1.0]]', '1 rows of 1 numbers'),
-    'covariance not symmetric': ('effects: {}\nself_calibration: {scale_factor_error: 0, bias: 0, covariance: [[1, 0.5], [0, 1]]}',
+    'an integer beyond all floats': ('effects: {bias: {bias: 1' + '0' * 400 + '}}',
+                                     'effects.bias.bias'),
+    'an integer of too many digits': ('effects: {bias: {bias: 1' + '0' * 5000 + '}}',
+                                      'model.yaml'),
+    'out of bounds': ('effects: {sine_response: {k: -1.0}}',
+                      'effects.sine_response.k is -1.0; wanted 0.001 to 30 s'),
+    'matrix of two lengths': (
+        'effects: {rate_temperature_polynomial: {matrix_dps: [[1, 2], [3]]}}',
+        'rows of finite numbers'),
+    'matrix with nan': ('effects: {rate_temperature_polynomial: {matrix_dps: [[.nan]]}}',
+                        'matrix_dps[0][0] is nan; wanted a finite'),
+    'polynomial of order -1': ('effects: {rate_temperature_polynomial: {orders: [-1, 2]}}',
+                               'the orders in rate and temperature'),
+    'polynomial of order yes': ('effects: {rate_temperature_polynomial: {orders: [true, 2]}}',
+                                'the orders in rate and temperature'),
+    'polynomial of order 1e9': (
+        'effects: {rate_temperature_polynomial: {orders: [1000000000, 2]}}',
+        'the orders in rate and temperature'),
+    'covariance too small': ('effects: {bias: {bias: 1.0}}\ncovariance: []',
+                             '1 rows of 1 numbers'),
+    'covariance of numbers': ('effects: {bias: {bias: 1.0}}\ncovariance: [1.0]',
+                              '1 rows of 1 numbers'),
+    'covariance with a stray number': ('effects: {bias: {bias: 1.0}}\ncovariance: [7, [1.0]]',
+                                       '1 rows of 1 numbers'),
+    'covariance not symmetric': ('effects: {}\nself_calibration: {scale_factor_error: 0, bias: 0, '
+                                 'covariance: [[1, 0.5], [0, 1]]}',
                                  'symmetric'),
     'covariance of small numbers not symmetric': (
-        'effects: {}\nself_calibration: {scale_factor_error: 0, bias: 0, covariance: [[1.0e-9, 9.e-10], [-9.e-10, 1.0e-9]]}', 'symmetric'),
-    'negative variance': ('effects: {bias: {bias: 1.0}}\ncovariance: [[-1.0]]', 'no negative variance'),
-    'slightly negative variance': ('effects: {}\nself_calibration: {scale_factor_error: 0, bias: 0, covariance: [[1, 0], [0, -1.0e-12]]}',
+        'effects: {}\nself_calibration: {scale_factor_error: 0, bias: 0, '
+        'covariance: [[1.0e-9, 9.e-10], [-9.e-10, 1.0e-9]]}', 'symmetric'),
+    'negative variance': ('effects: {bias: {bias: 1.0}}\ncovariance: [[-1.0]]',
+                          'no negative variance'),
+    'slightly negative variance': ('effects: {}\nself_calibration: {scale_factor_error: 0, '
+                                   'bias: 0, covariance: [[1, 0], [0, -1.0e-12]]}',
                                    'no negative variance'),
     'range upside down': ('effects: {}\nvalid: {rate: [1, -1]}', 'in this order'),
     'range of one': ('effects: {}\nvalid: {temperature: [1]}', 'valid.temperature is [1]'),
-    'negative noise': ('effects: {}\nnoise: {angle_random_walk: -1}', 'noise.angle_random_walk is -1; wanted a finite number of at'),
+    'negative noise': ('effects: {}\nnoise: {angle_random_walk: -1}',
+                       'noise.angle_random_walk is -1; wanted a finite number of at'),
     'unknown noise': ('effects: {}\nnoise: {pink: 1}', 'noise.pink'),
-    'scale of zero': ('effects: {}\nself_calibration: {scale_factor_error: -1.0, bias: 0}', 'self_calibration.scale_factor_error is -1.0'),
-    'polynomial of 100 rows': ('effects: {rate_temperature_polynomial: {matrix_dps: [' + '[1],' * 100 + ']}}', 'up to order 20'),
-    'a covariance of 10 000 rows': ('effects: {}\ncovariance: [' + '[1],' * 10000 + ']', '0 rows of 0 numbers'),
+    'scale of zero': ('effects: {}\nself_calibration: {scale_factor_error: -1.0, bias: 0}',
+                      'self_calibration.scale_factor_error is -1.0'),
+    'polynomial of 100 rows': ('effects: {rate_temperature_polynomial: {matrix_dps: ['
+                               + '[1],' * 100 + ']}}', 'up to order 20'),
+    'a covariance of 10 000 rows': ('effects: {}\ncovariance: [' + '[1],' * 10000 + ']',
+                                    '0 rows of 0 numbers'),
     'beyond what a gyro has': ('effects: {bias: {bias: 1e300}}', 'effects.bias.bias is 1e+300'),
 }
 
@@ -111,9 +146,11 @@ def test_effects_with_a_past_are_written_by_hand(tmp_path):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_every_effect_survives_its_file(tmp_path, name):
-    values = tuple(0.5 if each.default is None else each.default for each in CATALOGUE[name].parameters)
+    values = tuple(0.5 if each.default is None else each.default
+                   for each in CATALOGUE[name].parameters)
     bounds = [each.bounds for each in CATALOGUE[name].parameters]
-    model = GyroModel((Term(CATALOGUE[name], tuple(float(np.clip(value, *limits)) for value, limits in zip(values, bounds))),))
+    model = GyroModel((Term(CATALOGUE[name], tuple(float(np.clip(value, *limits))
+                                                   for value, limits in zip(values, bounds))),))
     write_model(tmp_path / 'model.yaml', model)
     assert read_model(tmp_path / 'model.yaml').terms == model.terms
 
@@ -124,7 +161,8 @@ def test_a_bad_file_is_refused_in_one_sentence_with_file_place_and_remedy(tmp_pa
         read(tmp_path, text)
     sentence = str(refused.value)
     assert sentence.startswith(str(tmp_path / 'model.yaml')) and message in sentence
-    assert ('wanted' in sentence or 'calibrate again' in sentence) and '\n' not in sentence and len(sentence) < 800
+    assert (('wanted' in sentence or 'calibrate again' in sentence) and '\n' not in sentence
+            and len(sentence) < 800)
 
 
 def test_a_missing_file_is_refused(tmp_path):
@@ -134,7 +172,9 @@ def test_a_missing_file_is_refused(tmp_path):
         read_model(tmp_path)
 
 
-@pytest.mark.parametrize('where', ['effects: {{bias: {{bias: {}}}}}', 'effects: {{}}\ngyro: {{name: {}}}', 'effects: {{}}\nversion: {}'])
+@pytest.mark.parametrize('where',
+                         ['effects: {{bias: {{bias: {}}}}}', 'effects: {{}}\ngyro: {{name: {}}}',
+                          'effects: {{}}\nversion: {}'])
 def test_a_file_that_unfolds_to_gigabytes_is_refused_in_little_memory(tmp_path, where):
     layers = ['a0: &a0 [x, x, x, x, x, x, x, x, x, x]']
     layers += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 10)]
@@ -147,7 +187,7 @@ def test_a_file_that_unfolds_to_gigabytes_is_refused_in_little_memory(tmp_path, 
 
 
 def is_read_or_refused(folder, text):
-    """Return whether it is read; what is neither a model nor refused by a ModelError is an error of the test."""
+    """Return whether it is read, not refused by a ModelError; anything else fails the test."""
     try:
         model = read(folder, text)
     except ModelError as error:
@@ -164,8 +204,9 @@ def test_a_file_cut_off_anywhere_is_a_model_or_refused(tmp_path):
     assert len(read_at) < len(data), 'no cut was refused'
 
 
-JUNK = ['.nan', '-.inf', '1e400', '1' + '0' * 330, 'null', 'true', '[]', '{}', '[[[]]]', '"', '\'', ':', '\x00', '- ', '&a', '*a', '!!set',
-        '!!binary x', '2024-02-30', '0o9', '0x', '1_0', '? ', '%', '\t', '\ufeff', '\n', '~: ~', '<<: 1', '9' * 20, '-1', '1e308', 'abc']
+JUNK = ['.nan', '-.inf', '1e400', '1' + '0' * 330, 'null', 'true', '[]', '{}', '[[[]]]', '"', '\'',
+        ':', '\x00', '- ', '&a', '*a', '!!set', '!!binary x', '2024-02-30', '0o9', '0x', '1_0',
+        '? ', '%', '\t', '\ufeff', '\n', '~: ~', '<<: 1', '9' * 20, '-1', '1e308', 'abc']
 
 
 def test_a_file_with_junk_in_it_is_a_model_or_refused(tmp_path):
@@ -175,14 +216,16 @@ def test_a_file_with_junk_in_it_is_a_model_or_refused(tmp_path):
         damaged = text
         for _ in range(generator.randint(1, 3)):
             begin = generator.randrange(len(damaged))
-            damaged = damaged[:begin] + generator.choice(JUNK) + damaged[begin + generator.choice([0, 1, 5, 30]):]
+            damaged = (damaged[:begin] + generator.choice(JUNK)
+                       + damaged[begin + generator.choice([0, 1, 5, 30]):])
         refused += not is_read_or_refused(tmp_path, damaged)
     assert refused > 100
 
 
 def test_a_file_with_any_value_of_another_kind_is_a_model_or_refused(tmp_path):
     generator = random.Random(1)
-    values = [None, True, -1, 0, 10 ** 400, math.nan, math.inf, 1e308, -1e308, '', 'a', [], {}, [1], [[1.0]], {'a': 1}, {1: 2}, {None: []}]
+    values = [None, True, -1, 0, 10 ** 400, math.nan, math.inf, 1e308, -1e308, '', 'a', [], {},
+              [1], [[1.0]], {'a': 1}, {1: 2}, {None: []}]
 
     def changed(node, left):
         if not left or not isinstance(node, (dict, list)) or not node:
@@ -192,7 +235,8 @@ def test_a_file_with_any_value_of_another_kind_is_a_model_or_refused(tmp_path):
         copy[key] = changed(node[key], left - 1)
         return copy
     content = yaml.safe_load(full_text(tmp_path))
-    read_ones = sum(is_read_or_refused(tmp_path, yaml.safe_dump(changed(content, generator.randint(0, 4)))) for _ in range(400))
+    read_ones = sum(is_read_or_refused(
+        tmp_path, yaml.safe_dump(changed(content, generator.randint(0, 4)))) for _ in range(400))
     assert 0 < read_ones < 200
 
 
@@ -215,14 +259,16 @@ def test_models_compensate_alike_whatever_their_self_calibration():
 
 def test_a_person_may_give_the_standard_deviations_of_a_self_calibration_alone(tmp_path):
     path = tmp_path / 'model.yaml'
-    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, standard_deviations: '
-                    '{bias: 0.003, scale_factor_error: 0.002}}')
+    path.write_text('effects: {}\nself_calibration: {scale_factor_error: 0.1, bias: 0.2, '
+                    'standard_deviations: {bias: 0.003, scale_factor_error: 0.002}}')
     assert read_model(path).self_calibration.standard_deviations == pytest.approx((0.002, 0.003))
 
 
 def test_a_written_self_calibration_shows_its_standard_deviations(tmp_path):
-    calibration = SelfCalibration(0.1, 0.2, ((4e-6, 1e-9), (1e-9, 9e-6)), '2026-01-01T00:00:00+00:00', 21.0, 'likelihood')
+    calibration = SelfCalibration(0.1, 0.2, ((4e-6, 1e-9), (1e-9, 9e-6)),
+                                  '2026-01-01T00:00:00+00:00', 21.0, 'likelihood')
     write_model(tmp_path / 'model.yaml', GyroModel(self_calibration=calibration))
     assert read_model(tmp_path / 'model.yaml').self_calibration == calibration
-    shown = yaml.safe_load((tmp_path / 'model.yaml').read_text())['self_calibration']['standard_deviations']
+    shown = yaml.safe_load(
+        (tmp_path / 'model.yaml').read_text())['self_calibration']['standard_deviations']
     assert shown == {'scale_factor_error': pytest.approx(0.002), 'bias': pytest.approx(0.003)}
