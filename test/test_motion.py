@@ -1,4 +1,4 @@
-"""Motions: the heading is the exact integral of the rate, and a profile's file means what its columns say."""
+"""Motions: the heading is the exact integral of the rate; files are read by their columns."""
 
 import math
 
@@ -6,12 +6,21 @@ import numpy as np
 import pytest
 
 from gyro_calibration.log import DEGREE
-from gyro_calibration.motion import CALIBRATION, NAMED, ROBOT, MotionError, from_headings, from_rates, read_motion, turns
+from gyro_calibration.motion import (
+    CALIBRATION,
+    NAMED,
+    ROBOT,
+    MotionError,
+    from_headings,
+    from_rates,
+    read_motion,
+    turns,
+)
 
 
 @pytest.mark.parametrize('name', NAMED)
 def test_the_heading_is_the_integral_of_the_rate(name):
-    """By Simpson's rule, which is exact for a rate that is linear between the grid's points: all corners are multiples of 0.1 s."""
+    """Simpson's rule is exact for a piecewise linear rate with corners at multiples of 0.1 s."""
     motion = NAMED[name]
     time = np.arange(round(motion.duration * 20) + 1) / 20.0
     middle = motion.rate_at((time[1:] + time[:-1]) / 2)
@@ -27,19 +36,22 @@ def test_a_ramp_turns_half_of_what_its_end_rate_would():
 
 def test_before_and_after_a_motion_stands():
     assert CALIBRATION.rate_at(np.array([-1.0, CALIBRATION.duration + 1.0])).tolist() == [0.0, 0.0]
-    assert ROBOT.heading_at(np.array([-5.0, ROBOT.duration + 5.0])).tolist() == [0.0, ROBOT.heading[-1]]
+    assert (ROBOT.heading_at(np.array([-5.0, ROBOT.duration + 5.0])).tolist()
+            == [0.0, ROBOT.heading[-1]])
 
 
 def test_the_calibration_takes_20_s_turns_both_ways_at_two_speeds_and_comes_back():
     rate = CALIBRATION.rate_at(np.arange(2001) / 100.0) / DEGREE
-    assert CALIBRATION.duration == 20.0 and CALIBRATION.heading[-1] == pytest.approx(0.0, abs=1e-12)
+    assert (CALIBRATION.duration == 20.0
+            and CALIBRATION.heading[-1] == pytest.approx(0.0, abs=1e-12))
     assert all((np.abs(rate - speed) < 1e-9).mean() > 0.1 for speed in (-45, -30, 0, 30, 45))
 
 
 def test_the_robot_drives_160_s_and_stands_for_half_of_them():
     """Hong and Park, section 4.1: a trajectory of 160 s."""
     rate = ROBOT.rate_at(np.arange(16001) / 100.0)
-    assert ROBOT.duration == pytest.approx(160.0) and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05)
+    assert (ROBOT.duration == pytest.approx(160.0)
+            and (rate == 0.0).mean() == pytest.approx(0.5, abs=0.05))
 
 
 def test_a_stretch_turns_rate_times_duration():
@@ -48,43 +60,60 @@ def test_a_stretch_turns_rate_times_duration():
 
 def test_known_headings_are_met_and_joined_by_lines():
     motion = from_headings(np.array([10.0, 11.0, 13.0]), np.array([5.0, 6.0, 6.5]))
-    assert motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist() == [0.0, 0.5, 1.0, 1.25, 1.5]
+    assert (motion.heading_at(np.array([0.0, 0.5, 1.0, 2.0, 3.0])).tolist()
+            == [0.0, 0.5, 1.0, 1.25, 1.5])
 
 
-@pytest.mark.parametrize('column, factor', [
-    ('heading_deg', DEGREE), ('heading_rad', 1.0), ('reference_heading_deg', DEGREE), ('reference_heading_rad', 1.0)])
+@pytest.mark.parametrize('column, factor',
+                         [('heading_deg', DEGREE), ('heading_rad', 1.0),
+                          ('reference_heading_deg', DEGREE), ('reference_heading_rad', 1.0)])
 def test_a_profile_of_headings_is_read(tmp_path, column, factor):
     (tmp_path / 'profile.csv').write_text(f'# note\n{column},time_s,lap\n1,0,a\n3,2,b\n\n')
     motion = read_motion(tmp_path / 'profile.csv')
-    assert motion.heading.tolist() == pytest.approx([0.0, 2.0 * factor]) and motion.rate is None and motion.duration == 2.0
+    assert (motion.heading.tolist() == pytest.approx([0.0, 2.0 * factor]) and motion.rate is None
+            and motion.duration == 2.0)
 
 
-@pytest.mark.parametrize('column, factor', [
-    ('rate_dps', DEGREE), ('rate_rad_s', 1.0), ('reference_rate_dps', DEGREE), ('reference_rate_rad_s', 1.0)])
+@pytest.mark.parametrize('column, factor',
+                         [('rate_dps', DEGREE), ('rate_rad_s', 1.0),
+                          ('reference_rate_dps', DEGREE), ('reference_rate_rad_s', 1.0)])
 def test_a_profile_of_rates_is_read(tmp_path, column, factor):
     (tmp_path / 'profile.csv').write_text(f'\ufefftime_s,{column}\n5,0\n7,3\n')
     motion = read_motion(tmp_path / 'profile.csv')
-    assert motion.rate.tolist() == [0.0, 3.0 * factor] and motion.heading_at(2.0) == pytest.approx(3.0 * factor)
+    assert (motion.rate.tolist() == [0.0, 3.0 * factor]
+            and motion.heading_at(2.0) == pytest.approx(3.0 * factor))
 
 
 def test_the_reference_of_a_log_is_a_profile_by_its_heading_and_without_what_was_lost(tmp_path):
-    (tmp_path / 'log.csv').write_text('time_s,gyro_dps,reference_rate_rad_s,reference_heading_rad\n0,0,5,0\n1,0,5,nan\n2,0,5,3\n')
+    (tmp_path / 'log.csv').write_text(
+        'time_s,gyro_dps,reference_rate_rad_s,reference_heading_rad\n'
+        '0,0,5,0\n1,0,5,nan\n2,0,5,3\n')
     motion = read_motion(tmp_path / 'log.csv')
-    assert motion.rate is None and motion.time.tolist() == [0.0, 2.0] and motion.heading.tolist() == [0.0, 3.0]
+    assert (motion.rate is None and motion.time.tolist() == [0.0, 2.0]
+            and motion.heading.tolist() == [0.0, 3.0])
 
 
 REFUSED = {
-    'two headings': ('time_s,reference_heading_deg,reference_heading_rad\n0,1,1\n1,1,1\n', 'wanted time_s and one of'),
-    'text in a reference': ('time_s,reference_rate_dps\n0,1\n1,fast\n2,1\n', 'column reference_rate_dps'),
+    'two headings': ('time_s,reference_heading_deg,reference_heading_rad\n0,1,1\n1,1,1\n',
+                     'wanted time_s and one of'),
+    'text in a reference': ('time_s,reference_rate_dps\n0,1\n1,fast\n2,1\n',
+                            'column reference_rate_dps'),
     'a lost time': ('time_s,reference_rate_dps\n0,1\nnan,2\n2,1\n', 'column time_s'),
-    'a reference lost everywhere': ('time_s,reference_rate_dps\n0,nan\n1,nan\n2,1\n', 'at least two rows'),
-    'empty': ('', 'the columns are nothing'), 'no rows': ('time_s,rate_dps\n', 'at least two rows'),
-    'no time': ('rate_dps\n1\n2\n', 'wanted time_s'), 'no motion': ('time_s\n1\n2\n', 'wanted time_s and one of'),
+    'a reference lost everywhere': ('time_s,reference_rate_dps\n0,nan\n1,nan\n2,1\n',
+                                    'at least two rows'),
+    'empty': ('', 'the columns are nothing'),
+    'no rows': ('time_s,rate_dps\n', 'at least two rows'),
+    'no time': ('rate_dps\n1\n2\n', 'wanted time_s'),
+    'no motion': ('time_s\n1\n2\n', 'wanted time_s and one of'),
     'two motions': ('time_s,rate_dps,heading_deg\n0,1,1\n1,1,1\n', 'wanted time_s and one of'),
-    'one row': ('time_s,rate_dps\n0,1\n', 'at least two rows'), 'time stands': ('time_s,rate_dps\n0,1\n0,1\n', 'time_s must increase'),
-    'text': ('time_s,rate_dps\n0,1\n1,fast\n', 'column rate_dps'), 'nan': ('time_s,rate_dps\n0,nan\n1,1\n', 'column rate_dps'),
-    'inf': ('time_s,rate_dps\n0,1\ninf,1\n', 'column time_s'), 'short': ('time_s,rate_dps\n0,1\n1\n', 'column rate_dps'),
-    'binary': (bytes(range(256)), 'cannot be read'), 'beyond': ('time_s,rate_dps\n0,1\n1,1e300\n', 'column rate_dps'),
+    'one row': ('time_s,rate_dps\n0,1\n', 'at least two rows'),
+    'time stands': ('time_s,rate_dps\n0,1\n0,1\n', 'time_s must increase'),
+    'text': ('time_s,rate_dps\n0,1\n1,fast\n', 'column rate_dps'),
+    'nan': ('time_s,rate_dps\n0,nan\n1,1\n', 'column rate_dps'),
+    'inf': ('time_s,rate_dps\n0,1\ninf,1\n', 'column time_s'),
+    'short': ('time_s,rate_dps\n0,1\n1\n', 'column rate_dps'),
+    'binary': (bytes(range(256)), 'cannot be read'),
+    'beyond': ('time_s,rate_dps\n0,1\n1,1e300\n', 'column rate_dps'),
     'no time between': ('time_s,rate_dps\n0,1\n5e-324,1\n', 'time_s must increase'),
     'large': (b'\n' * 17_000_000, 'more than 16000000 bytes'),
     'endless field': ('time_s,rate_dps\n0,' + '1' * 200000, 'cannot be read'),

@@ -1,4 +1,4 @@
-"""Simulated noise has the Allan deviation of IEEE Std 952: N / sqrt(tau), 0.664 B, K sqrt(tau / 3)."""
+"""Simulated noise has the Allan deviation of IEEE Std 952: N/sqrt(tau), 0.664 B, K sqrt(tau/3)."""
 
 import math
 
@@ -11,7 +11,7 @@ INTERVAL = 0.01
 
 
 def allan_variance(rate, size):
-    """Return the Allan variance of non-overlapping means of `size` samples (IEEE Std 952, C.1), and how many differences it has."""
+    """Return Allan variance (IEEE Std 952, C.1) of `size` samples, and how many differences."""
     means = rate[:len(rate) // size * size].reshape(-1, size).mean(axis=1)
     return np.mean(np.diff(means) ** 2) / 2.0, len(means) - 1
 
@@ -20,14 +20,17 @@ def assert_variance(noise, size, wanted, count=2 ** 18, runs=8):
     """
     Assert the Allan variance within four standard errors.
 
-    The n differences of neighbours correlate by -1/2 or less, so their mean square has a relative variance of at most 3 / n.
+    The n differences of neighbours correlate by -1/2 or less, so that their mean square has a
+    relative variance of at most 3 / n.
 
     """
     generator = np.random.default_rng(952)
-    found = [allan_variance(simulate_noise(noise, count, INTERVAL, generator), size) for _ in range(runs)]
+    found = [allan_variance(simulate_noise(noise, count, INTERVAL, generator), size)
+             for _ in range(runs)]
     tolerance = 4.0 * math.sqrt(3.0 / (found[0][1] * runs))
     assert tolerance < 0.25
-    assert np.mean([variance for variance, _ in found]) / wanted == pytest.approx(1.0, abs=tolerance)
+    assert (np.mean([variance for variance, _ in found]) / wanted
+            == pytest.approx(1.0, abs=tolerance))
 
 
 @pytest.mark.parametrize('size', [1, 10, 100, 1000])
@@ -43,24 +46,28 @@ def test_flicker_has_a_floor_of_0_664_times_the_bias_instability(size):
 
 @pytest.mark.parametrize('size', [30, 100, 1000])
 def test_a_random_walk_grows_with_the_square_root_of_time(size):
-    wanted = 1e-5 ** 2 * size * INTERVAL / 3.0 * (1.0 + 0.5 / size ** 2)  # exactly, for a walk in steps
+    wanted = 1e-5 ** 2 * size * INTERVAL / 3.0 * (1.0 + 0.5 / size ** 2)  # exact in steps
     assert_variance(Noise(rate_random_walk=1e-5), size, wanted)
 
 
-@pytest.mark.parametrize('noise', [Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)], ids=['flicker', 'walk'])
+@pytest.mark.parametrize('noise', [Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)],
+                         ids=['flicker', 'walk'])
 @pytest.mark.parametrize('apart', [3, 20])
 def test_means_wander_as_foretold(noise, apart):
     generator, duration, size = np.random.default_rng(5), 2.0, 200
     squares = []
     for _ in range(12):
-        means = simulate_noise(noise, 2 ** 16 // size * size, INTERVAL, generator).reshape(-1, size).mean(axis=1)[20:]
+        means = simulate_noise(noise, 2 ** 16 // size * size, INTERVAL,
+                               generator).reshape(-1, size).mean(axis=1)[20:]
         squares.append(np.mean((means[apart:] - means[:-apart]) ** 2))
     deviation = np.std(squares) / math.sqrt(len(squares))
-    assert np.mean(squares) == pytest.approx(noise.wander(apart * duration, duration), abs=4.0 * deviation, rel=0.12)
+    assert np.mean(squares) == pytest.approx(noise.wander(apart * duration, duration),
+                                             abs=4.0 * deviation, rel=0.12)
 
 
 def test_the_allan_variance_is_the_sum_of_its_parts():
-    assert Noise(1.0, 2.0, 3.0).allan_variance(5.0) == pytest.approx(1.0 / 5.0 + (ALLAN_FLOOR * 2.0) ** 2 + 9.0 * 5.0 / 3.0)
+    assert Noise(1.0, 2.0, 3.0).allan_variance(5.0) == pytest.approx(
+        1.0 / 5.0 + (ALLAN_FLOOR * 2.0) ** 2 + 9.0 * 5.0 / 3.0)
 
 
 def test_the_three_add_up_and_none_is_silence():
@@ -68,21 +75,25 @@ def test_the_three_add_up_and_none_is_silence():
     assert not simulate_noise(Noise(), 100, INTERVAL, generator).any()
     parts = Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)
     alone = sum(simulate_noise(part, 100, INTERVAL, np.random.default_rng(2)) for part in parts)
-    assert simulate_noise(Noise(7e-4, 1e-4, 1e-5), 100, INTERVAL, np.random.default_rng(2)) == pytest.approx(alone, abs=1e-12)
+    assert (simulate_noise(Noise(7e-4, 1e-4, 1e-5), 100, INTERVAL, np.random.default_rng(2))
+            == pytest.approx(alone, abs=1e-12))
 
 
 def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_so():
-    """Their introduction: 2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 minutes, which is about what comes after 20 s of rest."""
+    """2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 min, as their introduction states."""
     degree = math.pi / 180.0
-    assert math.sqrt(Noise(2.5 * degree / 60).heading_variance(3600.0)) / degree == pytest.approx(2.5)
-    both = math.sqrt(Noise(2.5 * degree / 60, 18 * degree / 3600).heading_variance(1800.0)) / degree
+    assert (math.sqrt(Noise(2.5 * degree / 60).heading_variance(3600.0)) / degree
+            == pytest.approx(2.5))
+    both = (math.sqrt(Noise(2.5 * degree / 60, 18 * degree / 3600).heading_variance(1800.0))
+            / degree)
     assert both == pytest.approx(11.0, abs=1.0)
 
 
-@pytest.mark.parametrize('noise', [Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)],
-                         ids=['angle random walk', 'bias instability', 'rate random walk'])
+@pytest.mark.parametrize('noise', [
+    Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)
+], ids=['angle random walk', 'bias instability', 'rate random walk'])
 def test_the_heading_varies_as_foretold(noise):
-    """Flicker is stood for by four processes a decade apart, which is within a tenth; white noise is not counted in the mean before."""
+    """Four processes a decade apart make flicker to 10 %; white noise has no mean before."""
     generator, runs, interval, ends = np.random.default_rng(3), 1500, 0.5, []
     known, count = round(CALIBRATED / interval), 400
     for _ in range(runs):
@@ -90,4 +101,5 @@ def test_the_heading_varies_as_foretold(noise):
         before = 0.0 if noise.angle_random_walk else rate[:known].mean()
         ends.append((rate[known:] - before).sum() * interval)
     allowed = 4.0 * math.sqrt(2.0 / runs) + (0.1 if noise.bias_instability else 0.01)
-    assert np.mean(np.square(ends)) / noise.heading_variance(count * interval) == pytest.approx(1.0, abs=allowed)
+    assert (np.mean(np.square(ends)) / noise.heading_variance(count * interval)
+            == pytest.approx(1.0, abs=allowed))

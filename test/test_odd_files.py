@@ -91,7 +91,8 @@ def test_what_is_no_file_is_not_read(read, error, name, kind, tmp_path):
 @each_kind
 def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, folder, run):
     words = ['compensate', folder / 'log.csv', '--model', folder / 'model.yaml', '--out']
-    for name in ('.out.csv.abcd1234', '.calibration.yaml.abcd1234', 'there.csv', 'calibration.yaml'):
+    for name in ('.out.csv.abcd1234', '.calibration.yaml.abcd1234', 'there.csv',
+                 'calibration.yaml'):
         KINDS[kind](folder / name)
     before = {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()}
     assert run(*words, folder / 'out.csv')[0] == 0
@@ -106,8 +107,10 @@ def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, fol
 
 def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
     os.mkfifo(tmp_path / 'log.csv')
-    writer = 'import sys, time; file = open(sys.argv[1], "w"); time.sleep(2); print("gyro_dps\\n1\\n2", file=file)'
-    with subprocess.Popen([sys.executable, '-c', writer, tmp_path / 'log.csv'], stdout=subprocess.PIPE):
+    writer = ('import sys, time; file = open(sys.argv[1], "w"); time.sleep(2); '
+              'print("gyro_dps\\n1\\n2", file=file)')
+    with subprocess.Popen([sys.executable, '-c', writer, tmp_path / 'log.csv'],
+                          stdout=subprocess.PIPE):
         for _ in range(20):  # until the writer has begun, which a busy machine may hold up
             try:
                 assert len(read_log(tmp_path / 'log.csv')) == 2
@@ -122,13 +125,14 @@ def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
 
 @pytest.mark.parametrize('path, words', [
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
-    ('log.csv/a.csv', 'a directory|file exists'), ('circle.csv', 'too many levels of symbolic links'),
-    ('closed/a.csv', 'permission denied')])
+    ('log.csv/a.csv', 'a directory|file exists'),
+    ('circle.csv', 'too many levels of symbolic links'), ('closed/a.csv', 'permission denied')])
 def test_what_cannot_be_opened_is_said_with_its_remedy(path, words, folder, run, monkeypatch):
     (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
     deny(monkeypatch, folder / 'closed')
     path = folder / path
-    for read, error in ((read_log, LogError), (read_model, ModelError), (read_motion, MotionError)):
+    for read, error in ((read_log, LogError), (read_model, ModelError),
+                        (read_motion, MotionError)):
         with pytest.raises(error) as raised:
             read(path)
         assert re.search(words, str(raised.value)) or 'closed' in str(path)
@@ -138,9 +142,11 @@ def test_what_cannot_be_opened_is_said_with_its_remedy(path, words, folder, run,
     if 'circle' not in path.name:  # a link is replaced by what is written
         said = store.keep(SelfCalibration())
         assert 'NOT STORED' in said and re.search(words, said)
-        code, _, error = run('compensate', folder / 'log.csv', '--model', folder / 'model.yaml', '--out', path)
+        code, _, error = run('compensate', folder / 'log.csv', '--model', folder / 'model.yaml',
+                             '--out', path)
         assert code == 2 and error.count('\n') == 1 and re.search(words, error) and ';' in error
-    code, _, error = run('compensate', path, '--model', folder / 'model.yaml', '--out', folder / 'out.csv')
+    code, _, error = run('compensate', path, '--model', folder / 'model.yaml',
+                         '--out', folder / 'out.csv')
     assert code == 2 and error.count('\n') == 1 and path.name in error
 
 
@@ -166,7 +172,8 @@ def test_the_longest_name_that_there_may_be_is_written(folder):
 @pytest.mark.parametrize('number', [28, 30, 13, 36, 20, 2, 40, 122])
 def test_an_error_of_the_system_names_file_and_remedy(number):
     said = explained(OSError(number, os.strerror(number), '/data/a\x1b[2Jb'))
-    assert said.startswith('/data/a\\x1b[2Jb: ') and '; ' in said and reason(OSError(number, 'X y')) == 'x y'
+    assert (said.startswith('/data/a\\x1b[2Jb: ') and '; ' in said
+            and reason(OSError(number, 'X y')) == 'x y')
 
 
 # Links and modes
@@ -237,20 +244,24 @@ def test_nothing_that_a_terminal_obeys_is_printed(folder, run):
         ('compensate', name, '--model', model, '--out', out, '--json'),
         ('compensate', f'{name}2', '--model', model, '--out', out),
         ('compensate', folder / 'log.csv', '--model', f'{model}{ESCAPES}', '--out', out),
-        ('compensate', name, f'--{ESCAPES}'), ('simulate', '--motion', ESCAPES, '--model', model, '--out', out),
-        ('allan', name), ('diagnose', name, '--out', folder / 'd'), ('fit', name, '--out', folder / 'm.yaml')]
+        ('compensate', name, f'--{ESCAPES}'),
+        ('simulate', '--motion', ESCAPES, '--model', model, '--out', out),
+        ('allan', name), ('diagnose', name, '--out', folder / 'd'),
+        ('fit', name, '--out', folder / 'm.yaml')]
     for text in (f'time_s,gyro_dps{ESCAPES}\n0,1\n', f'time_s,gyro_dps\n0,{ESCAPES}\n1,1\n',
                  f'{ESCAPES},gyro_dps,gyro_rad_s\n0,1,2\n'):
         path = folder / f'{len(tries)}.csv'
         path.write_text(text, newline='')
         tries.append(('compensate', path, '--model', model, '--out', out))
     path = folder / 'named.yaml'
-    path.write_text(MODEL + f'gyro: {{name: {json.dumps(ESCAPES)}}}\nbad{json.dumps(ESCAPES)}: 1\n')
+    path.write_text(
+        MODEL + f'gyro: {{name: {json.dumps(ESCAPES)}}}\nbad{json.dumps(ESCAPES)}: 1\n')
     tries.append(('compensate', folder / 'log.csv', '--model', path, '--out', out))
     for words in tries:
         code, answer, error = run(*words)
         assert code in (0, 1, 2) and answer + error
-        assert not [each for each in answer + error if not each.isprintable() and each != '\n'], words
+        assert not [each
+                    for each in answer + error if not each.isprintable() and each != '\n'], words
 
 
 def test_messages_are_one_printable_line():
@@ -268,8 +279,10 @@ STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
 @pytest.mark.parametrize('model, calibration, hint', [
     ('', 'effects: {}\n', 'holds none'),
     ('effects: {}\n' + STORED, 'effects: {}\n', 'holds none'),
-    ('', 'effects: {}\ngyro: {serial_number: "8"}\n' + STORED, 'the serial number 8, and the model to one without'),
-    ('effects: {}\ngyro: {serial_number: "7"}\n', 'effects: {}\n' + STORED, 'without a serial number, and the model to 7'),
+    ('', 'effects: {}\ngyro: {serial_number: "8"}\n' + STORED,
+     'the serial number 8, and the model to one without'),
+    ('effects: {}\ngyro: {serial_number: "7"}\n', 'effects: {}\n' + STORED,
+     'without a serial number, and the model to 7'),
     ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
     ('', '', 'the file'),
 ])
@@ -277,12 +290,14 @@ def test_a_calibration_that_is_not_used_is_told(model, calibration, hint, tmp_pa
     """One that the model file itself has is kept then."""
     (tmp_path / 'model.yaml').write_text(model or 'effects: {}\n')
     (tmp_path / 'calibration.yaml').write_text(calibration)
-    store = StateStore(str(tmp_path / 'model.yaml'), tmp_path / 'calibration.yaml', tmp_path / 'biases.yaml', Prior())
+    store = StateStore(str(tmp_path / 'model.yaml'), tmp_path / 'calibration.yaml',
+                       tmp_path / 'biases.yaml', Prior())
     assert hint in store.hint and 'not used' in store.hint and 'calibrate again' in store.hint
     assert (store.model.self_calibration is not None) == ('self_calibration' in model)
 
 
-@pytest.mark.parametrize('ahead, known', [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
+@pytest.mark.parametrize('ahead, known',
+                         [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
 def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     """Until the clock is right: a robot without a battery for it begins in the past."""
     from gyro_calibration.assumptions import Assumptions
@@ -292,11 +307,13 @@ def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     model = GyroModel(noise=Noise(angle_random_walk=1e-4), self_calibration=calibration)
     live = HeadingEstimator(model, BiasTable(model, Prior()), Assumptions(), Settings(), 10.0, now)
     live.add(0.0, 0.01, now)
-    assert (live.age(now) == max(-ahead, 0.0)) == known == ('later than the clock' not in live.sentence)
+    assert (live.age(now) == max(-ahead, 0.0)) == known == (
+        'later than the clock' not in live.sentence)
     assert known or live.bias_variance > 100.0 * variance
     live.clock_was_set(ahead + 60.0)
     live.add(0.01, 0.01, now + ahead + 60.0)
-    assert 'later than the clock' not in live.sentence and live.age(now + ahead + 60.0) == pytest.approx(60.0)
+    assert ('later than the clock' not in live.sentence
+            and live.age(now + ahead + 60.0) == pytest.approx(60.0))
 
 
 # What grows
@@ -305,7 +322,8 @@ def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
 @pytest.mark.parametrize('count', [1600, 30_000])
 def test_equal_names_of_columns_take_no_longer_than_others(count, tmp_path):
     names = ['x'] * count
-    (tmp_path / 'wide.csv').write_text(f'gyro_dps,x.2,{",".join(names)}\n' + f'1,2,{",".join("3" * count)}\n' * 2)
+    (tmp_path / 'wide.csv').write_text(
+        f'gyro_dps,x.2,{",".join(names)}\n' + f'1,2,{",".join("3" * count)}\n' * 2)
     found = list(read_log(tmp_path / 'wide.csv').others)
     assert found[:4] == ['x.2', 'x', 'x.1', 'x.3'] and len(set(found)) == count + 1
 
@@ -320,11 +338,15 @@ def record(code, body):
 
 def mcap(content, compression, times):
     """Return an MCAP file of so many equal chunks."""
-    compress = {'zstd': lambda data: pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
-                'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
+    compress = {
+        'zstd': lambda data:
+            pytest.importorskip('zstandard').ZstdCompressor(level=19).compress(data),
+        'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[compression]
     packed = compress(content)
-    chunk = record(6, struct.pack('<QQQI', 0, 0, len(content), 0) + text(compression) + struct.pack('<Q', len(packed)) + packed)
-    schema = record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Imu') + text('ros2msg') + text(''))
+    chunk = record(6, struct.pack('<QQQI', 0, 0, len(content), 0) + text(compression)
+                   + struct.pack('<Q', len(packed)) + packed)
+    schema = record(
+        3, struct.pack('<H', 1) + text('sensor_msgs/msg/Imu') + text('ros2msg') + text(''))
     channel = record(4, struct.pack('<HH', 1, 1) + text('/imu') + text('cdr') + text(''))
     return b'\x89MCAP0\r\n' + schema + channel + chunk * times
 
@@ -337,7 +359,8 @@ def small_messages(size):
 @pytest.mark.parametrize('compression', ['zstd', 'lz4'])
 @pytest.mark.parametrize('content', [bytes, small_messages], ids=['zeros', 'messages'])
 def test_a_small_recording_that_unfolds_to_gigabytes_is_refused(content, compression, tmp_path):
-    (tmp_path / 'a.mcap').write_bytes(mcap(content(64 << 20), compression, 40 if compression == 'zstd' else 1))
+    (tmp_path / 'a.mcap').write_bytes(mcap(content(64 << 20), compression,
+                                           40 if compression == 'zstd' else 1))
     refused(tmp_path / 'a.mcap', 'grows to more than 100 times its size')
 
 
@@ -361,30 +384,35 @@ def refused(path, words, megabytes=60):
     assert peak < megabytes << 20
 
 
-PLAIN = 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB'
+PLAIN = (
+    'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB')
 
 
 @pytest.mark.parametrize('messages, more, words', [
     (PLAIN + ' AS (CAST(hex(zeroblob(100000 + id)) AS BLOB)))', '', 'tables of stored columns'),
     (PLAIN + ' AS (CAST(hex(zeroblob(10)) AS BLOB)) STORED)', '', 'tables of stored columns'),
     ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
-     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n', '', 'not a ROS 2 recording'),
+     'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n', '',
+     'not a ROS 2 recording'),
     ('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) '
      'SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(99) AS data FROM n',
-     "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'", 'cannot be read'),
+     "PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE name = "
+     "'messages'", 'cannot be read'),
 ], ids=['generated', 'stored', 'view', 'view called a table'])
 def test_nothing_in_the_schema_of_a_recording_is_computed(messages, more, words, tmp_path):
     with database(tmp_path / 'a.db3') as made:
         made.execute(messages)
         if 'AS (' in messages and 'VIEW' not in messages:
-            made.executemany('INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)', ((row,) for row in range(10)))
+            made.executemany('INSERT INTO messages(topic_id, timestamp) VALUES (1, ?)',
+                             ((row,) for row in range(10)))
         made.executescript(more)
     refused(tmp_path / 'a.db3', words)
 
 
 def database(path):
     made = sqlite3.connect(path)
-    made.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
+    made.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
+                 'serialization_format TEXT)')
     made.execute("INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu', 'cdr')")
     return made
 
@@ -403,15 +431,21 @@ def test_a_trigger_and_large_messages_of_others_leave_a_recording_as_it_is(tmp_p
 
 
 ODD = {
-    'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n', 'header': b'time_s,gyro_dps\n',
+    'empty': b'', 'a newline': b'\n', 'one row': b'time_s,gyro_dps\n0,1\n',
+    'header': b'time_s,gyro_dps\n',
     'two rows': b'time_s,gyro_dps\n0,1\n1,1\n', 'all zero': rb'0,0', 'all equal': rb'0,5',
-    'huge': rb'0,1e19', 'tiny': rb'0,1e-300', 'one huge': rb'0,0', 'signs': rb'0,-1e19', 'nan': rb'0,nan',
+    'huge': rb'0,1e19', 'tiny': rb'0,1e-300', 'one huge': rb'0,0', 'signs': rb'0,-1e19',
+    'nan': rb'0,nan',
     'half nan': rb'0,nan', 'fast': rb'0,1', 'slow': rb'0,1',
-    'semicolons': b'time_s;gyro_dps\n0;1\n1;1\n', 'commas as points': b'time_s;gyro_dps\n0,0;1,5\n0,1;1,5\n',
-    'utf-16': 'time_s,gyro_dps\n0,1\n1,1\n'.encode('utf-16'), 'latin-1': 'time_s,gyro_dps,ä\n0,1,ö\n1,1,ü\n'.encode('latin-1'),
-    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'quotes': b'time_s,gyro_dps\n"0,1\n1,1\n', 'not packed': b'\x1f\x8b\x08abc',
+    'semicolons': b'time_s;gyro_dps\n0;1\n1;1\n',
+    'commas as points': b'time_s;gyro_dps\n0,0;1,5\n0,1;1,5\n',
+    'utf-16': 'time_s,gyro_dps\n0,1\n1,1\n'.encode('utf-16'),
+    'latin-1': 'time_s,gyro_dps,ä\n0,1,ö\n1,1,ü\n'.encode('latin-1'),
+    'zero bytes': b'time_s,gyro_dps\n0,1\0\n1,1\n', 'quotes': b'time_s,gyro_dps\n"0,1\n1,1\n',
+    'not packed': b'\x1f\x8b\x08abc',
     'tabs': b'time_s\tgyro_dps\n0\t1\n1\t1\n', 'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
-    'bom and crlf': b'\xef\xbb\xbftime_s,gyro_dps\r\n0,1\r\n1,2\r\n2,1\r\n', 'cr': b'time_s,gyro_dps\r0,1\r1,2\r2,1\r',
+    'bom and crlf': b'\xef\xbb\xbftime_s,gyro_dps\r\n0,1\r\n1,2\r\n2,1\r\n',
+    'cr': b'time_s,gyro_dps\r0,1\r1,2\r2,1\r',
 }
 
 
@@ -421,10 +455,12 @@ def odd_log(name):
         return ODD[name]
     value = ODD[name].partition(b',')[2].decode()
     step = {'fast': 1e-9, 'slow': 1e17}.get(name, 0.01)
-    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300 else '1' if name == 'half nan' and row % 2 else value, row % 60)
+    rows = [(f'{row * step!r}', '1e19' if name == 'one huge' and row == 300
+             else '1' if name == 'half nan' and row % 2 else value, row % 60)
             for row in range(600)]
     columns = 'time_s,gyro_rad_s,reference_rate_rad_s,temperature_degc'
-    return '\n'.join([columns, *(f'{time},{rate},{rate},{warm}' for time, rate, warm in rows), '']).encode()
+    return '\n'.join([columns,
+                      *(f'{time},{rate},{rate},{warm}' for time, rate, warm in rows), '']).encode()
 
 
 VERBS = {
@@ -432,11 +468,15 @@ VERBS = {
     'rest': 'compensate {log} --model {model} --out {out} --rest',
     'hindsight': 'compensate {log} --model {model} --out {out} --hindsight',
     'counts': 'compensate {log} --model {model} --out {out} --sensitivity 1e19',
-    'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19', 'fit': 'fit {log} --out {out}',
+    'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19',
+    'fit': 'fit {log} --out {out}',
     'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
-    'profile': 'self-calibrate {log} --profile {log} --out {out}', 'turns': 'self-calibrate {log} --turns nearest --out {out}',
-    'turn': 'turn {log} --model {model}', 'plan': 'plan --limits {log}', 'simulate': 'simulate --motion {log} --model {model} --out {out}',
-    'diagnose': 'diagnose {log} --out {folder}', 'as a model': 'compensate {log} --model {log} --out {out}',
+    'profile': 'self-calibrate {log} --profile {log} --out {out}',
+    'turns': 'self-calibrate {log} --turns nearest --out {out}',
+    'turn': 'turn {log} --model {model}', 'plan': 'plan --limits {log}',
+    'simulate': 'simulate --motion {log} --model {model} --out {out}',
+    'diagnose': 'diagnose {log} --out {folder}',
+    'as a model': 'compensate {log} --model {log} --out {out}',
 }
 
 
@@ -444,15 +484,19 @@ VERBS = {
 def test_no_odd_log_ends_a_verb_in_a_traceback(verb, tmp_path, run):
     """What is finite is answered in finite numbers, and what is refused leaves no file."""
     model = tmp_path / 'model.yaml'
-    model.write_text('effects: {bias: {bias: 0.1}, cubic_nonlinearity: {cubic_nonlinearity: 1.0e-3}}\nnoise: {angle_random_walk: 1.0e-4}\n')
+    model.write_text(
+        'effects: {bias: {bias: 0.1}, cubic_nonlinearity: {cubic_nonlinearity: 1.0e-3}}\n'
+        'noise: {angle_random_walk: 1.0e-4}\n')
     for name in ODD:
         log, out = tmp_path / 'log.csv', tmp_path / 'out.csv'
         log.write_bytes(odd_log(name))
-        words = [word.format(log=log, out=out, model=model, folder=tmp_path / 'found') for word in VERBS[verb].split()]
+        words = [word.format(log=log, out=out, model=model, folder=tmp_path / 'found')
+                 for word in VERBS[verb].split()]
         with np.errstate(all='ignore'):
             code, answer, error = run(*words, '--json')
         said = [line for line in error.splitlines() if line.startswith('gyro_calibration: ')]
-        assert code in (0, 1, 2) and len(said) == (code > 0) and bool(answer) == (code == 0), (name, error)
+        assert (code in (0, 1, 2) and len(said) == (code > 0)
+                and bool(answer) == (code == 0)), (name, error)
         assert not answer or json.loads(answer)
         assert code == 0 or not out.exists(), name
         out.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The package as users get it: from colcon and from pip, with data files and with what `ros2 run` finds."""
+"""The package as installed by colcon and by pip, with data files and programs for `ros2 run`."""
 
 import ast
 import importlib.metadata
@@ -19,7 +19,8 @@ ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
          'gyro_calibration', 'config', 'launch', 'bin', 'lib', 'resource']
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
-COLCON = shutil.which('colcon', path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
+COLCON = shutil.which('colcon',
+                      path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
 needs_colcon = pytest.mark.skipif(COLCON is None, reason='colcon is not installed')
 
 
@@ -36,19 +37,24 @@ def source(tmp_path_factory):
 
 def run(*command, folder):
     """Run a command without the checkout on its Python path, and return what it prints."""
-    paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep) if path and Path(path) != ROOT]
+    paths = [path for path in os.environ.get('PYTHONPATH', '').split(os.pathsep)
+             if path and Path(path) != ROOT]
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(paths)}
-    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True,
+                            text=True, timeout=120)
     assert result.returncode == 0, f'{command}:\n{result.stdout}{result.stderr}'
     return result.stdout
 
 
 def expected_data():
     """Return the data files of an installed package below its prefix."""
-    files = {f'share/gyro_calibration/{file.relative_to(ROOT)}' for file in (ROOT / 'config').rglob('*.*')}
+    files = {f'share/gyro_calibration/{file.relative_to(ROOT)}'
+             for file in (ROOT / 'config').rglob('*.*')}
     assert 'share/gyro_calibration/config/sros2/policy.xml' in files
-    files |= {f'share/gyro_calibration/launch/{file.name}' for file in (ROOT / 'launch').glob('*.launch.py')}
-    files |= {'share/gyro_calibration/package.xml', 'share/ament_index/resource_index/packages/gyro_calibration'}
+    files |= {f'share/gyro_calibration/launch/{file.name}'
+              for file in (ROOT / 'launch').glob('*.launch.py')}
+    files |= {'share/gyro_calibration/package.xml',
+              'share/ament_index/resource_index/packages/gyro_calibration'}
     return files | {f'lib/gyro_calibration/{name}' for name in EXECUTABLES}
 
 
@@ -59,12 +65,15 @@ def test_the_version_of_the_manifest_is_the_version_of_the_module():
 
 def imported():
     """Return the libraries that the package and its launch files import, as rosdep calls them."""
-    nodes = [node for folder in ('gyro_calibration', 'launch') for file in (ROOT / folder).rglob('*.py')
+    nodes = [node for folder in ('gyro_calibration', 'launch')
+             for file in (ROOT / folder).rglob('*.py')
              for node in ast.walk(ast.parse(file.read_text()))]
     names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
-    roots = {name.partition('.')[0] for name in names} - sys.stdlib_module_names - {'gyro_calibration'}
-    return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'} else root for root in roots}
+    roots = ({name.partition('.')[0] for name in names} - sys.stdlib_module_names
+             - {'gyro_calibration'})
+    return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'}
+            else root for root in roots}
 
 
 def test_the_manifest_names_exactly_what_is_imported():
@@ -102,7 +111,8 @@ def test_colcon_sees_a_ros_package(source, tmp_path):
     verbs = run(COLCON, '--log-base', tmp_path, '--help', folder=source)
     if 'list' not in verbs:
         pytest.skip('colcon is installed without its verb list (colcon-package-information)')
-    assert run(COLCON, '--log-base', tmp_path, 'list', folder=source).split() == ['gyro_calibration', '.', '(ros.ament_python)']
+    assert run(COLCON, '--log-base', tmp_path, 'list', folder=source).split() == [
+        'gyro_calibration', '.', '(ros.ament_python)']
 
 
 @needs_colcon
@@ -140,15 +150,19 @@ def test_bloom_puts_nothing_on_the_path_but_the_command_line(source, tmp_path):
 def test_the_wheel_holds_what_colcon_installs(source, tmp_path):
     pytest.importorskip('setuptools', reason='setuptools is not installed')
     pytest.importorskip('wheel', reason='wheel is not installed')
-    options = ['--quiet', '--no-deps', '--no-build-isolation', '--no-index', '--wheel-dir', tmp_path]
+    options = ['--quiet', '--no-deps', '--no-build-isolation', '--no-index',
+               '--wheel-dir', tmp_path]
     run(sys.executable, '-m', 'pip', 'wheel', *options, source, folder=tmp_path)
     wheel, = tmp_path.glob('*.whl')
     with zipfile.ZipFile(wheel) as archive:
-        data = {name.split('.data/data/')[1]: archive.getinfo(name) for name in archive.namelist() if '.data/data/' in name}
+        data = {name.split('.data/data/')[1]: archive.getinfo(name)
+                for name in archive.namelist() if '.data/data/' in name}
         parts = {name for name in archive.namelist() if name.startswith('gyro_calibration/')}
     assert set(data) == expected_data()
-    assert all(data[f'lib/gyro_calibration/{name}'].external_attr >> 16 & 0o111 for name in EXECUTABLES)
-    assert parts == {str(file.relative_to(ROOT)) for file in (ROOT / 'gyro_calibration').rglob('*.*') if file.suffix != '.pyc'}
+    assert all(data[f'lib/gyro_calibration/{name}'].external_attr >> 16 & 0o111
+               for name in EXECUTABLES)
+    assert parts == {str(file.relative_to(ROOT))
+                     for file in (ROOT / 'gyro_calibration').rglob('*.*') if file.suffix != '.pyc'}
     check_metadata(wheel)
 
 

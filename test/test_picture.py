@@ -1,4 +1,4 @@
-"""Pictures: units on every axis, nothing on top of something else, and nothing said by colour alone."""
+"""Pictures: units on every axis, no overlapping texts, and nothing stated by colour alone."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,18 +10,25 @@ from gyro_calibration.calibration import fit_effects
 from gyro_calibration.dwells import Dwells, take
 from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 from gyro_calibration.log import DEGREE
-from gyro_calibration.picture import draw_error_surface, draw_headings, draw_residuals, draw_turn_errors
+from gyro_calibration.picture import (
+    draw_error_surface,
+    draw_headings,
+    draw_residuals,
+    draw_turn_errors,
+)
 from gyro_calibration.turn import SLOWEST, predicted_rates, turn_errors
 
 
 def table():
-    """Return six sweeps of a gyro with a sine response at -10 to 40 degC; two dwells are outlying."""
+    """Return six sweeps with a sine response at -10 to 40 degC and two outlying dwells."""
     generator = np.random.default_rng(1)
     rate = np.tile(np.concatenate([[0.0], np.arange(-100.0, 101.0, 20.0)]) * DEGREE, 6)
     temperature = np.repeat(np.linspace(-10.0, 40.0, 6), 12) + generator.normal(0.0, 0.3, 72)
-    output = np.sin(0.25 * rate) / 0.25 + (0.002 + 1e-4 * temperature) + 1e-4 * temperature * rate + generator.normal(0.0, 3e-4, 72)
+    output = (np.sin(0.25 * rate) / 0.25 + (0.002 + 1e-4 * temperature) + 1e-4 * temperature * rate
+              + generator.normal(0.0, 3e-4, 72))
     output[[20, 50]] += np.array([30.0, -3.0]) * DEGREE
-    return Dwells(rate, output, temperature, np.full(72, np.nan), np.repeat(np.arange(6), 12), tuple(map(str, range(72))))
+    return Dwells(rate, output, temperature, np.full(72, np.nan), np.repeat(np.arange(6), 12),
+                  tuple(map(str, range(72))))
 
 
 MEASURED = table()
@@ -29,7 +36,8 @@ MEASURED = table()
 
 @cache
 def warm():
-    return fit_effects(MEASURED, (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE, CATALOGUE['scale_factor_temperature']))
+    return fit_effects(MEASURED, (BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE,
+                                  CATALOGUE['scale_factor_temperature']))
 
 
 @cache
@@ -47,18 +55,21 @@ def fitted(fit):
 
 def draw_turns(path, fit):
     kept = fit.scatter.kept
-    draw_turn_errors(path, turn_errors(take(fit.dwells, kept), predicted_rates(fit)[kept]), SLOWEST)
+    draw_turn_errors(path,
+                     turn_errors(take(fit.dwells, kept), predicted_rates(fit)[kept]), SLOWEST)
 
 
 def draw_drive(path):
     time = np.linspace(0.0, 10.0, 50)
-    draw_headings(path, time, np.sin(time), {'pure integration': np.sin(time) + 0.01 * time, 'compensated': np.sin(time) + 0.001 * time})
+    draw_headings(path, time, np.sin(time), {'pure integration': np.sin(time) + 0.01 * time,
+                                             'compensated': np.sin(time) + 0.001 * time})
 
 
 IN_GREY = {
     'surface': lambda path: draw_surface(path, warm(), fitted(warm())),
     'surface without dwells': lambda path: draw_surface(path, warm()),
-    'surface without temperature': lambda path: draw_surface(path, without_temperature(), fitted(without_temperature())),
+    'surface without temperature': lambda path: draw_surface(
+        path, without_temperature(), fitted(without_temperature())),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
     'turns': lambda path: draw_turns(path, warm()),
@@ -96,19 +107,24 @@ def test_every_axis_says_what_it_shows_and_in_which_unit(figure_of, draw):
     figure = figure_of(draw)
     panels = [axes for axes in figure.axes if axes.get_label() != '<colorbar>']
     assert panels and all('[' in axes.get_ylabel() for axes in panels)
-    assert all('[' in axes.get_xlabel() for axes in panels if axes.xaxis.get_tick_params()['labelbottom'])
-    bars = [axes.get_xlabel() or axes.get_ylabel() for axes in figure.axes if axes.get_label() == '<colorbar>']
+    assert all('[' in axes.get_xlabel()
+               for axes in panels if axes.xaxis.get_tick_params()['labelbottom'])
+    bars = [axes.get_xlabel() or axes.get_ylabel()
+            for axes in figure.axes if axes.get_label() == '<colorbar>']
     assert all('[' in label for label in bars)
 
 
 def texts(figure):
-    """Return the boxes of all texts but the numbers at the axes, and of the legends, by what they say."""
+    """Return the boxes of all texts except axis numbers, and of the legends, by their text."""
     from matplotlib.text import Text
-    numbers = {id(text) for panel in figure.axes for axes in (panel, *panel.child_axes) for axis in (axes.xaxis, axes.yaxis)
-               for text in (*axis.get_ticklabels(), *axis.get_ticklabels(minor=True), axis.get_offset_text())}
+    numbers = {id(text) for panel in figure.axes for axes in (panel, *panel.child_axes)
+               for axis in (axes.xaxis, axes.yaxis)
+               for text in (*axis.get_ticklabels(), *axis.get_ticklabels(minor=True),
+                            axis.get_offset_text())}
     legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
     numbers |= {id(text) for legend in legends for text in legend.findobj(Text)}
-    shown = [text for text in figure.findobj(Text) if id(text) not in numbers and text.get_visible() and text.get_text().strip()]
+    shown = [text for text in figure.findobj(Text)
+             if id(text) not in numbers and text.get_visible() and text.get_text().strip()]
     boxes = [(text.get_text(), text.get_window_extent()) for text in shown]
     return boxes + [('legend', legend.get_window_extent()) for legend in legends]
 
@@ -118,9 +134,11 @@ def test_no_text_covers_another_or_leaves_the_paper(figure_of, draw):
     figure = figure_of(draw)
     boxes = texts(figure)
     assert len(boxes) > 3
-    overlaps = [(first, second) for number, (first, a) in enumerate(boxes) for second, b in boxes[number + 1:] if a.overlaps(b)]
+    overlaps = [(first, second) for number, (first, a) in enumerate(boxes)
+                for second, b in boxes[number + 1:] if a.overlaps(b)]
     assert not overlaps
-    outside = [text for text, box in boxes if box.x0 < 0 or box.y0 < 0 or box.x1 > figure.bbox.x1 or box.y1 > figure.bbox.y1]
+    outside = [text for text, box in boxes
+               if box.x0 < 0 or box.y0 < 0 or box.x1 > figure.bbox.x1 or box.y1 > figure.bbox.y1]
     assert not outside
 
 
@@ -133,7 +151,8 @@ def test_pictures_of_rate_tables_have_no_colours(pyplot, draw, tmp_path):
 
 
 @each_picture
-def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(pyplot, draw, tmp_path):
+def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(
+        pyplot, draw, tmp_path):
     draw(tmp_path / 'picture.svg')
     text = (tmp_path / 'picture.svg').read_text()
     assert '<svg' in text and 'deg' in text and text.rstrip().endswith('</svg>')
@@ -145,22 +164,28 @@ def test_outlying_dwells_are_marked_and_do_not_set_the_scale(figure_of):
     assert set(outlying) >= {20, 50}
     for axes in figure_of(lambda path: draw_residuals(path, warm())).axes[:4]:
         assert axes.get_legend().get_texts()[0].get_text().startswith(f'{len(outlying)} outlying')
-        assert max(map(abs, axes.get_ylim())) < 10.0, 'the scale is that of a dwell that is off by 30 deg/s'
+        assert max(map(abs, axes.get_ylim())) < 10.0, (
+            'the scale is that of a dwell that is off by 30 deg/s')
 
 
 def test_the_residuals_drawn_are_those_of_the_calibration(figure_of):
     figure = figure_of(lambda path: draw_residuals(path, warm()))
     kept = warm().scatter.kept
     after = figure.axes[2].collections[0].get_offsets()
-    np.testing.assert_allclose(after, np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)
+    np.testing.assert_allclose(after,
+                               np.column_stack([MEASURED.rate, warm().residual])[kept] / DEGREE)
     before = figure.axes[1].collections[0].get_offsets()
-    np.testing.assert_allclose(before, np.column_stack([MEASURED.temperature, (MEASURED.output - MEASURED.rate) / DEGREE])[kept])
+    np.testing.assert_allclose(before, np.column_stack(
+        [MEASURED.temperature, (MEASURED.output - MEASURED.rate) / DEGREE])[kept])
 
 
 def test_the_curves_of_the_surface_are_what_the_model_takes_off(figure_of):
-    figure = figure_of(lambda path: draw_error_surface(path, warm().model, (-1.5, 1.5), (0.0, 30.0)))
+    figure = figure_of(lambda path: draw_error_surface(path, warm().model,
+                                                       (-1.5, 1.5), (0.0, 30.0)))
     lines = figure.axes[1].get_lines()
-    assert [line.get_label() for line in lines] == ['model at 0.0 °C', 'model at 10.0 °C', 'model at 20.0 °C', 'model at 30.0 °C']
+    assert [line.get_label() for line in lines] == ['model at 0.0 °C', 'model at 10.0 °C',
+                                                    'model at 20.0 °C', 'model at 30.0 °C']
     assert len({line.get_linestyle() for line in lines}) == 4
     output, error = (values * DEGREE for values in lines[1].get_data())
-    np.testing.assert_allclose(warm().model.output(output - error, np.full(len(output), 10.0)), output, atol=1e-9)
+    np.testing.assert_allclose(warm().model.output(output - error, np.full(len(output), 10.0)),
+                               output, atol=1e-9)

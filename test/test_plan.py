@@ -1,4 +1,4 @@
-"""The planned motion: within what the robot can do, accepted, better than a plain one, and worth what was predicted."""
+"""The planned motion: feasible, accepted, better than a plain one, and as good as predicted."""
 
 import json
 import math
@@ -23,21 +23,25 @@ ABILITIES = {
     'a cable': Ability(60 * DEGREE, 120 * DEGREE, lowest=-180 * DEGREE, highest=180 * DEGREE),
     'free': Ability(60 * DEGREE, 120 * DEGREE),
     'a narrow place': Ability(60 * DEGREE, 60 * DEGREE, lowest=-20 * DEGREE, highest=20 * DEGREE),
-    'limited jerk': Ability(60 * DEGREE, 120 * DEGREE, 600 * DEGREE, 5 * DEGREE, -90 * DEGREE, 90 * DEGREE),
+    'limited jerk': Ability(60 * DEGREE, 120 * DEGREE, 600 * DEGREE, 5 * DEGREE, -90 * DEGREE,
+                            90 * DEGREE),
     'one way only': Ability(100 * DEGREE, 200 * DEGREE, lowest=-90 * DEGREE, highest=0.0),
-    'long rests': Ability(30 * DEGREE, 30 * DEGREE, lowest=-50 * DEGREE, highest=100 * DEGREE, rest=4.0),
+    'long rests': Ability(30 * DEGREE, 30 * DEGREE, lowest=-50 * DEGREE, highest=100 * DEGREE,
+                          rest=4.0),
 }
 
 
 @cache
 def planned(name):
-    return best(ABILITIES[name], Forecast(XV3500, 20.0, ROBOT, 160.0), 20.0, np.random.default_rng(0), 30)
+    return best(ABILITIES[name], Forecast(XV3500, 20.0, ROBOT, 160.0), 20.0,
+                np.random.default_rng(0), 30)
 
 
 @pytest.mark.parametrize('name', ABILITIES)
 def test_a_planned_motion_is_one_that_the_robot_can_do(name):
     motion, ability = planned(name).motion, ABILITIES[name]
-    assert able(ability, motion) and motion.duration == pytest.approx(20.0, abs=1e-9) and abs(motion.heading[-1]) < 1e-12
+    assert (able(ability, motion) and motion.duration == pytest.approx(20.0, abs=1e-9)
+            and abs(motion.heading[-1]) < 1e-12)
     for begin in (0.0, 20.0 - ability.rest):
         assert not motion.rate_at(np.linspace(begin + 1e-6, begin + ability.rest - 1e-6, 50)).any()
     steady = np.abs(motion.rate[:-1][np.diff(motion.rate) == 0.0])
@@ -45,63 +49,75 @@ def test_a_planned_motion_is_one_that_the_robot_can_do(name):
 
 
 def test_the_jerk_keeps_its_limit():
-    """Between the points of a ramp the rate is linear, so that the acceleration is known at their middles."""
+    """The rate is linear between points, so that accelerations are known at their middles."""
     motion = planned('limited jerk').motion
     step = np.diff(motion.time)
     acceleration = np.diff(motion.rate) / step
-    assert np.abs(np.diff(acceleration) / (0.5 * (step[1:] + step[:-1]))).max() <= 600 * DEGREE * 1.01
+    assert (np.abs(np.diff(acceleration) / (0.5 * (step[1:] + step[:-1]))).max()
+            <= 600 * DEGREE * 1.01)
 
 
-SLUGGISH = {'hardly any acceleration': Ability(60 * DEGREE, 1 * DEGREE), 'hardly any jerk': Ability(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
+SLUGGISH = {'hardly any acceleration': Ability(60 * DEGREE, 1 * DEGREE),
+            'hardly any jerk': Ability(60 * DEGREE, 120 * DEGREE, 5 * DEGREE)}
 
 
 @pytest.mark.parametrize('name', SLUGGISH)
 def test_a_robot_that_never_gets_to_its_fastest_rate_has_a_motion_too(name):
-    """By hand: from rest to a rate in a quarter of 18 s, at 1 deg/s² to 4.5 deg/s, at 5 deg/s³ to 5 (4.5 / 2)² = 25.3 deg/s."""
+    """In 4.5 s from rest: 1 deg/s² gives 4.5 deg/s, 5 deg/s³ gives 5 (4.5 / 2)² = 25.3 deg/s."""
     ability, forecast = SLUGGISH[name], Forecast(XV3500, 20.0, ROBOT, 160.0)
     fastest = {'hardly any acceleration': 4.5, 'hardly any jerk': 25.3125}[name] * DEGREE
-    simple, motion = plain(ability, 20.0), best(ability, forecast, 20.0, np.random.default_rng(1), 5).motion
+    simple, motion = (plain(ability, 20.0),
+                      best(ability, forecast, 20.0, np.random.default_rng(1), 5).motion)
     for each in (simple, motion):
-        assert able(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9) and abs(each.heading[-1]) < 1e-9
+        assert (able(ability, each) and each.duration == pytest.approx(20.0, abs=1e-9)
+                and abs(each.heading[-1]) < 1e-9)
     assert np.abs(motion.rate).max() == pytest.approx(fastest, rel=0.2)
-    assert ability.reach(9.0) == pytest.approx(4.5 * fastest) and ability.fastest(4.5 * fastest) == pytest.approx(fastest)
+    assert (ability.reach(9.0) == pytest.approx(4.5 * fastest)
+            and ability.fastest(4.5 * fastest) == pytest.approx(fastest))
 
 
 @pytest.mark.parametrize('name', ABILITIES)
 def test_it_tells_the_scale_better_than_a_plain_motion(name):
     forecast = Forecast(XV3500, 20.0, ROBOT, 160.0)
     simple = plain(ABILITIES[name], 20.0)
-    assert able(ABILITIES[name], simple) and abs(simple.heading[-1]) < 1e-12 and simple.duration == pytest.approx(20.0, abs=1e-9)
-    assert planned(name).prediction.scale_deviation < 0.75 * forecast.predict(simple).scale_deviation
+    assert (able(ABILITIES[name], simple) and abs(simple.heading[-1]) < 1e-12
+            and simple.duration == pytest.approx(20.0, abs=1e-9))
+    assert (planned(name).prediction.scale_deviation
+            < 0.75 * forecast.predict(simple).scale_deviation)
 
 
 def test_no_random_motion_that_the_robot_can_do_is_better():
-    """500 motions of two to eight turns with rates, angles and rests of their own, stretched until time or place end."""
-    ability, forecast, generator = ABILITIES['a cable'], Forecast(XV3500, 20.0, ROBOT, 160.0), np.random.default_rng(3)
+    """500 motions of random turns, rates and rests, stretched to the limit of time or place."""
+    ability, forecast, generator = (ABILITIES['a cable'], Forecast(XV3500, 20.0, ROBOT, 160.0),
+                                    np.random.default_rng(3))
     family, errors = _Family(ability, 20.0), []
     for _ in range(500):
         ends = np.append(generator.uniform(-1.0, 1.0, generator.integers(1, 8)), 0.0)
-        rows = family._timed(np.diff(ends, prepend=0.0), generator.uniform(0.2, 1.0, len(ends)), 0.0)
+        rows = family._timed(np.diff(ends, prepend=0.0),
+                             generator.uniform(0.2, 1.0, len(ends)), 0.0)
         if rows is not None:
             errors.append(forecast.error(profile(ability, rows, 1.0)))
     assert len(errors) > 100 and min(errors) > forecast.error(planned('a cable').motion)
 
 
 def test_the_same_seed_plans_the_same_motion():
-    first, second = (best(ABILITIES['free'], Forecast(XV3500, 10.0, ROBOT, 160.0), 10.0, np.random.default_rng(4), 10) for _ in range(2))
-    assert np.array_equal(first.motion.time, second.motion.time) and np.array_equal(first.motion.rate, second.motion.rate)
+    first, second = (best(ABILITIES['free'], Forecast(XV3500, 10.0, ROBOT, 160.0), 10.0,
+                          np.random.default_rng(4), 10) for _ in range(2))
+    assert (np.array_equal(first.motion.time, second.motion.time)
+            and np.array_equal(first.motion.rate, second.motion.rate))
 
 
 def test_the_bias_is_as_well_known_as_white_noise_allows_whatever_the_motion():
     """N / sqrt(T); the fit weighs means over blocks, which costs half a percent at the ends."""
     forecast = Forecast(WHITE, 20.0, ROBOT, 160.0)
     expected = WHITE.angle_random_walk / math.sqrt(20.0)
-    for motion in (CALIBRATION, *(planned(name).motion for name in ABILITIES), plain(ABILITIES['free'], 20.0)):
+    for motion in (CALIBRATION, *(planned(name).motion for name in ABILITIES),
+                   plain(ABILITIES['free'], 20.0)):
         assert forecast.predict(motion).bias_deviation == pytest.approx(expected, rel=0.01)
 
 
 def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulated():
-    """The mean over 20 s against the mean over the next 160 s; 1500 runs tell a standard deviation to 1.8 %."""
+    """Compare means of 20 s and the next 160 s; 1500 runs give a deviation to 1.8 %."""
     for noise in (Noise(1e-9, 1e-4), Noise(1e-9, 0.0, 1e-5)):
         generator, differences = np.random.default_rng(0), []
         for _ in range(1500):
@@ -112,13 +128,14 @@ def test_flicker_and_random_walk_part_the_bias_from_that_of_the_drive_as_simulat
 
 
 def followed(motion, late, lag):
-    """Return the rate of a robot that follows late and with a first-order lag, s, at the samples."""
+    """Return the sampled rate of a robot with a delay and a first-order lag, s."""
     rate = motion.rate_at(np.arange(20001) / 1000.0 - late)
     response = np.exp(-np.arange(2000) / 1000.0 / lag) if lag else np.ones(1)
     return np.convolve(rate, response / response.sum())[:20001:10]
 
 
-FOLLOWED = {'as planned': ('a cable', 0.0, 0.0), 'late by 0.05 s, lag of 0.1 s': ('limited jerk', 0.05, 0.1)}
+FOLLOWED = {'as planned': ('a cable', 0.0, 0.0),
+            'late by 0.05 s, lag of 0.1 s': ('limited jerk', 0.05, 0.1)}
 
 
 @pytest.mark.parametrize('name, late, lag', FOLLOWED.values(), ids=FOLLOWED)
@@ -127,7 +144,8 @@ def test_fits_scatter_as_predicted(name, late, lag):
     motion, errors = planned(name).motion, []
     rate = followed(motion, late, lag)
     for seed in range(40):
-        fit = fit_likelihood(TIME, rate + simulate_noise(WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])), motion, 0.2)
+        fit = fit_likelihood(TIME, rate + simulate_noise(
+            WHITE, len(TIME), 0.01, np.random.default_rng([2, seed])), motion, 0.2)
         errors.append((fit.scale_factor_error, fit.bias))
     expected = Forecast(WHITE, 20.0, ROBOT, 160.0).predict(motion)
     ratios = np.std(errors, axis=0, ddof=1) / (expected.scale_deviation, expected.bias_deviation)
@@ -135,7 +153,7 @@ def test_fits_scatter_as_predicted(name, late, lag):
 
 
 def test_the_heading_of_a_drive_errs_as_predicted():
-    """300 runs of white noise with known weights: s and b from sums, so that only the mapping is tested."""
+    """300 runs of white noise; s and b are weighted sums, so that only the mapping is tested."""
     noise, generator, drive = WHITE, np.random.default_rng(1), np.arange(1, 1601) / 10.0
     rate, errors = CALIBRATION.rate_at(TIME), []
     for _ in range(300):
@@ -144,14 +162,16 @@ def test_the_heading_of_a_drive_errs_as_predicted():
         walk = np.cumsum(simulate_noise(noise, len(drive), 0.1, generator)) * 0.1
         errors.append(np.abs(walk - s * ROBOT.heading_at(drive) - b * drive).mean())
     error = np.std(errors) / math.sqrt(len(errors))
-    assert Forecast(noise, 20.0, ROBOT, 160.0).predict(CALIBRATION).heading_error == pytest.approx(np.mean(errors), abs=3.0 * error)
+    assert Forecast(noise, 20.0, ROBOT, 160.0).predict(CALIBRATION).heading_error == pytest.approx(
+        np.mean(errors), abs=3.0 * error)
 
 
 def test_where_the_drive_turns_round_and_round_the_motion_gains_heading():
     round_and_round = turns([(160.0, 45.0)])
     forecast, generator = Forecast(XV3500, 20.0, round_and_round, 160.0), np.random.default_rng(0)
     chosen = best(ABILITIES['free'], forecast, 20.0, generator, 15).prediction
-    assert chosen.heading_error < 0.85 * forecast.predict(plain(ABILITIES['free'], 20.0)).heading_error
+    assert (chosen.heading_error
+            < 0.85 * forecast.predict(plain(ABILITIES['free'], 20.0)).heading_error)
 
 
 @pytest.mark.parametrize('name', ABILITIES)
@@ -159,15 +179,18 @@ def test_the_file_is_read_and_a_run_of_it_calibrates(name, tmp_path):
     write_motion(tmp_path / 'profile.csv', planned(name).motion)
     motion = read_motion(tmp_path / 'profile.csv')
     noise = simulate_noise(XV3500, len(TIME), 0.01, np.random.default_rng(0))
-    fit = self_calibrate(TIME, 1.03 * planned(name).motion.rate_at(TIME) + 0.001 + noise, motion, noise=XV3500)
+    fit = self_calibrate(TIME, 1.03 * planned(name).motion.rate_at(TIME) + 0.001 + noise,
+                         motion, noise=XV3500)
     assert abs(fit.scale_factor_error - 0.03) < 4.0 * math.sqrt(fit.covariance[0, 0])
 
 
 IMPOSSIBLE = {
     'no time': (Ability(1.0, 2.0, rest=10.0), 20.0, '20 s are too short for rests of 10 s'),
     'no time at the slowest rate': (Ability(1.0, 0.5, slowest=0.5, rest=1.0), 5.0, 'too short'),
-    'no place': (Ability(1.0, 2.0, lowest=0.0, highest=0.0), 20.0, 'the place leaves a turn of 0 deg'),
-    'no place at the slowest rate': (Ability(1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5), 20.0, 'more place or more acceleration'),
+    'no place': (Ability(1.0, 2.0, lowest=0.0, highest=0.0), 20.0,
+                 'the place leaves a turn of 0 deg'),
+    'no place at the slowest rate': (Ability(1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5),
+                                     20.0, 'more place or more acceleration'),
     'nothing worth it': (Ability(0.01, 0.02), 20.0, 'tells the scale to'),
     'next to no time': (Ability(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
 }
@@ -176,7 +199,8 @@ IMPOSSIBLE = {
 @pytest.mark.parametrize('ability, seconds, reason', IMPOSSIBLE.values(), ids=IMPOSSIBLE)
 def test_the_impossible_is_refused_in_a_sentence(ability, seconds, reason):
     with pytest.raises(DataRefused) as refused:
-        best(ability, Forecast(XV3500, seconds, ROBOT, 160.0), seconds, np.random.default_rng(0), 5)
+        best(ability, Forecast(XV3500, seconds, ROBOT, 160.0), seconds,
+             np.random.default_rng(0), 5)
     assert reason in str(refused.value) and '\n' not in str(refused.value)
 
 
@@ -185,35 +209,44 @@ def limits(tmp_path):
     """Return a function that writes limits and returns the file."""
     def write(**values):
         path = tmp_path / 'limits.yaml'
-        path.write_text(yaml.safe_dump({'maximum_rate_dps': 60, 'maximum_acceleration_dps2': 120, **values}))
+        path.write_text(
+            yaml.safe_dump({'maximum_rate_dps': 60, 'maximum_acceleration_dps2': 120, **values}))
         return path
     return write
 
 
 def test_the_verb_writes_a_profile_and_says_what_it_is_worth(run, limits, tmp_path):
-    code, text, _ = run('plan', '--limits', limits(maximum_heading_deg=90.0), '--seconds', 60, '--out', tmp_path / 'profile.csv', '--json')
+    code, text, _ = run('plan', '--limits', limits(maximum_heading_deg=90.0), '--seconds', 60,
+                        '--out', tmp_path / 'profile.csv', '--json')
     answer, motion = json.loads(text), read_motion(tmp_path / 'profile.csv')
-    assert code == 0 and motion.duration == pytest.approx(60.0) and motion.heading.max() < 90.01 * DEGREE
+    assert (code == 0 and motion.duration == pytest.approx(60.0)
+            and motion.heading.max() < 90.01 * DEGREE)
     assert [each['duration_s'] for each in answer['more_seconds']] == [120.0]
-    assert answer['scale_gain'] > 1.5 and answer['more_seconds'][0]['bias_deviation'] < answer['planned']['bias_deviation']
+    assert (answer['scale_gain'] > 1.5
+            and answer['more_seconds'][0]['bias_deviation'] < answer['planned']['bias_deviation'])
     assert answer['drive_s'] == 160.0 and answer['built_in_within_limits'] is False
 
 
 def test_the_verb_speaks_to_people(run, limits, tmp_path, monkeypatch):
     monkeypatch.setattr('gyro_calibration.cli.plan.LENGTHS', (12.0,))
     write_motion(tmp_path / 'drive.csv', from_rates(np.array([0.0, 10.0]), np.array([0.5, 0.5])))
-    code, text, _ = run('plan', '--limits', limits(), '--seconds', 10, '--motion', tmp_path / 'drive.csv', '--drive', 30)
-    assert code == 0 and 'planned, 12 s:' in text and 'heading over 30 s' in text and text.count('mean heading error') == 4
+    code, text, _ = run('plan', '--limits', limits(), '--seconds', 10,
+                        '--motion', tmp_path / 'drive.csv', '--drive', 30)
+    assert (code == 0 and 'planned, 12 s:' in text and 'heading over 30 s' in text
+            and text.count('mean heading error') == 4)
 
 
 WRONG = {
     'unknown': ({'maximum_speed': 3}, 'maximum_speed'),
-    'no acceleration': ({'maximum_acceleration_dps2': 0}, 'maximum_acceleration_dps2 is 0; wanted a number from 0.01'),
+    'no acceleration': ({'maximum_acceleration_dps2': 0},
+                        'maximum_acceleration_dps2 is 0; wanted a number from 0.01'),
     'a text': ({'maximum_rate_dps': 'fast'}, 'maximum_rate_dps is \'fast\''),
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),
-    'start outside the place': ({'minimum_heading_deg': 10}, 'minimum_heading_deg is 10; wanted a number from -1e+06 to 0'),
-    'slowest above fastest': ({'minimum_rate_dps': 70}, 'minimum_rate_dps is above maximum_rate_dps'),
+    'start outside the place': ({'minimum_heading_deg': 10},
+                                'minimum_heading_deg is 10; wanted a number from -1e+06 to 0'),
+    'slowest above fastest': ({'minimum_rate_dps': 70},
+                              'minimum_rate_dps is above maximum_rate_dps'),
 }
 
 
@@ -223,14 +256,16 @@ def test_wrong_limits_are_wrong_use(run, limits, values, reason):
     assert code == 2 and reason in said and said.count('\n') == 1 and not text
 
 
-@pytest.mark.parametrize('text', ['', '[1, 2]', 'maximum_rate_dps: 60', '{', '!!python/object/apply:os.getcwd []', '\0'])
+@pytest.mark.parametrize('text', ['', '[1, 2]', 'maximum_rate_dps: 60', '{',
+                                  '!!python/object/apply:os.getcwd []', '\0'])
 def test_a_file_that_holds_no_limits_is_wrong_use(run, tmp_path, text):
     (tmp_path / 'limits.yaml').write_text(text)
     code, _, said = run('plan', '--limits', tmp_path / 'limits.yaml')
     assert code == 2 and 'limits.yaml' in said and said.count('\n') == 1
 
 
-@pytest.mark.parametrize('options', [('--seconds', 301), ('--seconds', 0), ('--model', 'quiet.yaml'), ('--motion', 'nowhere.csv')])
+@pytest.mark.parametrize('options', [('--seconds', 301), ('--seconds', 0),
+                                     ('--model', 'quiet.yaml'), ('--motion', 'nowhere.csv')])
 def test_wrong_options_are_wrong_use(run, limits, tmp_path, monkeypatch, options):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'quiet.yaml').write_text('effects: {bias: {bias: 0.01}}')
@@ -241,7 +276,9 @@ def test_wrong_options_are_wrong_use(run, limits, tmp_path, monkeypatch, options
 
 
 def test_hardly_any_place_is_no_answer(run, limits):
-    code, text, said = run('plan', '--limits', limits(maximum_heading_deg=1e-7, minimum_heading_deg=0), '--seconds', 8)
+    code, text, said = run(
+        'plan', '--limits', limits(maximum_heading_deg=1e-7, minimum_heading_deg=0),
+        '--seconds', 8)
     assert code == 1 and not text and 'more place' in said and said.count('\n') == 1
 
 
