@@ -29,14 +29,16 @@ def values(*frames):
     return [(sample.temperature, dict(sample.health)) for sample in decoded(*frames)]
 
 
-@pytest.mark.parametrize('count', [0, 1, -1, 0x7FFFFF, -0x7FFFFF, -0x800000, 0x8000, -0x8000, 0x010203])
+@pytest.mark.parametrize('count',
+                         [0, 1, -1, 0x7FFFFF, -0x7FFFFF, -0x800000, 0x8000, -0x8000, 0x010203])
 def test_counts_have_a_sign(count):
     sample, = decoded(frame(count))
     assert sample.output == count
     assert decoded(PROTOCOL.encode(Sample(float(count)), ONE_COUNT))[0].output == count
 
 
-@pytest.mark.parametrize('raw, degrees', [(0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0)])
+@pytest.mark.parametrize('raw, degrees',
+                         [(0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0)])
 def test_the_temperature_comes_in_two_frames(raw, degrees):
     high, low = raw.to_bytes(2, 'big', signed=True)
     (first, _), (second, _) = values(frame(1, 0, high), frame(2, 1, low))
@@ -44,8 +46,8 @@ def test_the_temperature_comes_in_two_frames(raw, degrees):
 
 
 @pytest.mark.parametrize('number, name, raw, value', [
-    (2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1), (6, 'diagnostic_v', 13107, 1.0),
-    (2, 'supply_v', -16384, -5.0),
+    (2, 'supply_v', 16384, 5.0), (4, 'source_current_a', 13107, 0.1),
+    (6, 'diagnostic_v', 13107, 1.0), (2, 'supply_v', -16384, -5.0),
 ])
 def test_each_other_value_comes_in_two_frames(number, name, raw, value):
     high, low = raw.to_bytes(2, 'big', signed=True)
@@ -56,7 +58,8 @@ def test_each_other_value_comes_in_two_frames(number, name, raw, value):
 def test_all_values_come_round_and_are_good():
     encode = PROTOCOL.encoder(ONE_COUNT)
     samples = decoded(*(encode(Sample(0.0, -12.5, sequence=number)) for number in range(16)))
-    assert [sample.temperature for sample in samples if sample.temperature is not None] == pytest.approx([-12.5] * 2, abs=0.01)
+    assert ([sample.temperature for sample in samples if sample.temperature is not None]
+            == pytest.approx([-12.5] * 2, abs=0.01))
     health = {name: value for sample in samples for name, value in sample.health.items()}
     assert health == pytest.approx(HEALTH, abs=1e-4) and health.keys() == PROTOCOL.good.keys()
     assert all(low < health[name] < high for name, (low, high) in PROTOCOL.good.items())
@@ -71,7 +74,8 @@ def test_a_lost_frame_never_joins_halves_of_two_values(count):
         rest = [k for k in range(16) if k not in lost]
         heard = values(*(frames[k] for k in rest))
         assert all(said in (right[k], (None, {})) for k, said in zip(rest, heard, strict=True))
-        assert sum(said != (None, {}) for said in heard) == sum({2 * pair, 2 * pair + 1}.isdisjoint(lost) for pair in range(8))
+        assert sum(said != (None, {}) for said in heard) == sum(
+            {2 * pair, 2 * pair + 1}.isdisjoint(lost) for pair in range(8))
 
 
 def test_halves_with_garbage_between_are_not_joined():
@@ -89,19 +93,23 @@ def test_an_emulated_unit_takes_both_halves_at_one_instant():
     step = 250.0 / 0x8000
     encode = PROTOCOL.encoder(ONE_COUNT)
     warmer = -50.0 + 0x2600 * step
-    _, sample = decoded(encode(Sample(0.0, warmer - step, sequence=0)), encode(Sample(0.0, warmer, sequence=1)))
+    _, sample = decoded(encode(Sample(0.0, warmer - step, sequence=0)),
+                        encode(Sample(0.0, warmer, sequence=1)))
     assert sample.temperature == pytest.approx(warmer - step, abs=0.1 * step)
 
 
 def test_an_emulated_unit_says_of_itself_what_the_sample_says():
     encode = PROTOCOL.encoder(ONE_COUNT)
-    samples = decoded(*(encode(Sample(0.0, sequence=number, health={'source_current_a': 0.2})) for number in range(8)))
-    currents = [sample.health['source_current_a'] for sample in samples if 'source_current_a' in sample.health]
+    samples = decoded(*(encode(Sample(0.0, sequence=number, health={'source_current_a': 0.2}))
+                        for number in range(8)))
+    currents = [sample.health['source_current_a']
+                for sample in samples if 'source_current_a' in sample.health]
     assert currents == pytest.approx([0.2], abs=1e-4)
 
 
 def test_a_sensitivity_is_asked_for():
     with pytest.raises(ValueError, match='sensitivity is not set.*rad/s of one count'):
         PROTOCOL.decoder()
-    sample, = PROTOCOL.decoder(Settings(sensitivity=math.radians(1.0) / 27880.0)).feed(frame(27880))
+    sample, = PROTOCOL.decoder(Settings(sensitivity=math.radians(1.0) / 27880.0)).feed(
+        frame(27880))
     assert sample.output == pytest.approx(math.radians(1.0))

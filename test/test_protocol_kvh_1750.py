@@ -1,4 +1,4 @@
-"""The KVH 1750: the frame of the manual field by field, what a CRC keeps out, and what the settings do."""
+"""The KVH 1750: the frame of the manual field by field, the CRC, and the settings."""
 
 import math
 import struct
@@ -39,9 +39,11 @@ def decoded(data, axis='z', **settings):
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])
 def test_the_frame_of_the_manual_is_read_field_by_field(axis):
     sample, = decoded(GOLDEN, axis)
-    assert sample.output == pytest.approx(ROTATION[axis] * 1000.0, rel=1e-6)  # 1000 Hz is what a new unit sends
+    # A new unit sends at 1000 Hz.
+    assert sample.output == pytest.approx(ROTATION[axis] * 1000.0, rel=1e-6)
     assert sample.specific_force == pytest.approx(FORCE[axis] * GRAVITY, rel=2e-4)
-    assert (sample.temperature, sample.sequence, sample.missing, sample.time, sample.health) == (40.0, 61, 0, None, {})
+    assert ((sample.temperature, sample.sequence, sample.missing, sample.time, sample.health)
+            == (40.0, 61, 0, None, {}))
 
 
 def test_the_crc_is_the_one_of_the_manual():
@@ -52,7 +54,8 @@ def test_a_frame_is_written_as_the_manual_has_it():
     """But for the axes that are not read, which an emulated unit leaves at zero."""
     sample, = decoded(GOLDEN)
     written = PROTOCOL.encode(sample)
-    assert written[:4] == GOLDEN[:4] and written[12:16] == GOLDEN[12:16] and written[24:32] == GOLDEN[24:32]
+    assert (written[:4] == GOLDEN[:4] and written[12:16] == GOLDEN[12:16]
+            and written[24:32] == GOLDEN[24:32])
     assert written == sealed(written[:32])
 
 
@@ -68,11 +71,13 @@ def test_a_frame_is_written_as_the_manual_has_it():
 def test_the_rate_is_the_angle_by_the_interval_that_the_unit_is_set_to(settings, factor):
     sample, = decoded(GOLDEN, 'y', **settings)
     assert sample.output == pytest.approx(ROTATION['y'] * factor, rel=1e-6)
-    assert decoded(PROTOCOL.encode(Sample(0.25), Settings(**settings)), **settings)[0].output == pytest.approx(0.25, rel=1e-6)
+    assert (decoded(PROTOCOL.encode(Sample(0.25), Settings(**settings)), **settings)[0].output
+            == pytest.approx(0.25, rel=1e-6))
 
 
 def test_the_nominal_rate_is_the_one_that_is_set():
-    assert [PROTOCOL.nominal_rate(Settings(sample_rate=rate)) for rate in (None, 250.0)] == [1000.0, 250.0]
+    assert ([PROTOCOL.nominal_rate(Settings(sample_rate=rate)) for rate in (None, 250.0)]
+            == [1000.0, 250.0])
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
@@ -81,7 +86,8 @@ def test_only_the_bits_of_the_axis_count(axis):
     sample, = with_status(gyro | accelerometer, name)
     assert sample.specific_force is not None
     sample, = with_status(0x77 & ~accelerometer, name)
-    assert sample.specific_force is None and sample.output == pytest.approx(ROTATION[name] * 1000.0, rel=1e-6)
+    assert (sample.specific_force is None
+            and sample.output == pytest.approx(ROTATION[name] * 1000.0, rel=1e-6))
     assert with_status(0x77 & ~gyro, name) == []
 
 
@@ -107,8 +113,10 @@ def test_the_specific_force_keeps_its_sign(force):
 
 
 def test_the_sequence_wraps_at_128():
-    samples = decoded(b''.join(PROTOCOL.encode(Sample(0.1, sequence=number)) for number in range(300)))
-    assert [sample.sequence for sample in samples] == [number % 128 for number in range(300)] and PROTOCOL.modulus == 128
+    samples = decoded(b''.join(PROTOCOL.encode(Sample(0.1, sequence=number))
+                               for number in range(300)))
+    assert ([sample.sequence for sample in samples] == [number % 128 for number in range(300)]
+            and PROTOCOL.modulus == 128)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 3e38])
@@ -130,7 +138,8 @@ def test_no_two_flipped_bits_get_past_the_crc():
     whole, past = int.from_bytes(GOLDEN, 'big'), 0
     flips = [1 << bit for bit in range(8 * len(GOLDEN))]
     for place, first in enumerate(flips):
-        past += sum(splitter._is_intact((whole ^ first ^ second).to_bytes(36, 'big')) for second in flips[:place])
+        past += sum(splitter._is_intact((whole ^ first ^ second).to_bytes(36, 'big'))
+                    for second in flips[:place])
     assert past == 0
 
 

@@ -1,4 +1,4 @@
-"""The Razor firmware: axes that point right and down, accelerations that are negated, lines of other kinds."""
+"""The Razor firmware: axes right and down, negated accelerations, and lines of other kinds."""
 
 import pytest
 
@@ -20,20 +20,24 @@ def decoded(data, axis='z'):
     ('z', 0.03, 1.0),  # down becomes up, and what holds the sensor up is up
 ])
 def test_axes_and_accelerations_are_turned_as_in_ros(axis, rate, force):
-    """As the ROS driver of the firmware does: x and -y and -z of the rates, -x and y and z of the accelerations."""
+    """As in the ROS driver: x, -y, -z of the rates and -x, y, z of the accelerations."""
     sample, = decoded(LINE, axis)
-    assert sample.output == pytest.approx(rate) and sample.specific_force == pytest.approx(force * 9.80665)
+    assert (sample.output == pytest.approx(rate)
+            and sample.specific_force == pytest.approx(force * 9.80665))
     again, = decoded(PROTOCOL.encode(sample, Settings(axis=axis)), axis)
-    assert again.output == pytest.approx(sample.output) and again.specific_force == pytest.approx(sample.specific_force, abs=0.001)
+    assert (again.output == pytest.approx(sample.output)
+            and again.specific_force == pytest.approx(sample.specific_force, abs=0.001))
 
 
 def test_a_line_is_written_as_the_firmware_prints_it():
-    assert PROTOCOL.encode(Sample(-0.25, specific_force=9.80665)) == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n'
+    assert (PROTOCOL.encode(Sample(-0.25, specific_force=9.80665))
+            == b'#YPRAG=0.00,0.00,0.00,0.00,0.00,256.00,0.00,0.00,0.25\r\n')
 
 
 @pytest.mark.parametrize('line', [
-    b'#YPRAG=1,2,3,4,5,6,7,8', b'#YPRAG=1,2,3,4,5,6,7,8,9,10', b'#YPRAG=1,2,3,4,5,6,7,8,nan', b'#YPRAG=1,2,3,4,5,6,7,8,',
-    b'YPRAG=1,2,3,4,5,6,7,8,9', b'#YPRAGM=1,2,3,4,5,6,7,8,9,10,11,12', b'#YPRAG=1,2,3,4,5,6,7,8,0x9', b'#A-C=1,2,3',
+    b'#YPRAG=1,2,3,4,5,6,7,8', b'#YPRAG=1,2,3,4,5,6,7,8,9,10', b'#YPRAG=1,2,3,4,5,6,7,8,nan',
+    b'#YPRAG=1,2,3,4,5,6,7,8,', b'YPRAG=1,2,3,4,5,6,7,8,9',
+    b'#YPRAGM=1,2,3,4,5,6,7,8,9,10,11,12', b'#YPRAG=1,2,3,4,5,6,7,8,0x9', b'#A-C=1,2,3',
 ])
 def test_other_lines_are_discarded(line):
     decoder = PROTOCOL.decoder()

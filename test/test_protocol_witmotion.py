@@ -24,9 +24,11 @@ def decoded(*frames, axis='z'):
 
 def test_the_axis_chooses_rate_and_acceleration():
     for axis, rate, force in (('x', 100, 4), ('y', -200, -5), ('z', 300, 2048)):
-        sample, = decoded(frame(0x51, 4, -5, 2048, 2500), frame(0x52, 100, -200, 300, 2534), axis=axis)
+        sample, = decoded(frame(0x51, 4, -5, 2048, 2500),
+                          frame(0x52, 100, -200, 300, 2534), axis=axis)
         assert sample.output == pytest.approx(math.radians(2000.0 * rate / 32768))
-        assert sample.specific_force == pytest.approx(16.0 * GRAVITY * force / 32768) and sample.temperature == pytest.approx(25.34)
+        assert (sample.specific_force == pytest.approx(16.0 * GRAVITY * force / 32768)
+                and sample.temperature == pytest.approx(25.34))
 
 
 @pytest.mark.parametrize('count', [0x7FFF, -0x8000, -1, 0])
@@ -37,8 +39,10 @@ def test_counts_have_a_sign(count):
 
 @pytest.mark.parametrize('temperature', [-40.0, -0.01, 0.0, 61.7])
 def test_the_temperature_has_a_sign(temperature):
-    assert decoded(frame(0x52, 0, 0, 0, round(100 * temperature)))[0].temperature == pytest.approx(temperature)
-    assert decoded(PROTOCOL.encode(Sample(0.1, temperature)))[0].temperature == pytest.approx(temperature)
+    assert (decoded(frame(0x52, 0, 0, 0, round(100 * temperature)))[0].temperature
+            == pytest.approx(temperature))
+    assert (decoded(PROTOCOL.encode(Sample(0.1, temperature)))[0].temperature
+            == pytest.approx(temperature))
 
 
 @pytest.mark.parametrize('force', [9.81, -9.81, None])
@@ -49,15 +53,18 @@ def test_the_specific_force_keeps_its_sign(force):
 
 def test_an_acceleration_belongs_to_the_next_rate_only():
     force, rate = frame(0x51, 0, 0, 2048, 0), frame(0x52, 0, 0, 1, 0)
-    assert [sample.specific_force is None for sample in decoded(force, rate, rate, force, rate)] == [False, True, False]
+    assert ([sample.specific_force is None for sample in decoded(force, rate, rate, force, rate)]
+            == [False, True, False])
     assert decoded(force, b'\x55\x52', rate)[0].specific_force is None
 
 
 def test_frames_of_other_kinds_are_passed_over():
     decoder = PROTOCOL.decoder()
-    samples = decoder.feed(b''.join(frame(kind, 1, 2, 3, 4) for kind in (0x50, 0x51, 0x52, 0x53, 0x54, 0x59, 0x5A)))
+    samples = decoder.feed(b''.join(frame(kind, 1, 2, 3, 4)
+                                    for kind in (0x50, 0x51, 0x52, 0x53, 0x54, 0x59, 0x5A)))
     assert len(samples) == 1 and decoder.discarded_bytes == 0
 
 
 def test_a_frame_is_written_byte_by_byte_as_the_data_sheet_has_it():
-    assert PROTOCOL.encode(Sample(math.radians(31.25), 25.0)) == bytes.fromhex('5552000000000002C40976')
+    assert (PROTOCOL.encode(Sample(math.radians(31.25), 25.0))
+            == bytes.fromhex('5552000000000002C40976'))
