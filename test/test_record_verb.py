@@ -1,4 +1,4 @@
-"""Recording with real processes: from a port and from topics, interrupted, killed, and on a disk that is full."""
+"""Recording with real processes: from a port and from topics, interrupted, killed, disk full."""
 
 import contextlib
 import json
@@ -31,24 +31,28 @@ KINDS = ['a.csv', 'a.csv.gz', 'a.mcap']
 @contextlib.contextmanager
 def gyro(link, rate=RATE):
     """
-    Be a gyro that counts: its outputs rise by 1e-4 rad/s a sample, so that each tells which one it is.
+    Emulate a gyro that counts: its outputs rise by 1e-4 rad/s a sample, which numbers them.
 
-    It is a replay, twice as fast, for that waits for a reader whom a busy machine does not let read.
+    It is a replay at double speed, which waits for a reader on a busy machine.
 
     """
-    samples = (Sample(1e-4 * (number % 10_000), 25.0, time=2.0 * number / rate) for number in range(10 ** 6))
-    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')), 2.0, link):
+    samples = (Sample(1e-4 * (number % 10_000), 25.0, time=2.0 * number / rate)
+               for number in range(10 ** 6))
+    with Emulator(find('csv'), samples,
+                  Settings(columns=('gyro_rad_s', 'temperature_degc')), 2.0, link):
         yield
 
 
 def words_for(link, out, *more):
-    return ['record', '--port', str(link), '--protocol', 'csv', '--columns', 'gyro_rad_s,temperature_degc', '--out', str(out), *more]
+    return ['record', '--port', str(link), '--protocol', 'csv',
+            '--columns', 'gyro_rad_s,temperature_degc', '--out', str(out), *more]
 
 
 def _record(words, output, error, environment, limit):
-    """Run the program in a process of its own, with its output in files, and maybe with a limit for the size of files, in bytes."""
+    """Run the program with its output in files and, if given, a file size limit in bytes."""
     os.environ.update(environment)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run without a terminal, where it is ignored
+    # The tests may run without a terminal, where the signal is ignored.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     for path, number in ((output, 1), (error, 2)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
     if limit is not None:
@@ -58,17 +62,19 @@ def _record(words, output, error, environment, limit):
 
 
 class Recording:
-    """The program in a process, which is forked from one that has imported all it needs: that takes a tenth of the time."""
+    """The program in a process forked from one with its imports, for a tenth of the time."""
 
     def __init__(self, folder, words, limit=None):
         forks = multiprocessing.get_context('forkserver')
-        forks.set_forkserver_preload(['gyro_calibration.cli.main', 'gyro_calibration.ros.recorder_node', __name__])
+        forks.set_forkserver_preload(['gyro_calibration.cli.main',
+                                      'gyro_calibration.ros.recorder_node', __name__])
         self._files = [Path(tempfile.mkstemp(dir=folder)[1]) for _ in range(2)]
-        self.process = forks.Process(target=_record, args=(list(map(str, words)), *self._files, dict(os.environ), limit))
+        self.process = forks.Process(
+            target=_record, args=(list(map(str, words)), *self._files, dict(os.environ), limit))
         self.process.start()
 
     def end(self, number=None, timeout=20.0):
-        """Send a signal, if one is given, and return exit code, standard output and standard error."""
+        """Send a signal, if given, and return exit code, standard output and standard error."""
         if number is not None:
             os.kill(self.process.pid, number)
         self.process.join(timeout)
@@ -97,7 +103,8 @@ def record(tmp_path_factory):
 
 
 def read(path, **topics):
-    return read_recording(path, Topics(**topics)) if str(path).endswith('.mcap') else read_log(path)
+    return (read_recording(path, Topics(**topics)) if str(path).endswith('.mcap')
+            else read_log(path))
 
 
 def holds(path, count):
@@ -114,19 +121,23 @@ def is_unbroken(log):
 # From the port
 
 
-@pytest.mark.parametrize(('name', 'number'), [('a.csv', signal.SIGINT), ('a.csv.gz', signal.SIGTERM), ('a.mcap', signal.SIGINT),
-                                              ('b.mcap', signal.SIGHUP)])
+@pytest.mark.parametrize(('name', 'number'),
+                         [('a.csv', signal.SIGINT), ('a.csv.gz', signal.SIGTERM),
+                          ('a.mcap', signal.SIGINT), ('b.mcap', signal.SIGHUP)])
 def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
-        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 15.0, 'a first piece')
+        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 15.0,
+                   'a first piece')
         time.sleep(1.0)
         code, out, _ = recording.end(number)
     answer, log = json.loads(out), read(tmp_path / name)
     assert code == 0
     assert (answer['samples'], answer['lost'], answer['protocol']) == (len(log), 0, 'csv')
     assert is_unbroken(log) and (log.temperature == 25.0).all()
-    assert not name.endswith('.mcap') or len(_messages(tmp_path / name, '/imu/data_raw')) == len(log)  # it has its closing part
+    # An MCAP file has its closing part.
+    assert (not name.endswith('.mcap')
+            or len(_messages(tmp_path / name, '/imu/data_raw')) == len(log))
     assert np.median(np.diff(log.time)) == pytest.approx(1.0 / RATE, rel=0.05)
     assert {'protocol: csv', f'port: {tmp_path / "gyro"}'} <= set(log.notes)
 
@@ -149,21 +160,26 @@ def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
         assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
         before = (tmp_path / 'a.csv').read_bytes()
         code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-    assert code == 2 and 'is there already' in error and (tmp_path / 'a.csv').read_bytes() == before
+    assert (code == 2 and 'is there already' in error
+            and (tmp_path / 'a.csv').read_bytes() == before)
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
     (['--out', 'a.txt', '--port', '/dev/x'], 'a recording ends in .csv, .csv.gz or .mcap'),
-    (['--out', 'a.csv', '--port', '/dev/x', '--topic', 'imu'], '--port and topics were both given'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--topic', 'imu'],
+     '--port and topics were both given'),
     (['--out', 'a.csv', '--port', '/dev/x', '--protocol', 'morse'], 'morse'),
-    (['--out', 'a.csv', '--port', '/dev/x', '--baud', '-5'], '--baud is -5, but must be from 0 to 4000000'),
+    (['--out', 'a.csv', '--port', '/dev/x', '--baud', '-5'],
+     '--baud is -5, but must be from 0 to 4000000'),
     (['--out', 'a.csv', '--port', '/dev/x', '--baud', '9' * 30], 'but must be from 0 to 4000000'),
     (['--out', 'a.csv', '--protocol', 'csv'], 'without --port'),
     (['--out', 'a.csv', '--sample-rate', '100'], 'without --port'),
     (['--out', 'a.csv', '--increments', 'never'], 'without --port'),
-    (['--out', 'a.csv', '--topic', 'imu', '--reference-topic', '/imu'], 'one topic was named twice'),
+    (['--out', 'a.csv', '--topic', 'imu', '--reference-topic', '/imu'],
+     'one topic was named twice'),
     (['--out', 'a.csv', '--all'], 'record several topics into .mcap'),
-    (['--out', 'a.csv', '--reference-topic', 'a', '--reference-topic', 'b'], 'record several topics into .mcap'),
+    (['--out', 'a.csv', '--reference-topic', 'a', '--reference-topic', 'b'],
+     'record several topics into .mcap'),
 ])
 def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch, words, sentence):
     monkeypatch.chdir(tmp_path)
@@ -174,7 +190,7 @@ def test_wrong_use_is_one_sentence_and_leaves_no_file(run, tmp_path, monkeypatch
 
 @contextlib.contextmanager
 def angles(link, rate=100.0):
-    """Be a gyro that turns at 0.1 rad/s, and sends the angles since its last sample at another rate than a new one."""
+    """Send the angles of a gyro at 0.1 rad/s, at another sample rate than a new one does."""
     samples = (Sample(0.1, 25.0, time=number / rate) for number in range(10 ** 6))
     with Emulator(find('kvh_1750'), samples, Settings(sample_rate=rate), link=link):
         yield
@@ -187,21 +203,28 @@ def angles(link, rate=100.0):
 ])
 def test_angles_at_another_rate_than_set_are_told(run, tmp_path, options, rate, factor, is_warned):
     with angles(tmp_path / 'gyro'):
-        code, out, error = run('record', '--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--out', tmp_path / 'a.csv',
-                               '--seconds', '6', '--json', *options)
+        code, out, error = run('record', '--port', tmp_path / 'gyro', '--protocol', 'kvh_1750',
+                               '--out', tmp_path / 'a.csv', '--seconds', '6', '--json', *options)
     log, remarks = read(tmp_path / 'a.csv'), ' '.join(json.loads(out)['remarks'])
     assert code == 0 and log.output == pytest.approx(rate, rel=1e-6), error
-    assert ('samples a second are not the 1000 by which angles are made rates: set sample_rate.' in remarks) == is_warned
-    assert any(note.startswith(f'sensitivity: {factor!r} rad/s a unit of the device') for note in log.notes), log.notes
+    assert ('samples a second are not the 1000 by which angles are made rates: set sample_rate.'
+            in remarks) == is_warned
+    assert any(note.startswith(f'sensitivity: {factor!r} rad/s a unit of the device')
+               for note in log.notes), log.notes
 
 
 @pytest.mark.parametrize(('first', 'is_kept'), [(1.8, True), (4.5, False)])
 def test_a_temperature_of_a_port_gets_its_column_or_is_told(run, tmp_path, first, is_kept):
-    samples = (Sample(0.1, 25.0 if number >= first * RATE else None, time=number / RATE) for number in range(10 ** 6))
-    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')), link=tmp_path / 'gyro', wait_for_reader=True):
-        code, out, _ = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '6', '--json'))
-    told = [remark for remark in json.loads(out)['remarks'] if 'temperature_degc came too late for a column of a log' in remark]
-    assert code == 0 and (read(tmp_path / 'a.csv').temperature is not None, not told) == (is_kept, is_kept)
+    samples = (Sample(0.1, 25.0 if number >= first * RATE else None, time=number / RATE)
+               for number in range(10 ** 6))
+    with Emulator(find('csv'), samples, Settings(columns=('gyro_rad_s', 'temperature_degc')),
+                  link=tmp_path / 'gyro', wait_for_reader=True):
+        code, out, _ = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv',
+                                      '--seconds', '6', '--json'))
+    told = [remark for remark in json.loads(out)['remarks']
+            if 'temperature_degc came too late for a column of a log' in remark]
+    assert (code == 0
+            and (read(tmp_path / 'a.csv').temperature is not None, not told) == (is_kept, is_kept))
 
 
 def test_columns_with_a_unit_have_no_sensitivity_beside_it(run, tmp_path):
@@ -213,18 +236,21 @@ def test_columns_with_a_unit_have_no_sensitivity_beside_it(run, tmp_path):
 
 def test_a_port_that_is_not_there_is_told_and_leaves_no_file(run, tmp_path):
     code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '1'))
-    assert (code, out) == (1, '') and 'nothing came within' in error and str(tmp_path / 'gyro') in error
+    assert ((code, out) == (1, '') and 'nothing came within' in error
+            and str(tmp_path / 'gyro') in error)
     assert not (tmp_path / 'a.csv').exists()
 
 
 def test_a_gyro_that_is_unplugged_leaves_a_gap(record, wait_until, tmp_path):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--json'))
-        wait_until(lambda: (tmp_path / 'a.csv').exists() and (tmp_path / 'a.csv').stat().st_size, 15.0, 'a first piece')
+        wait_until(lambda: (tmp_path / 'a.csv').exists() and (tmp_path / 'a.csv').stat().st_size,
+                   15.0, 'a first piece')
     time.sleep(1.0)
     size = (tmp_path / 'a.csv').stat().st_size
     with gyro(tmp_path / 'gyro'):
-        wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > size + 1000, 15.0, 'samples after the gap')
+        wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > size + 1000, 15.0,
+                   'samples after the gap')
         code, out, error = recording.end(signal.SIGINT)
     steps = np.diff(read_log(tmp_path / 'a.csv').time)
     assert code == 0 and json.loads(out)['openings'] >= 2 and 'samples of csv come' in error
@@ -242,7 +268,8 @@ def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until
             link, out = tmp_path / str(number) / 'gyro', tmp_path / str(number) / name
             stack.enter_context(gyro(link))
             running.append((out, record(*words_for(link, out)).process))
-        wait_until(lambda: all(out.exists() and out.stat().st_size for out, _ in running), 30.0, 'first pieces')
+        wait_until(lambda: all(out.exists() and out.stat().st_size for out, _ in running), 30.0,
+                   'first pieces')
         for out, process in running:
             time.sleep(0.3 * generator.random())
             killed = time.time()
@@ -268,16 +295,19 @@ def test_what_came_before_a_silence_outlives_a_kill(record, wait_until, tmp_path
 
 def _begin(log):
     """Return when the first sample of a log was taken, in s since 1970, as its notes say."""
-    word = next(note for note in log.notes if 'time_s ' in note).replace('time_s counts from: ', 'time_s from ')
+    word = next(note for note in log.notes if 'time_s ' in note).replace(
+        'time_s counts from: ', 'time_s from ')
     return float(word.partition('time_s from ')[2].split()[0])
 
 
-@pytest.mark.parametrize(('name', 'limit'), [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 600_000)])
+@pytest.mark.parametrize(('name', 'limit'),
+                         [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 600_000)])
 def test_a_file_that_may_not_grow_stays_readable(record, tmp_path, name, limit):
     with gyro(tmp_path / 'gyro', 1000.0):
         code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=limit).end()
     log, size = read(tmp_path / name), (tmp_path / name).stat().st_size
-    assert code == 1 and f'{size} bytes stay in {tmp_path / name}' in error and 'make room' in error
+    assert (code == 1 and f'{size} bytes stay in {tmp_path / name}' in error
+            and 'make room' in error)
     assert size <= limit and len(log) > 500 and is_unbroken(log)
 
 
@@ -326,27 +356,31 @@ class Robot:
         from geometry_msgs.msg import PoseStamped
         from nav_msgs.msg import Odometry
         from sensor_msgs.msg import Imu, Temperature
-        self.kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry, 'pose': PoseStamped}
+        self.kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry,
+                      'pose': PoseStamped}
         self._ros, self._publishers = ros, {}
 
     def offer(self, *topics, quality=None):
         """Publish on some topics from now on."""
         for topic in topics:
-            self._publishers[topic] = self._ros.publisher(self.kinds[topic], topic, quality or reliable())
+            self._publishers[topic] = self._ros.publisher(self.kinds[topic], topic,
+                                                          quality or reliable())
 
     def is_heard(self, count=1):
         return all(each.get_subscription_count() >= count for each in self._publishers.values())
 
     def is_received(self):
-        """Return whether all that was published is in the queues of those who listen, by what they acknowledged."""
+        """Return whether all subscribers acknowledged all that was published."""
         from rclpy.duration import Duration
-        return all(each.wait_for_all_acked(Duration(seconds=0.01)) for each in self._publishers.values())
+        return all(each.wait_for_all_acked(Duration(seconds=0.01))
+                   for each in self._publishers.values())
 
     def send(self, time, rate, heading):
         """Publish one sample on all topics."""
         for topic, publisher in self._publishers.items():
             message = self.kinds[topic]()
-            message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000 + int(time), round(time % 1.0 * 1e9)
+            message.header.stamp.sec, message.header.stamp.nanosec = (
+                1_700_000_000 + int(time), round(time % 1.0 * 1e9))
             message.header.frame_id = 'gyro'
             if topic == 'imu/data_raw':
                 message.angular_velocity.z, message.linear_acceleration_covariance[0] = rate, -1.0
@@ -354,7 +388,8 @@ class Robot:
                 message.temperature = 25.0 + 0.01 * time
             else:
                 pose = message.pose.pose if topic == 'odom' else message.pose
-                pose.orientation.z, pose.orientation.w = math.sin(heading / 2.0), math.cos(heading / 2.0)
+                pose.orientation.z, pose.orientation.w = (math.sin(heading / 2.0),
+                                                          math.cos(heading / 2.0))
             if topic == 'odom':
                 message.twist.twist.angular.z = rate
             publisher.publish(message)
@@ -376,37 +411,47 @@ def reliable(**how):
     return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
 
 
-def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(ros, record, run, wait_until, tmp_path):
+def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
+        ros, record, run, wait_until, tmp_path):
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
-    both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json') for name in ('a.csv', 'a.mcap')]
+    both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json')
+            for name in ('a.csv', 'a.mcap')]
     wait_until(lambda: robot.is_heard(2), 20.0, 'both recorders')
     count = robot.drive()
     wait_until(robot.is_received, 20.0, 'the last message')
     answers = [each.end(signal.SIGINT) for each in both]
     for code, out, error in answers:
-        assert code == 0 and (json.loads(out)['samples'], json.loads(out)['lost']) == (count, 0), error
+        assert (code == 0
+                and (json.loads(out)['samples'], json.loads(out)['lost']) == (count, 0)), error
     log, recording = read(tmp_path / 'a.csv'), read(tmp_path / 'a.mcap', reference='odom')
     for name in ('output', 'time', 'temperature', 'reference_rate'):
         np.testing.assert_array_equal(getattr(log, name), getattr(recording, name), name)
     np.testing.assert_allclose(log.reference_heading, recording.reference_heading, atol=1e-9)
-    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 0.0001}\n')
+    (tmp_path / 'm.yaml').write_text(
+        'effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 0.0001}\n')
     model = ['--model', tmp_path / 'm.yaml']
-    for words in (['fit'], ['diagnose', *model], ['compensate', *model, '--out', tmp_path / 'o.csv'], ['allan']):
-        results = [run(*words, tmp_path / 'a.csv'), run(*words, tmp_path / 'a.mcap', '--reference-topic', 'odom')]
+    for words in (['fit'], ['diagnose', *model],
+                  ['compensate', *model, '--out', tmp_path / 'o.csv'], ['allan']):
+        results = [run(*words, tmp_path / 'a.csv'),
+                   run(*words, tmp_path / 'a.mcap', '--reference-topic', 'odom')]
         assert results[0][0] == results[1][0], results
         if results[0][0]:  # a refusal is the same sentence
-            assert results[0][2].splitlines()[-1].replace('a.csv', 'a.mcap') == results[1][2].splitlines()[-1]
+            assert (results[0][2].splitlines()[-1].replace('a.csv', 'a.mcap')
+                    == results[1][2].splitlines()[-1])
         else:
             assert results[0][1].replace('a.csv', 'a.mcap') == results[1][1]
 
 
-def test_publishers_that_come_late_or_with_another_quality_are_heard(ros, record, wait_until, tmp_path):
+def test_publishers_that_come_late_or_with_another_quality_are_heard(
+        ros, record, wait_until, tmp_path):
     from rclpy.qos import DurabilityPolicy
     from std_msgs.msg import String
     robot = Robot(ros)
-    recording = record('record', '--reference-topic', 'pose', '--reference-topic', 'note', '--out', tmp_path / 'a.mcap', '--json')
-    wait_until(lambda: 'nobody publishes /imu/data_raw, /imu/temperature, /pose, /note so far' in recording.error, 20.0, 'a remark')
+    recording = record('record', '--reference-topic', 'pose', '--reference-topic', 'note',
+                       '--out', tmp_path / 'a.mcap', '--json')
+    wait_until(lambda: 'nobody publishes /imu/data_raw, /imu/temperature, /pose, /note so far'
+               in recording.error, 20.0, 'a remark')
     note = ros.publisher(String, 'note', reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL))
     note.publish(String(data='said before anybody listened'))
     robot.offer('imu/data_raw')
@@ -433,10 +478,12 @@ def ros_quality():
 def _messages(path, topic):
     reading = pytest.importorskip('mcap.reader', reason='mcap is not installed')
     with open(path, 'rb') as file:
-        return [message.data for _, _, message in reading.make_reader(file).iter_messages(topics=[topic])]
+        return [message.data
+                for _, _, message in reading.make_reader(file).iter_messages(topics=[topic])]
 
 
-def test_everything_is_recorded_with_definitions_that_others_understand(ros, record, wait_until, tmp_path):
+def test_everything_is_recorded_with_definitions_that_others_understand(
+        ros, record, wait_until, tmp_path):
     rosbag2, typesys = rosbags()
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom', 'pose')
@@ -449,7 +496,8 @@ def test_everything_is_recorded_with_definitions_that_others_understand(ros, rec
     with rosbag2.Reader(tmp_path / 'a.mcap') as reader:
         for connection in reader.connections:
             store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        found = {connection.topic: store.deserialize_cdr(data, connection.msgtype) for connection, _, data in reader.messages()}
+        found = {connection.topic: store.deserialize_cdr(data, connection.msgtype)
+                 for connection, _, data in reader.messages()}
     assert {'/imu/data_raw', '/imu/temperature', '/odom', '/pose'} <= set(found)
     assert found['/odom'].twist.twist.angular.z == pytest.approx(math.sin(0.5 * 1.98) * 0.0)
     assert found['/imu/data_raw'].header.stamp.sec == 1_700_000_001
@@ -462,20 +510,25 @@ def test_a_log_of_a_topic_of_another_kind_is_refused(ros, record, wait_until, tm
     wait_until(robot.is_heard, 20.0, 'the recorder')
     robot.drive(0.0, 1.0)
     code, out, error = recording.end()
-    assert (code, out) == (2, '') and '/odom is nav_msgs/msg/Odometry; --topic wants sensor_msgs/msg/Imu' in error
+    assert ((code, out) == (2, '')
+            and '/odom is nav_msgs/msg/Odometry; --topic wants sensor_msgs/msg/Imu' in error)
     assert not (tmp_path / 'a.csv').exists()
 
 
 @pytest.mark.parametrize(('topic', 'domain', 'sentence'), [
     ('1x', None, '/1x is no name of a topic (failed to resolve name'),
     ('a b', None, '/a b is no name of a topic (failed to resolve name'),
-    ('imu', 'x', 'ROS 2 cannot be started (failed to initialize rcl: ROS_DOMAIN_ID is not an integral number)'),
+    ('imu', 'x',
+     'ROS 2 cannot be started (failed to initialize rcl: '
+     'ROS_DOMAIN_ID is not an integral number)'),
     ('imu', '999', 'ROS_DOMAIN_ID is 999, but the largest is 232'),
 ])
-def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(ros_domain, record, tmp_path, monkeypatch, topic, domain, sentence):
+def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
+        ros_domain, record, tmp_path, monkeypatch, topic, domain, sentence):
     if domain is not None:
         monkeypatch.setenv('ROS_DOMAIN_ID', domain)
-    code, out, error = record('record', '--topic', topic, '--out', tmp_path / 'a.csv', '--seconds', 2).end()
+    code, out, error = record('record', '--topic', topic, '--out', tmp_path / 'a.csv',
+                              '--seconds', 2).end()
     assert (code, out) == (2, '') and sentence in error and error.count('\n') == 1
     assert not (tmp_path / 'a.csv').exists()
 
@@ -501,15 +554,18 @@ def test_topics_that_nobody_publishes_are_told(ros_domain, record, tmp_path):
 
 def test_a_driver_is_recorded_from_its_topics(start_node, ros, record, wait_until, tmp_path):
     with gyro(tmp_path / 'gyro'):
-        start_node('driver_node', parameters={'port': tmp_path / 'gyro', 'protocol': 'csv', 'columns': '[gyro_rad_s, temperature_degc]'})
-        both = [record('record', '--out', tmp_path / name, '--json') for name in ('a.csv', 'a.mcap')]
+        start_node('driver_node', parameters={'port': tmp_path / 'gyro', 'protocol': 'csv',
+                                              'columns': '[gyro_rad_s, temperature_degc]'})
+        both = [record('record', '--out', tmp_path / name, '--json')
+                for name in ('a.csv', 'a.mcap')]
         files = [tmp_path / 'a.csv', tmp_path / 'a.mcap']
         wait_until(lambda: all(holds(file, 201) for file in files), 60.0, 'samples')
         ends = [each.end(signal.SIGINT) for each in both]
     logs = [read(file) for file in files]
     for (code, out, error), log in zip(ends, logs, strict=True):
         assert code == 0 and json.loads(out)['samples'] == len(log) > 200, error
-        assert is_unbroken(log) and json.loads(out)['lost'] == 0 and (log.temperature == 25.0).all()
+        assert (is_unbroken(log) and json.loads(out)['lost'] == 0
+                and (log.temperature == 25.0).all())
 
 
 def test_without_ros_the_way_out_is_said(run, tmp_path, monkeypatch):

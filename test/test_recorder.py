@@ -8,7 +8,14 @@ import pytest
 from recordings import BEGIN, Messages, rosbags
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.driver.recorder import AtomicAppender, CsvRecorder, DiskFull, McapRecorder, MessageLog, about
+from gyro_calibration.driver.recorder import (
+    AtomicAppender,
+    CsvRecorder,
+    DiskFull,
+    McapRecorder,
+    MessageLog,
+    about,
+)
 from gyro_calibration.log import LogError, read_log
 from gyro_calibration.messages import IMU, TEMPERATURE
 from gyro_calibration.recording import Topics, read_recording
@@ -22,7 +29,8 @@ def notes():
 
 
 def samples(count=300):
-    return [(BEGIN + 10_000_000 * number, Sample(0.01 * number, 20.0 + 0.001 * number, specific_force=9.8)) for number in range(count)]
+    return [(BEGIN + 10_000_000 * number, Sample(0.01 * number, 20.0 + 0.001 * number,
+                                                 specific_force=9.8)) for number in range(count)]
 
 
 def recorders(folder):
@@ -46,7 +54,8 @@ def test_each_kind_of_file_holds_the_samples_and_says_where_they_came_from(tmp_p
     for name in ('a.csv', 'a.csv.gz', 'a.mcap'):
         log = read(tmp_path / name)
         np.testing.assert_array_equal(log.output, [sample.output for _, sample in samples()])
-        np.testing.assert_array_equal(log.temperature, [sample.temperature for _, sample in samples()])
+        np.testing.assert_array_equal(log.temperature,
+                                      [sample.temperature for _, sample in samples()])
         np.testing.assert_array_equal(log.specific_force, 9.8)
         np.testing.assert_array_equal(log.time, np.arange(300) * 10_000_000 / 1e9)
         assert {'port: /dev/ttyUSB0', 'protocol: csv'} <= set(log.notes)
@@ -76,10 +85,12 @@ def test_rosbags_reads_what_is_recorded(tmp_path):
     with rosbag2.Reader(tmp_path / 'a.mcap') as reader:
         for connection in reader.connections:
             store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        found = [store.deserialize_cdr(data, connection.msgtype) for connection, _, data in reader.messages()
+        found = [store.deserialize_cdr(data, connection.msgtype)
+                 for connection, _, data in reader.messages()
                  if connection.topic == '/imu/data_raw']
         assert reader.message_count == 600
-    assert [message.angular_velocity.z for message in found] == [sample.output for _, sample in samples()]
+    assert [message.angular_velocity.z for message in found] == [
+        sample.output for _, sample in samples()]
     assert found[-1].header.frame_id == 'gyro' and found[-1].linear_acceleration.z == 9.8
 
 
@@ -100,7 +111,8 @@ def test_a_recording_of_nothing_leaves_no_file(tmp_path):
 
 @pytest.mark.parametrize('name', ['a.csv', 'a.csv.gz', 'a.mcap'])
 def test_what_is_killed_before_its_first_piece_takes_no_name(tmp_path, name):
-    recorder = (McapRecorder if name.endswith('.mcap') else CsvRecorder)(str(tmp_path / name), notes)
+    recorder = (McapRecorder if name.endswith('.mcap') else CsvRecorder)(
+        str(tmp_path / name), notes)
     for stamp, sample in samples(50):
         recorder.add_sample(stamp, sample)
     assert not list(tmp_path.iterdir())
@@ -170,7 +182,8 @@ def test_other_programs_read_the_whole_pieces_of_a_recording_on_a_full_disk(tmp_
 def test_values_that_come_seldom_are_held_and_late_ones_are_told(tmp_path):
     recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
     for number in range(400):
-        health = {10: {'supply_v': 5.0}, 200: {'supply_v': 4.9}, 300: {'source_current_a': 0.1}}.get(number, {})
+        health = {10: {'supply_v': 5.0}, 200: {'supply_v': 4.9},
+                  300: {'source_current_a': 0.1}}.get(number, {})
         recorder.add_sample(BEGIN + 10_000_000 * number, Sample(0.0, health=health))
         recorder.flush()
     recorder.close()
@@ -178,7 +191,8 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_told(tmp_path):
     assert recorder.missed == {'source_current_a'}
 
 
-@pytest.mark.parametrize(('first', 'missed'), [(2.0, set()), (4.0, {'reference_heading_rad', 'reference_rate_rad_s'})])
+@pytest.mark.parametrize(('first', 'missed'),
+                         [(2.0, set()), (4.0, {'reference_heading_rad', 'reference_rate_rad_s'})])
 def test_a_reference_that_comes_too_late_for_a_column_is_told(topic, first, missed):
     for number in range(600):
         time = 0.01 * number
@@ -208,7 +222,8 @@ class Topic:
 
     def send(self, topic, message, received):
         kind = message.__msgtype__
-        self.log.add(Message(topic, kind, BEGIN + round(1e9 * received), bytes(self.make.store.serialize_cdr(message, kind))))
+        self.log.add(Message(topic, kind, BEGIN + round(1e9 * received),
+                             bytes(self.make.store.serialize_cdr(message, kind))))
         self.rows.flush()
 
     def read(self):
@@ -242,7 +257,8 @@ def test_a_log_from_topics_holds_what_a_recording_of_them_holds(topic, tmp_path)
     turned = log.reference_heading - other.reference_heading
     known = np.isfinite(turned)
     np.testing.assert_array_equal(known, np.isfinite(other.reference_heading))
-    # The log goes on after the gap by less than half a turn; a recording asks the gyro, which here knows nothing of the turns.
+    # The log goes on after the gap by less than half a turn; a recording asks the gyro, which here
+    # does not measure the turns.
     np.testing.assert_allclose(np.remainder(turned[known] + 1.0, 2.0 * np.pi), 1.0, atol=1e-9)
     assert 200 < np.isnan(log.reference_heading).sum() < 400
 
@@ -250,7 +266,8 @@ def test_a_log_from_topics_holds_what_a_recording_of_them_holds(topic, tmp_path)
 def test_a_log_goes_on_where_the_clock_of_the_stamps_was_set(topic):
     for number in range(600):
         time = 0.01 * number
-        topic.send('/imu', topic.make.imu(time + (0.0, -3600.0, 7200.0)[number // 200], time), time)
+        topic.send('/imu',
+                   topic.make.imu(time + (0.0, -3600.0, 7200.0)[number // 200], time), time)
     log = topic.read()
     np.testing.assert_allclose(log.time, 0.01 * np.arange(600), atol=1e-6)
     assert topic.log.clock_steps == 2 and topic.log.samples == 600
@@ -264,7 +281,8 @@ def test_whichever_topic_a_set_clock_shows_on_first_all_go_on(topic, first, step
         time = 0.01 * number
         stamp = time + step * (number >= 300)
         make = topic.make
-        made = {'/imu': make.imu(stamp, time), '/odom': make.odometry(stamp, 0.1, time), '/t': make.temperature(stamp, time)}
+        made = {'/imu': make.imu(stamp, time), '/odom': make.odometry(stamp, 0.1, time),
+                '/t': make.temperature(stamp, time)}
         for name in order:
             topic.send(name, made[name], time)
     log = topic.read()
@@ -284,7 +302,8 @@ def test_a_message_that_was_under_way_while_the_clock_was_set_changes_nothing(to
 
 def test_a_stalled_subscriber_shifts_no_stamps(topic):
     for number in range(600):
-        topic.send('/imu', topic.make.imu(0.01 * number, number), max(0.01 * number, 4.0 if number > 100 else 0.0))
+        topic.send('/imu', topic.make.imu(0.01 * number, number),
+                   max(0.01 * number, 4.0 if number > 100 else 0.0))
     np.testing.assert_allclose(topic.read().time, 0.01 * np.arange(600), atol=1e-9)
     assert topic.log.clock_steps == 0
 
@@ -296,7 +315,8 @@ def test_lost_and_doubled_samples_are_counted(topic):
         if number % 100 == 50:
             topic.send('/imu', topic.make.imu(0.01 * number, number), 0.01 * number)
     log = topic.read()
-    assert (topic.log.lost, topic.log.left_out, len(log)) == (5, 6, 594)  # the last one lost is seen by nobody
+    # Nobody sees the last one lost.
+    assert (topic.log.lost, topic.log.left_out, len(log)) == (5, 6, 594)
 
 
 def test_bytes_that_are_no_message_are_counted(topic):
@@ -315,7 +335,8 @@ def test_bytes_that_are_no_message_are_counted(topic):
     ('/t', IMU, '--temperature-topic wants sensor_msgs/msg/Temperature'),
     ('/odom', TEMPERATURE, '--reference-topic wants nav_msgs/msg/Odometry, sensor_msgs/msg/Imu,'),
 ])
-def test_a_topic_of_another_kind_than_its_role_wants_is_refused_in_a_log_and_told_of_a_recording(topic, name, kind, wanted):
+def test_a_topic_of_another_kind_than_its_role_wants_is_refused_in_a_log_and_told_of_a_recording(
+        topic, name, kind, wanted):
     message = Message(name, kind, BEGIN, bytes(1000))
     with pytest.raises(LogError, match=f'^{name} is {kind}; {wanted}'):
         topic.log.add(message)
@@ -330,7 +351,8 @@ def test_what_a_reference_does_not_report_is_no_column(topic):
         topic.send('/imu', topic.make.imu(time, time), time)
         topic.send('/odom', topic.make.imu(time, 7.0, heading=0.1, reports_rate=False), time)
     log = topic.read()
-    assert log.reference_rate is None and np.nanmax(np.abs(log.reference_heading)) == pytest.approx(0.1, abs=1e-6)
+    assert (log.reference_rate is None
+            and np.nanmax(np.abs(log.reference_heading)) == pytest.approx(0.1, abs=1e-6))
 
 
 def test_pieces_of_a_packed_log_are_whole_by_themselves(tmp_path):

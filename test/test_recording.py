@@ -1,4 +1,4 @@
-"""A measured gyro on a turntable: calibrated on 20 s, its heading follows the encoder for 5 min."""
+"""A measured gyro on a turntable: calibrated on 20 s, its heading follows the encoder 5 min."""
 
 import math
 

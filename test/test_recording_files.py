@@ -1,4 +1,4 @@
-"""ROS 2 recordings as logs: written by the library rosbags, in each kind of storage, whole, torn and hostile."""
+"""ROS 2 recordings as logs: written by rosbags in each storage, whole, torn and hostile."""
 
 import contextlib
 import hashlib
@@ -31,7 +31,7 @@ def make():
 
 @pytest.fixture
 def turning():
-    """Return times, s, of 20 s, the rate there, rad/s, and its integral, which passes half a turn several times."""
+    """Return times over 20 s, the rate, rad/s, and its integral, which passes half turns."""
     time = np.arange(0.0, 20.0, 1.0 / RATE)
     return time, 1.5 + np.sin(0.4 * time), 1.5 * time + (1.0 - np.cos(0.4 * time)) / 0.4
 
@@ -43,7 +43,8 @@ def gyro(make, time, rate, **how):
 def measured(data):
     """Return 20 s of a gyro on a turntable, with a reference heading."""
     log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
-    return replace(log, **{name: values[:2000] for name, values in vars(log).items() if isinstance(values, np.ndarray)})
+    return replace(log, **{name: values[:2000] for name, values in vars(log).items()
+                           if isinstance(values, np.ndarray)})
 
 
 # Storage
@@ -53,20 +54,25 @@ def measured(data):
 def test_a_recording_holds_what_the_log_held(data, tmp_path, kind):
     log = measured(data)
     folder = write(tmp_path / 'bag', of_log(log), **KINDS[kind])
-    for path in (folder, shutil.copy(file_of(folder), tmp_path)):  # as a folder, and as a file without metadata.yaml
+    # As a folder, and as a file without metadata.yaml.
+    for path in (folder, shutil.copy(file_of(folder), tmp_path)):
         read = read_recording(path, Topics(reference='table'))
         np.testing.assert_array_equal(read.output, log.output)
-        np.testing.assert_allclose(read.time, log.time - log.time[0], rtol=0.0, atol=0.6e-9)  # stamps are whole nanoseconds
+        # Stamps are whole nanoseconds.
+        np.testing.assert_allclose(read.time, log.time - log.time[0], rtol=0.0, atol=0.6e-9)
         turned = read.reference_heading - read.reference_heading[0]
-        np.testing.assert_allclose(turned, log.reference_heading - log.reference_heading[0], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(turned, log.reference_heading - log.reference_heading[0],
+                                   rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('distribution', ['ROS2_FOXY', 'ROS2_HUMBLE', 'ROS2_JAZZY', 'ROS2_KILTED'])
 def test_every_distribution_is_read(tmp_path, turning, distribution):
     time, rate, heading = turning
     make = Messages(distribution)
-    topics = {'imu': gyro(make, time, rate, force=9.8), 'odom': [(at, make.odometry(at, h, r)) for at, r, h in zip(time, rate, heading)]}
-    log = read_recording(write(tmp_path / 'bag', topics, distribution=distribution), Topics(reference='odom'))
+    topics = {'imu': gyro(make, time, rate, force=9.8),
+              'odom': [(at, make.odometry(at, h, r)) for at, r, h in zip(time, rate, heading)]}
+    log = read_recording(write(tmp_path / 'bag', topics, distribution=distribution),
+                         Topics(reference='odom'))
     np.testing.assert_array_equal(log.output, rate)
     np.testing.assert_array_equal(log.reference_rate, rate)
     np.testing.assert_allclose(log.reference_heading, heading, atol=1e-12)
@@ -88,14 +94,17 @@ def test_messages_of_any_alignment_are_parsed_as_rosbags_writes_them(make, frame
 def test_rosbags_reads_a_message_that_was_serialized_here(make, frame):
     numbers = [float(number) for number in range(37)]
     message = make.store.deserialize_cdr(serialize(BEGIN + 5, frame, numbers), IMU)
-    assert (message.header.frame_id, message.header.stamp.nanosec, message.angular_velocity.z) == (frame, 5, 15.0)
+    assert ((message.header.frame_id, message.header.stamp.nanosec, message.angular_velocity.z)
+            == (frame, 5, 15.0))
     assert message.linear_acceleration_covariance[8] == 36.0
-    assert parse(serialize(BEGIN, frame, [20.5, 0.0]), LAYOUTS[TEMPERATURE]) == (BEGIN, (20.5, 0.0))
+    assert (parse(serialize(BEGIN, frame, [20.5, 0.0]), LAYOUTS[TEMPERATURE])
+            == (BEGIN, (20.5, 0.0)))
 
 
 def test_bytes_that_are_no_message_are_refused():
     good = serialize(BEGIN, 'gyro', 37 * [0.0])
-    for data in (b'', good[:3], good[:20], good[:-1], b'\0\x07' + good[2:], good[:12] + b'\xff' * 4 + good[16:]):
+    for data in (b'', good[:3], good[:20], good[:-1], b'\0\x07' + good[2:],
+                 good[:12] + b'\xff' * 4 + good[16:]):
         with pytest.raises(MessageError):
             parse(data, LAYOUTS[IMU])
 
@@ -104,12 +113,17 @@ def write_chunks(path, compression, count, chunked=True):
     """Write a recording of a gyro that counts, by the library mcap."""
     writing = pytest.importorskip('mcap.writer', reason='mcap is not installed')
     with open(path, 'wb') as file:
-        writer = writing.Writer(file, chunk_size=10_000, compression=writing.CompressionType[compression], use_chunking=chunked)
+        writer = writing.Writer(file, chunk_size=10_000,
+                                compression=writing.CompressionType[compression],
+                                use_chunking=chunked)
         writer.start('ros2')
         writer.add_metadata('who', {'is': 'it'})
-        channel = writer.register_channel('/imu', 'cdr', writer.register_schema(IMU, 'ros2msg', b''))
+        channel = writer.register_channel('/imu', 'cdr',
+                                          writer.register_schema(IMU, 'ros2msg', b''))
         for number in range(count):
-            writer.add_message(channel, BEGIN + number, serialize(BEGIN + 10 ** 7 * number, 'gyro', 37 * [float(number)]), BEGIN)
+            writer.add_message(
+                channel, BEGIN + number,
+                serialize(BEGIN + 10 ** 7 * number, 'gyro', 37 * [float(number)]), BEGIN)
         writer.finish()
 
 
@@ -127,7 +141,8 @@ def test_several_files_of_a_folder_are_one_recording(make, tmp_path, turning):
     (tmp_path / 'whole').mkdir()
     for number in range(12):
         part = slice(number * 150, (number + 1) * 150)
-        file = file_of(write(tmp_path / f'part_{number}', {'imu': gyro(make, time[part], rate[part])}, storage='MCAP'))
+        file = file_of(write(tmp_path / f'part_{number}',
+                             {'imu': gyro(make, time[part], rate[part])}, storage='MCAP'))
         shutil.copy(file, tmp_path / 'whole' / f'whole_{number}.mcap')
     np.testing.assert_array_equal(read_recording(tmp_path / 'whole').output, rate[:1800])
 
@@ -139,7 +154,8 @@ def test_several_files_of_a_folder_are_one_recording(make, tmp_path, turning):
 def test_a_torn_mcap_file_is_read_up_to_the_tear(make, tmp_path, kind):
     # Enough for several chunks, the last of which is torn in its middle.
     time = np.arange(9000) / RATE
-    whole = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}, **KINDS[kind])).read_bytes()
+    whole = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)},
+                          **KINDS[kind])).read_bytes()
     data = whole[:whole.index(b'rosbag2') - 13]  # without the closing part
     counts, torn = [], tmp_path / 'torn.mcap'
     for share in (0.5, 0.7, 0.9, 1.0):
@@ -148,13 +164,14 @@ def test_a_torn_mcap_file_is_read_up_to_the_tear(make, tmp_path, kind):
         counts.append(len(log))
         np.testing.assert_array_equal(log.output, time[:len(log)])
         assert any('is torn after' in note for note in log.notes)
-    # There are three chunks, so what is torn off more lies within one: of a torn chunk, too, all is read that is there.
+    # There are three chunks, so that most cuts lie within one: all that is left of it is read.
     assert counts == sorted(set(counts)) and counts[0] > 3000 and counts[-1] == 9000
 
 
 def test_zeros_at_the_end_are_a_tear(make, tmp_path):
     time = np.arange(500) / RATE
-    data = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}, storage='MCAP')).read_bytes()
+    data = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)},
+                         storage='MCAP')).read_bytes()
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(data[:data.index(b'rosbag2') - 13] + bytes(4096))
     log = read_recording(torn)
@@ -169,7 +186,8 @@ def test_a_damaged_chunk_is_left_out_and_told(tmp_path):
     (tmp_path / 'a.mcap').write_bytes(data)
     log = read_recording(tmp_path / 'a.mcap')
     assert 1900 < len(log) < 2000 and (np.diff(log.output) > 0).all()
-    assert any('1 damaged or oversized part of the recording was left out' in note for note in log.notes)
+    assert any('1 damaged or oversized part of the recording was left out' in note
+               for note in log.notes)
 
 
 def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
@@ -186,11 +204,15 @@ def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
 def test_what_a_killed_writer_left_beside_its_database_is_read(tmp_path):
     with contextlib.closing(sqlite3.connect(tmp_path / 'live.db3')) as database:
         database.execute('PRAGMA journal_mode=WAL')
-        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)')
-        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)')
+        database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
+                         'serialization_format TEXT)')
+        database.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, '
+                         'timestamp INTEGER, data BLOB)')
         database.execute('INSERT INTO topics VALUES (1, "/imu", ?, "cdr")', [IMU])
-        rows = [(BEGIN + n, serialize(BEGIN + n * 10 ** 7, 'gyro', 37 * [float(n)])) for n in range(300)]
-        database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)', rows)
+        rows = [(BEGIN + n, serialize(BEGIN + n * 10 ** 7, 'gyro', 37 * [float(n)]))
+                for n in range(300)]
+        database.executemany('INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)',
+                             rows)
         database.commit()
         (tmp_path / 'dead').mkdir()
         for file in tmp_path.glob('live.db3*'):
@@ -214,7 +236,8 @@ def test_a_sample_takes_little_memory(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'a.db3', 'a.mcap.zstd', 'a.db3.zstd'])
-@pytest.mark.parametrize('content', [b'', b'\0' * 100, b'\x89MCAP0\r\n', b'SQLite format 3\0' + bytes(84), bytes(range(256)) * 40],
+@pytest.mark.parametrize('content', [b'', b'\0' * 100, b'\x89MCAP0\r\n',
+                                     b'SQLite format 3\0' + bytes(84), bytes(range(256)) * 40],
                          ids=['empty', 'zeros', 'magic of mcap', 'magic of sqlite', 'garbage'])
 def test_garbage_is_one_sentence(run, tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
@@ -223,7 +246,8 @@ def test_garbage_is_one_sentence(run, tmp_path, name, content):
     assert error.startswith(f'gyro_calibration: {tmp_path}') and error.count('\n') == 1
 
 
-@pytest.mark.parametrize('kind', ['mcap', 'mcap-chunks', 'sqlite3', 'sqlite3-message', 'mcap-file'])
+@pytest.mark.parametrize('kind',
+                         ['mcap', 'mcap-chunks', 'sqlite3', 'sqlite3-message', 'mcap-file'])
 def test_flipped_bits_end_in_a_log_or_a_sentence(make, tmp_path, kind):
     time = np.arange(300) / RATE
     path = file_of(write(tmp_path / 'bag', {'imu': gyro(make, time, time)}, **KINDS[kind]))
@@ -241,10 +265,13 @@ def test_flipped_bits_end_in_a_log_or_a_sentence(make, tmp_path, kind):
 
 @pytest.mark.parametrize('name', ['zstd', 'lz4'])
 def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
-    bomb = {'zstd': lambda data: pytest.importorskip('zstandard').compress(data),
-            'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[name](bytes(1 << 26))
-    body = struct.pack('<QQQI', 0, 0, 1000, 0) + struct.pack('<I', len(name)) + name.encode() + struct.pack('<Q', len(bomb)) + bomb
-    (tmp_path / 'bomb.mcap').write_bytes(b'\x89MCAP0\r\n' + struct.pack('<BQ', 6, len(body)) + body)
+    bomb = {
+        'zstd': lambda data: pytest.importorskip('zstandard').compress(data),
+        'lz4': lambda data: pytest.importorskip('lz4.frame').compress(data)}[name](bytes(1 << 26))
+    body = (struct.pack('<QQQI', 0, 0, 1000, 0) + struct.pack('<I', len(name)) + name.encode()
+            + struct.pack('<Q', len(bomb)) + bomb)
+    (tmp_path / 'bomb.mcap').write_bytes(
+        b'\x89MCAP0\r\n' + struct.pack('<BQ', 6, len(body)) + body)
     with pytest.raises(LogError, match='no message of sensor_msgs/msg/Imu'):
         read_recording(tmp_path / 'bomb.mcap')
 
@@ -259,28 +286,34 @@ def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
 
 def test_a_database_with_views_for_tables_is_refused(tmp_path):
     with contextlib.closing(sqlite3.connect(tmp_path / 'a.db3')) as database:
-        database.execute('CREATE VIEW topics AS SELECT 1 AS id, "/imu" AS name, "x" AS type, "cdr" AS serialization_format')
-        database.execute('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n')
+        database.execute('CREATE VIEW topics AS SELECT 1 AS id, "/imu" AS name, "x" AS type, '
+                         '"cdr" AS serialization_format')
+        database.execute('CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL '
+                         'SELECT i + 1 FROM n) SELECT i FROM n')
     with pytest.raises(LogError, match='not a ROS 2 recording'):
         read_recording(tmp_path / 'a.db3')
 
 
 def test_a_sentence_shows_no_text_of_a_file_that_a_terminal_would_obey(make, tmp_path):
     bad = '/imu\x1b[2J\n' + 300 * 'x'
-    topics = {bad: [(0.0, make.temperature(0.0, 20.0))], **{f'/t{n}': [(0.0, make.temperature(0.0, 20.0))] for n in range(30)}}
+    topics = {bad: [(0.0, make.temperature(0.0, 20.0))],
+              **{f'/t{n}': [(0.0, make.temperature(0.0, 20.0))] for n in range(30)}}
     for storage in ('MCAP', 'SQLITE3'):
         with pytest.raises(LogError) as caught:
             read_recording(write(tmp_path / storage, topics, storage=storage))
-        assert str(caught.value).isprintable() and len(str(caught.value)) < 2500 and 'and 11 more' in str(caught.value)
+        assert (str(caught.value).isprintable() and len(str(caught.value)) < 2500
+                and 'and 11 more' in str(caught.value))
 
 
 def test_a_compressed_recording_says_which_package_it_needs(make, tmp_path, monkeypatch):
     time = np.arange(300) / RATE
     topics = {'imu': gyro(make, time, time)}
-    plain, packed = write(tmp_path / 'plain', topics, storage='MCAP'), write(tmp_path / 'packed', topics, **KINDS['mcap-chunks'])
+    plain, packed = (write(tmp_path / 'plain', topics, storage='MCAP'),
+                     write(tmp_path / 'packed', topics, **KINDS['mcap-chunks']))
     monkeypatch.setitem(sys.modules, 'zstandard', None)
     assert len(read_recording(plain)) == 300
-    with pytest.raises(LogError, match='needs the Python package zstandard: pip install zstandard'):
+    with pytest.raises(LogError,
+                       match='needs the Python package zstandard: pip install zstandard'):
         read_recording(packed)
 
 
@@ -294,8 +327,8 @@ def test_only_recordings_are_taken_for_recordings(tmp_path):
 def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_path):
     """Its only page begins with an entry whose length is as large as can be written."""
     page = bytearray(512)
-    for place, data in {0: b'SQLite format 3', 16: b'\2', 21: b'\x40\x20\x20', 100: b'\r', 104: b'\2', 108: b'\1\x89', 393: 17 * b'\xff',
-                        411: b'C'}.items():
+    for place, data in {0: b'SQLite format 3', 16: b'\2', 21: b'\x40\x20\x20', 100: b'\r',
+                        104: b'\2', 108: b'\1\x89', 393: 17 * b'\xff', 411: b'C'}.items():
         page[place:place + len(data)] = data
     (tmp_path / 'a.db3').write_bytes(page[:412])
     with pytest.raises(LogError, match='it asks for more memory than there may be'):
@@ -314,20 +347,25 @@ def test_a_recording_that_is_not_there_is_one_sentence_and_is_not_made(tmp_path,
 
 def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     time, rate, _ = turning
-    path = write(tmp_path / 'bag', {'/imu/data_raw': gyro(make, time, rate), '/imu/data': gyro(make, time, 2 * rate)})
+    path = write(tmp_path / 'bag', {'/imu/data_raw': gyro(make, time, rate),
+                                    '/imu/data': gyro(make, time, 2 * rate)})
     code, _, error = run('allan', path)
     assert code == 2 and '/imu/data and /imu/data_raw; say by --topic' in error
     for name in ('imu/data', '/imu/data'):
         np.testing.assert_array_equal(read_recording(path, Topics(name)).output, 2 * rate)
-    np.testing.assert_array_equal(read_recording(path, Topics(reference='imu/data')).output, rate)  # the one that is left
+    # It is the only one left.
+    np.testing.assert_array_equal(read_recording(path, Topics(reference='imu/data')).output, rate)
 
 
 def test_topics_that_are_not_there_or_of_another_kind_are_told(make, tmp_path, turning):
     time, rate, _ = turning
-    path = write(tmp_path / 'bag', {'/imu': gyro(make, time, rate), '/t': [(0.0, make.temperature(0.0, 20.0))]})
-    with pytest.raises(LogError, match=r'no topic gyro; there are /imu \(sensor_msgs/msg/Imu\) and /t \(sensor_msgs/msg/Temp'):
+    path = write(tmp_path / 'bag',
+                 {'/imu': gyro(make, time, rate), '/t': [(0.0, make.temperature(0.0, 20.0))]})
+    with pytest.raises(LogError, match=r'no topic gyro; there are /imu \(sensor_msgs/msg/Imu\) '
+                                       r'and /t \(sensor_msgs/msg/Temp'):
         read_recording(path, Topics('gyro'))
-    with pytest.raises(LogError, match='/t is sensor_msgs/msg/Temperature; --reference-topic wants nav_msgs/msg/Odometry, '):
+    with pytest.raises(LogError, match='/t is sensor_msgs/msg/Temperature; '
+                                       '--reference-topic wants nav_msgs/msg/Odometry, '):
         read_recording(path, Topics(reference='t'))
     with pytest.raises(LogError, match='cannot be its own reference'):
         read_recording(path, Topics('imu', reference='imu'))
@@ -359,26 +397,31 @@ def test_times_are_those_of_the_headers(make, tmp_path):
 @pytest.mark.parametrize('stamp', [None, 7.0], ids=['zero', 'always the same'])
 def test_without_stamps_the_times_of_receiving_are_taken_and_told(make, tmp_path, stamp):
     time = np.arange(300) / RATE
-    topics = {'imu': [(at, make.imu(stamp, at)) for at in time], 'odom': [(at, make.odometry(at, at, 1.0)) for at in time]}
+    topics = {'imu': [(at, make.imu(stamp, at)) for at in time],
+              'odom': [(at, make.odometry(at, at, 1.0)) for at in time]}
     log = read_recording(write(tmp_path / 'bag', topics), Topics(reference='odom'))
     np.testing.assert_allclose(log.time, time, atol=1e-9)
-    np.testing.assert_allclose(log.reference_heading, time, atol=1e-9)  # of the same clock as the gyro
+    np.testing.assert_allclose(log.reference_heading, time, atol=1e-9)  # from the gyro's clock
     assert any('times are those at which messages were received' in note for note in log.notes)
     assert any(f'time_s from {BEGIN // 10 ** 9}.{DELAY:09d} s' in note for note in log.notes)
 
 
 def test_doubled_samples_are_left_out_and_told(make, tmp_path):
     time = np.arange(300) / RATE
-    topics = {'imu': sorted(gyro(make, time, time) + gyro(make, time[100:200], time[100:200]), key=lambda each: each[0])}
+    topics = {'imu': sorted(gyro(make, time, time) + gyro(make, time[100:200], time[100:200]),
+                            key=lambda each: each[0])}
     log = read_recording(write(tmp_path / 'bag', topics))
     np.testing.assert_array_equal(log.output, time)
-    assert any('100 samples with the stamp of another one were left out' in note for note in log.notes)
+    assert any('100 samples with the stamp of another one were left out' in note
+               for note in log.notes)
 
 
 def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_path):
     time = np.arange(300) / RATE
-    path = write(tmp_path / 'bag', {'imu': [(at, make.imu(np.floor(10 * at) / 10, at)) for at in time]})
-    with pytest.raises(LogError, match='270 of 300 samples of imu have the stamp of another sample.* give --rate'):
+    path = write(tmp_path / 'bag',
+                 {'imu': [(at, make.imu(np.floor(10 * at) / 10, at)) for at in time]})
+    with pytest.raises(LogError, match='270 of 300 samples of imu have the stamp of another '
+                                       'sample.* give --rate'):
         read_recording(path)
     log = read_recording(path, rate=RATE)
     np.testing.assert_array_equal(log.output, time)
@@ -387,7 +430,8 @@ def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_
 
 def test_a_clock_that_was_set_back_is_refused(make, tmp_path):
     time = np.arange(300) / RATE
-    path = write(tmp_path / 'bag', {'imu': [(at, make.imu(at + (0.0 if at < 1.5 else 3600.0 * -1.0), at)) for at in time]})
+    path = write(tmp_path / 'bag', {
+        'imu': [(at, make.imu(at + (0.0 if at < 1.5 else 3600.0 * -1.0), at)) for at in time]})
     with pytest.raises(LogError, match=r'step back by 3599\.9\d* s at sample 151'):
         read_recording(path)
 
@@ -395,7 +439,8 @@ def test_a_clock_that_was_set_back_is_refused(make, tmp_path):
 # Temperature
 
 
-def test_a_slow_temperature_lies_on_the_line_between_readings_and_is_held_at_the_ends(make, tmp_path, turning):
+def test_a_slow_temperature_lies_on_the_line_between_readings_and_is_held_at_the_ends(
+        make, tmp_path, turning):
     time, rate, _ = turning
     readings = [(at, make.temperature(at, 20.0 + at)) for at in np.arange(2.5, 18.0)]
     log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, rate), 't': readings}))
@@ -416,11 +461,13 @@ def test_a_long_time_without_temperature_is_told_and_another_time_is_not_used(ma
 
 def test_of_several_temperatures_the_one_named_like_the_gyro_is_taken(make, tmp_path, turning):
     time, rate, _ = turning
-    topics = {'gyro/imu': gyro(make, time, rate), 'battery/temperature': [(0.0, make.temperature(0.0, 5.0))],
+    topics = {'gyro/imu': gyro(make, time, rate),
+              'battery/temperature': [(0.0, make.temperature(0.0, 5.0))],
               'gyro/temperature': [(0.0, make.temperature(0.0, 30.0))]}
     path = write(tmp_path / 'bag', topics)
     np.testing.assert_array_equal(read_recording(path).temperature, 30.0)
-    np.testing.assert_array_equal(read_recording(path, Topics(temperature='battery/temperature')).temperature, 5.0)
+    np.testing.assert_array_equal(
+        read_recording(path, Topics(temperature='battery/temperature')).temperature, 5.0)
 
 
 # References
@@ -428,15 +475,18 @@ def test_of_several_temperatures_the_one_named_like_the_gyro_is_taken(make, tmp_
 
 def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
     time, rate, heading = turning
-    topics = {'imu': gyro(make, time, rate), 'odom': [(at, make.odometry(at, h, r)) for at, r, h in zip(time, rate, heading)],
+    topics = {'imu': gyro(make, time, rate),
+              'odom': [(at, make.odometry(at, h, r)) for at, r, h in zip(time, rate, heading)],
               'other': [(at, make.imu(at, r, heading=h)) for at, r, h in zip(time, rate, heading)],
               'pose': [(at, make.pose(at, h)) for at, h in zip(time, heading)],
               'twist': [(at, make.twist(at, r)) for at, r in zip(time, rate)],
               'bare': gyro(make, time, rate)}
     path = write(tmp_path / 'bag', topics)
-    for name, has_heading, has_rate in (('odom', 1, 1), ('other', 1, 1), ('pose', 1, 0), ('twist', 0, 1), ('bare', 0, 1)):
+    for name, has_heading, has_rate in (('odom', 1, 1), ('other', 1, 1), ('pose', 1, 0),
+                                        ('twist', 0, 1), ('bare', 0, 1)):
         log = read_recording(path, Topics('imu', name))
-        assert (log.reference_heading is not None, log.reference_rate is not None) == (has_heading, has_rate), name
+        assert ((log.reference_heading is not None, log.reference_rate is not None)
+                == (has_heading, has_rate)), name
         if has_heading:
             np.testing.assert_allclose(log.reference_heading, heading, atol=1e-9)
         if has_rate:
@@ -446,7 +496,8 @@ def test_each_kind_of_reference_gives_what_it_holds(make, tmp_path, turning):
 def test_a_reference_at_its_own_times_lies_on_the_line_between_its_values(make, tmp_path):
     time = np.arange(500) / RATE
     own = np.arange(0.003, 4.9, 0.04)
-    topics = {'imu': gyro(make, time, np.full(500, 0.5)), 'pose': [(at, make.pose(at, 0.5 * at)) for at in own]}
+    topics = {'imu': gyro(make, time, np.full(500, 0.5)),
+              'pose': [(at, make.pose(at, 0.5 * at)) for at in own]}
     log = read_recording(write(tmp_path / 'bag', topics), Topics(reference='pose'))
     inside = (time >= own[0]) & (time <= own[-1])
     np.testing.assert_allclose(log.reference_heading[inside], 0.5 * time[inside], atol=1e-9)
@@ -457,9 +508,11 @@ def test_a_reference_at_its_own_times_lies_on_the_line_between_its_values(make, 
 def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path, turning, sign):
     time, rate, heading = turning
     lost = (time > 5.0) & (time < 12.0)  # more than two turns
-    poses = [(at, make.pose(at, np.nan if gone else h)) for at, h, gone in zip(time, heading, lost)]
+    poses = [(at, make.pose(at, np.nan if gone else h))
+             for at, h, gone in zip(time, heading, lost)]
     imu = gyro(make, time, sign * (rate + 0.3))  # a bias, and perhaps upside down
-    log = read_recording(write(tmp_path / 'bag', {'imu': imu, 'pose': poses}), Topics(reference='pose'))
+    log = read_recording(write(tmp_path / 'bag', {'imu': imu, 'pose': poses}),
+                         Topics(reference='pose'))
     np.testing.assert_array_equal(np.isnan(log.reference_heading), lost)
     np.testing.assert_allclose(log.reference_heading[~lost], heading[~lost], atol=1e-9)
     assert any('more than half a turn' in note for note in log.notes)
@@ -467,14 +520,16 @@ def test_a_lost_reference_is_nan_and_goes_on_with_the_right_turn(make, tmp_path,
 
 def test_a_reference_of_another_time_is_refused(make, tmp_path, turning):
     time, rate, _ = turning
-    topics = {'imu': gyro(make, time, rate), 'pose': [(at, make.pose(at + 3600.0, 0.0)) for at in time]}
+    topics = {'imu': gyro(make, time, rate),
+              'pose': [(at, make.pose(at + 3600.0, 0.0)) for at in time]}
     with pytest.raises(LogError, match='no heading and no rate at the times of the gyro'):
         read_recording(write(tmp_path / 'bag', topics), Topics(reference='pose'))
 
 
 def test_odometry_that_never_fills_in_its_rate_gives_its_heading(make, tmp_path, turning):
     time, rate, heading = turning
-    topics = {'imu': gyro(make, time, rate), 'odom': [(at, make.odometry(at, h, 0.0)) for at, h in zip(time, heading)]}
+    topics = {'imu': gyro(make, time, rate),
+              'odom': [(at, make.odometry(at, h, 0.0)) for at, h in zip(time, heading)]}
     log = read_recording(write(tmp_path / 'bag', topics), Topics(reference='odom'))
     assert log.reference_rate is None and log.reference_heading is not None
 
@@ -503,27 +558,35 @@ def numbers_of(answer):
 def recorded(run, tmp_path):
     """Return the same simulated motion as a log and as a recording, and the model of its gyro."""
     model = tmp_path / 'model.yaml'
-    model.write_text('effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: 0.01}}\nnoise: {angle_random_walk: 0.0001}\n')
+    model.write_text(
+        'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: 0.01}}\n'
+        'noise: {angle_random_walk: 0.0001}\n')
 
     def recorded(motion):
         path = tmp_path / 'log.csv'
-        assert run('simulate', '--model', model, '--motion', motion, '--out', path, '--sample-rate', 25, '--seed', 1)[0] == 0
+        assert run('simulate', '--model', model, '--motion', motion, '--out', path,
+                   '--sample-rate', 25, '--seed', 1)[0] == 0
         log = replace(read_log(path), reference_rate=None)  # a pose has no rate
         write_log(path, log)
         return path, write(tmp_path / 'bag', of_log(log), storage='MCAP'), model
     return recorded
 
 
-@pytest.mark.parametrize('verb', ['fit', 'turn', 'self-calibrate', 'allan', 'diagnose', 'compensate', 'compensate --rest'])
+@pytest.mark.parametrize('verb', ['fit', 'turn', 'self-calibrate', 'allan', 'diagnose',
+                                  'compensate', 'compensate --rest'])
 def test_a_verb_answers_alike_for_a_recording_and_for_its_log(run, recorded, tmp_path, verb):
-    motion = 'rest' if verb in ('allan', 'diagnose') else 'calibration' if verb == 'self-calibrate' else 'robot'
+    motion = ('rest' if verb in ('allan', 'diagnose') else 'calibration'
+              if verb == 'self-calibrate' else 'robot')
     path, recording, model = recorded(motion)
     words = [word.format(model=model, out=tmp_path / 'out.csv') for word in {
-        'diagnose': 'diagnose --model {model} --seed 1', 'compensate': 'compensate --model {model} --out {out}',
-        'compensate --rest': 'compensate --rest --model {model} --out {out}'}.get(verb, verb).split()]
+        'diagnose': 'diagnose --model {model} --seed 1',
+        'compensate': 'compensate --model {model} --out {out}',
+        'compensate --rest': 'compensate --rest --model {model} --out {out}'}.get(
+            verb, verb).split()]
     code, answer, _ = run(*words, path, '--json')
     outputs = [read_log(tmp_path / 'out.csv')] if verb.startswith('compensate') else []
-    again = run(*words, recording, '--json', *([] if motion == 'rest' else ['--reference-topic', 'table']))
+    again = run(*words, recording, '--json',
+                *([] if motion == 'rest' else ['--reference-topic', 'table']))
     assert (code, again[0]) == (0, 0), again
     assert 'gyro: imu/data_raw' in again[2]
     first, second = (numbers_of(json.loads(text)) for text in (answer, again[1]))
@@ -540,4 +603,5 @@ def test_a_model_says_of_which_files_of_a_recording_it_comes(run, recorded, tmp_
     out = tmp_path / 'fitted.yaml'
     assert run('fit', recording, '--reference-topic', 'table', '--out', out)[0] == 0
     digest = hashlib.sha256(file_of(recording).read_bytes()).hexdigest()
-    assert yaml.safe_load(out.read_text())['origin']['files'] == [{'name': 'bag.mcap', 'sha256': digest}]
+    assert yaml.safe_load(out.read_text())['origin']['files'] == [
+        {'name': 'bag.mcap', 'sha256': digest}]

@@ -1,4 +1,4 @@
-"""The sources worked through again: each number is what a small computation of its own gives, and verdicts can fail."""
+"""The sources reproduced: each number equals an independent computation, and verdicts can fail."""
 
 import ast
 import json
@@ -47,48 +47,57 @@ def numbers(source, words):
 # verdicts
 
 @pytest.mark.parametrize('published, value, verdict', [
-    ('4.8', 4.849, 'reproduced'), ('4.8', 4.851, 'differs'), ('< 2', 1.9, 'reproduced'), ('< 2', 2.1, 'differs'),
-    ('~ 10', 30.0, 'reproduced'), ('~ 10', 33.0, 'differs'), ('~ 10', -10.0, 'differs'), ('', 1.0, ''),
+    ('4.8', 4.849, 'reproduced'), ('4.8', 4.851, 'differs'), ('< 2', 1.9, 'reproduced'),
+    ('< 2', 2.1, 'differs'), ('~ 10', 30.0, 'reproduced'), ('~ 10', 33.0, 'differs'),
+    ('~ 10', -10.0, 'differs'), ('', 1.0, ''),
 ])
 def test_a_verdict_is_what_the_last_digit_allows(published, value, verdict):
     assert Comparison('', '', value, published).verdict == verdict
     if verdict == 'differs':
-        assert Comparison('', '', value, published, own_figures=True).verdict == 'contradicts itself'
+        assert (Comparison('', '', value, published, own_figures=True).verdict
+                == 'contradicts itself')
 
 
 def test_the_uncertainty_of_ours_counts():
-    assert Comparison('', '', 5.0, '4.8', uncertainty=0.2).agrees and not Comparison('', '', 5.0, '4.8', uncertainty=0.1).agrees
+    assert (Comparison('', '', 5.0, '4.8', uncertainty=0.2).agrees
+            and not Comparison('', '', 5.0, '4.8', uncertainty=0.1).agrees)
     assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).agrees
 
 
 @each_source
 def test_a_wrong_published_value_does_not_come_out(source):
-    wrong = [replace(each, published=f'{3.0 * each.value + 7.0:.3f}') for each in reproduced(source).comparisons
+    wrong = [replace(each, published=f'{3.0 * each.value + 7.0:.3f}')
+             for each in reproduced(source).comparisons
              if each.verdict == 'reproduced' and each.published[0] not in '<~']
     assert len(wrong) > 2 and not [each for each in wrong if each.agrees]
 
 
 @pytest.mark.parametrize('source, contradicting', [
     ('ojeda', ['data sets, every 10 deg/s and 2 K']),
-    ('hong_park', ['drift in 30 min, root of the sum of squares', 'off pure integration, self-calibration']),
+    ('hong_park',
+     ['drift in 30 min, root of the sum of squares', 'off pure integration, self-calibration']),
     ('bot_thoughts', ['SF, mean of the slopes']),
 ])
 def test_what_contradicts_itself(source, contradicting):
-    assert [each.quantity for each in reproduced(source).comparisons if each.verdict == 'contradicts itself'] == contradicting
+    assert [each.quantity for each in reproduced(source).comparisons
+            if each.verdict == 'contradicts itself'] == contradicting
 
 
 @each_source
 def test_every_number_of_a_contradiction_is_in_its_sentence(source):
     for contradiction in reproduced(source).contradictions:
-        assert contradiction.numbers and all(np.isfinite(value) for value in contradiction.numbers.values())
-        assert not [name for name in contradiction.numbers if f'{{{name}:' not in contradiction.pattern], contradiction.pattern
+        assert (contradiction.numbers
+                and all(np.isfinite(value) for value in contradiction.numbers.values()))
+        assert not [name for name in contradiction.numbers
+                    if f'{{{name}:' not in contradiction.pattern], contradiction.pattern
 
 
 # the verb and its page
 
 @each_source
 def test_the_page_holds_what_the_program_prints(source):
-    assert page(reproduced(source)) in (ROOT / 'docs/reproduction.md').read_text(), 'run gyro_calibration reproduce and put it there'
+    assert page(reproduced(source)) in (ROOT / 'docs/reproduction.md').read_text(), (
+        'run gyro_calibration reproduce and put it there')
 
 
 @each_source
@@ -102,7 +111,8 @@ def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys,
         assert not error, 'the progress bar is for terminals'
         answers.append(json.loads(text)['sources'])
     assert answers[0] == answers[1] != answers[2]
-    assert {'quantity', 'unit', 'published', 'ours', 'verdict'} <= set(answers[0][source]['comparisons'][0])
+    assert {'quantity', 'unit', 'published', 'ours', 'verdict'} <= set(
+        answers[0][source]['comparisons'][0])
 
 
 def test_a_source_that_is_not_there_is_wrong_use(capsys):
@@ -114,7 +124,8 @@ def test_a_source_that_is_not_there_is_wrong_use(capsys):
 @pytest.mark.parametrize('path', FILES, ids=[path.name for path in FILES])
 def test_the_files_only_compute(path):
     nodes = list(ast.walk(ast.parse(path.read_text())))
-    called = {node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+    called = {node.func.id
+              for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
     assert not called & {'print', 'open', 'input'} and 'default_rng' not in path.read_text()
 
 
@@ -131,29 +142,37 @@ def test_eq_10_as_printed_puts_several_powers_into_one_column():
 
 
 def test_the_condition_numbers_are_those_of_numpys_vandermonde_matrix():
-    rates, temperatures = (axis.ravel() for axis in np.meshgrid(np.linspace(-100, 100, 21), np.linspace(25, 45, 11)))
+    rates, temperatures = (
+        axis.ravel() for axis in np.meshgrid(np.linspace(-100, 100, 21), np.linspace(25, 45, 11)))
     found = numbers('ojeda', 'condition number')
-    assert found['raw'] == pytest.approx(np.linalg.cond(np.polynomial.polynomial.polyvander2d(rates, temperatures, [3, 2])), rel=1e-3)
+    assert found['raw'] == pytest.approx(np.linalg.cond(
+        np.polynomial.polynomial.polyvander2d(rates, temperatures, [3, 2])), rel=1e-3)
     scaled = np.polynomial.polynomial.polyvander2d(rates / 100, (temperatures - 35) / 10, [3, 2])
     assert found['scaled'] == pytest.approx(np.linalg.cond(scaled), rel=1e-6)
 
 
 def test_the_error_before_is_that_of_scale_and_sine():
     gyro, speeds = ojeda.rd2100(), np.arange(5, 101, 5) * DEGREE
-    rates, temperatures = (axis.ravel() for axis in np.meshgrid(np.concatenate([-speeds, speeds]), np.arange(25.0, 46.0, 2.0)))
+    rates, temperatures = (axis.ravel() for axis in np.meshgrid(
+        np.concatenate([-speeds, speeds]), np.arange(25.0, 46.0, 2.0)))
     scale = 1 + 0.02 / 115 * (temperatures - 25)
     error = np.sin(0.1 * rates) / 0.1 + (scale - 1) * rates - rates
-    np.testing.assert_allclose(gyro.output(rates, temperatures) - gyro.output(0.0 * rates, temperatures) - rates, error, atol=1e-12)
-    assert ours('ojeda', 'rms error of the rate, static bias only').ours == pytest.approx(np.sqrt(np.mean(error ** 2)) / DEGREE, rel=0.01)
+    np.testing.assert_allclose(gyro.output(rates, temperatures)
+                               - gyro.output(0.0 * rates, temperatures) - rates, error, atol=1e-12)
+    assert ours('ojeda', 'rms error of the rate, static bias only').ours == pytest.approx(
+        np.sqrt(np.mean(error ** 2)) / DEGREE, rel=0.01)
     turn = np.abs(error / rates).max() * 100
-    assert ours('ojeda', 'largest error of a full turn, static bias only').ours == pytest.approx(turn, rel=0.05)
+    assert (ours('ojeda', 'largest error of a full turn, static bias only').ours
+            == pytest.approx(turn, rel=0.05))
 
 
 def test_a_full_turn_errs_by_the_error_of_the_rate_times_its_time():
     gyro = replace(ojeda.rd2100(), noise=GyroModel().noise)
     rates, temperatures = np.array([36.0, -90.0]) * DEGREE, np.array([25.0, 45.0])
-    errors, durations = ojeda.simulated_turns(gyro, [GyroModel(), gyro], rates, temperatures, np.random.default_rng(0))
-    wanted = (gyro.output(rates, temperatures) - gyro.output(0.0 * rates, temperatures) - rates) * [10.0, 4.0]
+    errors, durations = ojeda.simulated_turns(gyro, [GyroModel(), gyro], rates, temperatures,
+                                              np.random.default_rng(0))
+    wanted = ((gyro.output(rates, temperatures) - gyro.output(0.0 * rates, temperatures) - rates)
+              * [10.0, 4.0])
     np.testing.assert_allclose(durations, [10.0, 4.0])
     np.testing.assert_allclose(errors, [wanted, [0.0, 0.0]], atol=1e-9)
 
@@ -161,10 +180,13 @@ def test_a_full_turn_errs_by_the_error_of_the_rate_times_its_time():
 def test_the_calibration_takes_the_error_down_to_what_noise_leaves():
     for n in (12, 121, 231):
         left = ours('ojeda', f'rms error of the rate, n = {n}')
-        assert 0.0015 < left.ours < 0.003, 'flicker of 0.002 deg/s, of which the static bias takes a part away'
+        assert 0.0015 < left.ours < 0.003, (
+            'flicker of 0.002 deg/s, of which the static bias takes a part away')
         ratio = ours('ojeda', f'error of the rate, before over after, n = {n}')
-        assert ratio.ours == pytest.approx(ours('ojeda', 'rms error of the rate, static bias only').ours / left.ours, rel=0.05)
-        assert ratio.verdict == 'differs' and ours('ojeda', f'largest error of a full turn, n = {n}').verdict == 'reproduced'
+        assert ratio.ours == pytest.approx(
+            ours('ojeda', 'rms error of the rate, static bias only').ours / left.ours, rel=0.05)
+        assert ratio.verdict == 'differs' and ours(
+            'ojeda', f'largest error of a full turn, n = {n}').verdict == 'reproduced'
 
 
 def test_noise_in_the_regressor_does_what_the_expected_normal_equations_say():
@@ -174,13 +196,16 @@ def test_noise_in_the_regressor_does_what_the_expected_normal_equations_say():
     for name, deviation in (('vibration_single', 1.0), ('vibration_mean', 0.1)):
         noise = deviation / 100 * nodes
         powers = np.array([(rates + noise) ** i for i in range(4)])
-        matrix, vector = np.einsum('irn,jrn,n->ij', powers, powers, weights), np.einsum('irn,n,n->i', powers, noise, weights)
-        assert found[name] == pytest.approx(100 * np.linalg.solve(matrix, vector).sum(), rel=0.03, abs=2e-4)
+        matrix, vector = (np.einsum('irn,jrn,n->ij', powers, powers, weights),
+                          np.einsum('irn,n,n->i', powers, noise, weights))
+        assert found[name] == pytest.approx(100 * np.linalg.solve(matrix, vector).sum(),
+                                            rel=0.03, abs=2e-4)
     assert abs(found['white_single']) < 1e-5 and abs(found['white_mean']) < 1e-5
 
 
 def test_the_cubic_fails_beyond_its_range_as_without_noise():
-    inside, beyond = np.arange(-60, 61, 10) * DEGREE, np.array([-100, -90, -80, -70, 70, 80, 90, 100]) * DEGREE
+    inside, beyond = (np.arange(-60, 61, 10) * DEGREE,
+                      np.array([-100, -90, -80, -70, 70, 80, 90, 100]) * DEGREE)
     slopes = 1 + 0.02 / 115 * np.linspace(0, 20, 11)
 
     def output(rates):
@@ -189,14 +214,17 @@ def test_the_cubic_fails_beyond_its_range_as_without_noise():
             for known, output, rates in zip(output(inside), output(beyond), [beyond] * 11)]
     found = numbers('ojeda', 'start of a sine')
     assert found['strong'] == pytest.approx(np.sqrt(np.mean(np.square(left))) / DEGREE, rel=0.05)
-    assert found['strong_sine'] < 0.1 * found['strong'] and found['weak_sine'] < found['weak'] < 0.1 * found['strong']
+    assert (found['strong_sine'] < 0.1 * found['strong']
+            and found['weak_sine'] < found['weak'] < 0.1 * found['strong'])
 
 
 def test_the_other_numbers_of_ojeda_follow_by_hand():
     assert numbers('ojeda', 'Ann Arbor')['earth'] == pytest.approx(10.12, abs=0.01)
     assert numbers('ojeda', 'Ann Arbor')['ratio'] == pytest.approx(10.12 / 7.2, abs=0.01)
-    assert numbers('ojeda', 'data sets and not 121') == {'rates': 21, 'temperatures': 11, 'sets': 231, 'step': 20.0}
-    assert numbers('ojeda', 'no angle')['printed'] == 10 * numbers('ojeda', 'no angle')['right'] == 10.0
+    assert numbers('ojeda', 'data sets and not 121') == {'rates': 21, 'temperatures': 11,
+                                                         'sets': 231, 'step': 20.0}
+    assert (numbers('ojeda', 'no angle')['printed']
+            == 10 * numbers('ojeda', 'no angle')['right'] == 10.0)
     assert numbers('ojeda', 'of what?')['specified'] == 1.5
     order = numbers('ojeda', 'more than one order')
     assert math.hypot(order['more'], order['after']) == pytest.approx(order['before'] / 10)
@@ -211,7 +239,8 @@ def by_hand(motion, shift=0):
     time = np.arange(count) / 20
     measured = 0.9 * motion.rate_at(time) + 0.1
     rows = [(sum(measured[shift:shift + n]) / 20, n / 20) for n in range(1, count - shift)]
-    scale, offset = np.linalg.lstsq(np.array(rows), motion.heading_at(time[1:count - shift]), rcond=None)[0]
+    scale, offset = np.linalg.lstsq(np.array(rows), motion.heading_at(time[1:count - shift]),
+                                    rcond=None)[0]
     return 100 * ((1 / scale - 1) / -0.1 - 1), 100 * (-offset / scale / 0.1 - 1)
 
 
@@ -220,7 +249,8 @@ def test_the_rectangle_rule_has_the_errors_of_figure_6():
     assert by_hand(motion) == pytest.approx((found['s'], found['b']), rel=1e-6)
     assert by_hand(motion, 1) == pytest.approx((found['late_s'], found['late_b']), rel=1e-6)
     assert found['trapezoid'] < 1e-6 and found['late_s'] > 0 > found['s']
-    assert by_hand(hong_park.one_turn(3.0, 4.25)) == pytest.approx((-4.70, -20.61), abs=0.005), 'a motion in round numbers is near'
+    assert by_hand(hong_park.one_turn(3.0, 4.25)) == pytest.approx((-4.70, -20.61), abs=0.005), (
+        'a motion in round numbers is near')
 
 
 def test_a_short_move_has_the_same_errors_in_s_bar_and_b_bar():
@@ -238,25 +268,33 @@ def test_eq_8_as_printed_gives_both_in_each_others_place():
 def test_pure_integration_errs_by_s_and_b_alone():
     time = np.arange(0, 160, 0.01)
     error = 0.0373 * ROBOT.heading_at(time) / DEGREE + 0.75 / 60 * time
-    assert ours('hong_park', 'mean error, pure integration').ours == pytest.approx(np.abs(error).mean(), rel=0.1)
+    assert ours('hong_park', 'mean error, pure integration').ours == pytest.approx(
+        np.abs(error).mean(), rel=0.1)
 
 
 def test_calibration_and_filter_take_off_the_heading_error_what_the_first_page_says():
     text = (Path(__file__).parents[1] / 'README.md').read_text()
-    for row, name in (('self-calibration', 'self-calibration by likelihood'),
-                      ('threshold filter, single samples, as published', 'threshold filter, single samples'),
-                      ('threshold filter, mean of 0.2 s', 'threshold filter, mean of 0.2 s'),
-                      ('both, single samples, as published', 'likelihood and filter, single samples'),
-                      ('both, mean of 0.2 s', 'likelihood and filter, mean of 0.2 s')):
-        assert f'| {row} | {ours("hong_park", f"off pure integration, {name}").ours:.0f} % |' in text
+    for row, name in (
+            ('self-calibration', 'self-calibration by likelihood'),
+            ('threshold filter, single samples, as published', 'threshold filter, single samples'),
+            ('threshold filter, mean of 0.2 s', 'threshold filter, mean of 0.2 s'),
+            ('both, single samples, as published', 'likelihood and filter, single samples'),
+            ('both, mean of 0.2 s', 'likelihood and filter, mean of 0.2 s')):
+        assert (
+            f'| {row} | {ours("hong_park", f"off pure integration, {name}").ours:.0f} % |' in text)
 
 
 def test_the_percentages_of_table_1_are_those_of_its_means():
-    for name in ('self-calibration by likelihood', 'threshold filter, single samples', 'likelihood and filter, mean of 0.2 s'):
-        part = ours('hong_park', f'mean error, {name}').ours / ours('hong_park', 'mean error, pure integration').ours
-        assert ours('hong_park', f'off pure integration, {name}').ours == pytest.approx(100 - 100 * part)
-    assert ours('hong_park', 'off pure integration, threshold filter, single samples').verdict == 'differs'
-    assert ours('hong_park', 'off pure integration, self-calibration').ours == pytest.approx(100 * (1 - 1.1511 / 1.6675))
+    for name in ('self-calibration by likelihood', 'threshold filter, single samples',
+                 'likelihood and filter, mean of 0.2 s'):
+        part = (ours('hong_park', f'mean error, {name}').ours
+                / ours('hong_park', 'mean error, pure integration').ours)
+        assert (ours('hong_park', f'off pure integration, {name}').ours
+                == pytest.approx(100 - 100 * part))
+    assert (ours('hong_park', 'off pure integration, threshold filter, single samples').verdict
+            == 'differs')
+    assert (ours('hong_park', 'off pure integration, self-calibration').ours
+            == pytest.approx(100 * (1 - 1.1511 / 1.6675)))
 
 
 def test_single_samples_pass_the_threshold_as_often_as_drawn_ones():
@@ -269,21 +307,27 @@ def test_single_samples_pass_the_threshold_as_often_as_drawn_ones():
 def test_eq_7_is_as_far_from_the_bound_as_its_covariance_says():
     time = np.arange(2001) / 100
     rate = CALIBRATION.rate_at(time)
-    columns, bound = np.column_stack([CALIBRATION.heading_at(time), time]), np.column_stack([rate, np.ones(2001)])
+    columns, bound = (np.column_stack([CALIBRATION.heading_at(time), time]),
+                      np.column_stack([rate, np.ones(2001)]))
     # a sum of white noise at the times t and u has the covariance min(t, u)
     estimator = np.linalg.inv(columns.T @ columns) @ columns.T
     covariance = estimator @ np.minimum.outer(time, time) @ estimator.T
     ratio = np.sqrt(np.diag(covariance) / np.diag(np.linalg.inv(bound.T @ bound) * 100))
     found = numbers('hong_park', 'Cramer-Rao')
-    assert (found['s'], found['b']) == pytest.approx(tuple(ratio), rel=0.15)  # three standard errors of 200 runs
+    # Three standard errors of 200 runs.
+    assert (found['s'], found['b']) == pytest.approx(tuple(ratio), rel=0.15)
     assert found['likely_s'] < 1.15 and found['likely_b'] < 1.15
 
 
 def test_the_other_numbers_of_hong_and_park_follow_by_hand():
-    assert numbers('hong_park', '120 deg in 160 s') == pytest.approx({'drift': 120, 'mean': 60, 'published': 1.6675, 'fits': 2})
-    assert numbers('hong_park', 'as a sum') == pytest.approx({'sum': 10.77, 'squares': 9.17}, abs=0.01)
-    assert numbers('hong_park', 'the text has 41 %') == pytest.approx({'table': 30.97, 'mean': 64.11, 'deviation': 13.78}, abs=0.01)
-    assert numbers('hong_park', 'deletes true turns') == pytest.approx({'lost': 17.82, 'kept': 18.18, 'limit': 18.0}, rel=1e-6)
+    assert numbers('hong_park', '120 deg in 160 s') == pytest.approx(
+        {'drift': 120, 'mean': 60, 'published': 1.6675, 'fits': 2})
+    assert numbers('hong_park', 'as a sum') == pytest.approx(
+        {'sum': 10.77, 'squares': 9.17}, abs=0.01)
+    assert numbers('hong_park', 'the text has 41 %') == pytest.approx(
+        {'table': 30.97, 'mean': 64.11, 'deviation': 13.78}, abs=0.01)
+    assert numbers('hong_park', 'deletes true turns') == pytest.approx(
+        {'lost': 17.82, 'kept': 18.18, 'limit': 18.0}, rel=1e-6)
 
 
 # Bot Thoughts
@@ -297,14 +341,18 @@ def test_the_slopes_come_out_of_the_means():
     left = np.array([2.5654, -2854.5, -3857.9]) - rest - slope * np.array([0, 200, 270])
     deviation = math.sqrt(left @ left / np.square(np.array([0, 200, 270]) - 470 / 3).sum())
     found = numbers('bot_thoughts', 'A strobe that is off')
-    assert found['interval'] == pytest.approx(12.706 * deviation, rel=1e-4) and found['off'] == pytest.approx(abs(left[1] / slope))
+    assert (found['interval'] == pytest.approx(12.706 * deviation, rel=1e-4)
+            and found['off'] == pytest.approx(abs(left[1] / slope)))
 
 
 def test_each_cause_that_is_named_makes_the_slopes_equal():
     found, (first, second) = numbers('bot_thoughts', 'A strobe that is off'), bot_thoughts.slopes()
-    assert (-2854.5 - 2.5654 + first * found['null']) / 200 == pytest.approx(second, rel=1e-4), 'the null'
-    assert (-3857.9 + 2854.5) / (70 + found['speed']) == pytest.approx(first, rel=1e-4), 'the speed'
-    assert found['percent'] == pytest.approx(0.342, abs=0.001) and found['kelvin'] == pytest.approx(found['null'] / 0.04)
+    assert (-2854.5 - 2.5654 + first * found['null']) / 200 == pytest.approx(second, rel=1e-4), (
+        'the null')
+    assert (-3857.9 + 2854.5) / (70 + found['speed']) == pytest.approx(first, rel=1e-4), (
+        'the speed')
+    assert (found['percent'] == pytest.approx(0.342, abs=0.001)
+            and found['kelvin'] == pytest.approx(found['null'] / 0.04))
 
 
 def test_the_code_of_the_blog_is_consistent_but_for_the_sign():
@@ -312,14 +360,18 @@ def test_the_code_of_the_blog_is_consistent_but_for_the_sign():
     assert found['difference'] == pytest.approx(abs(2.5654 / 14.309 - 0.1793), abs=1e-9)
     assert found['unsigned'] == pytest.approx((2 ** 32 - 2854 - 2.5654) / -14.309, rel=1e-6)
     start = numbers('bot_thoughts', 'wrong sign')
-    assert start['wrong'] == pytest.approx(2 * 0.1793, abs=1e-3) and start['hour'] == pytest.approx(3600 * 0.02238)
+    assert (start['wrong'] == pytest.approx(2 * 0.1793, abs=1e-3)
+            and start['hour'] == pytest.approx(3600 * 0.02238))
 
 
 def test_the_strobe_is_as_far_off_as_the_slopes_differ():
     found = numbers('bot_thoughts', 'a strobe at 59.8 Hz')
-    assert found['off'] == pytest.approx(100 * 0.2 / 60) and abs(found['off'] - found['slopes']) < 0.02
-    assert found['corrected'] == pytest.approx(-14.309 * 60 / 59.8) and found['left'] == pytest.approx(0.972, abs=0.001)
-    assert found['nominal'] == pytest.approx(-0.003, abs=0.0005) and found['crystal'] == pytest.approx(0.008)
+    assert (found['off'] == pytest.approx(100 * 0.2 / 60)
+            and abs(found['off'] - found['slopes']) < 0.02)
+    assert (found['corrected'] == pytest.approx(-14.309 * 60 / 59.8)
+            and found['left'] == pytest.approx(0.972, abs=0.001))
+    assert (found['nominal'] == pytest.approx(-0.003, abs=0.0005)
+            and found['crystal'] == pytest.approx(0.008))
 
 
 def test_the_solvers_way_is_least_squares_of_its_sum():
@@ -331,6 +383,7 @@ def test_the_solvers_way_is_least_squares_of_its_sum():
 
 def test_neither_way_explains_the_difference_of_the_scales():
     found = numbers('bot_thoughts', 'the two methods differ by')
-    assert found['turntable'] == pytest.approx(1.32, abs=0.005) and abs(found['solver']) + 3 * found['solver_scatter'] < 0.05
+    assert (found['turntable'] == pytest.approx(1.32, abs=0.005)
+            and abs(found['solver']) + 3 * found['solver_scatter'] < 0.05)
     assert abs(found['likely']) + 3 * found['likely_scatter'] < 0.05
     assert found['late'] > 0.1 and found['reverse'] < -1 and found['slow'] < -40
