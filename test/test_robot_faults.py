@@ -2,8 +2,8 @@
 A small robot and the compensation node as a process, on real DDS, under faults.
 
 What is decided is tested in test_calibration_drive.py with a clock that the test steps; here, that
-the node joins it to topics. Tests wait for events; a machine that holds samples up for a quarter of
-a second ends a drive as well, which the tests take for what it is.
+the node joins it to topics. Tests wait for events; a machine that delays samples by 0.25 s ends a
+drive as well, which the tests accept.
 
 """
 
@@ -30,7 +30,8 @@ class Stage:
     """A robot, and what is known of the node under test."""
 
     def __init__(self, ros, wait_until, start_node, folder):
-        self.ros, self.wait_until, self._start_node, self._folder = ros, wait_until, start_node, folder
+        self.ros, self.wait_until, self._start_node, self._folder = (
+            ros, wait_until, start_node, folder)
         self.samples, self.reports = ros.collect(Imu, 'imu/data'), []
         ros.node.create_subscription(
             DiagnosticArray, '/diagnostics',
@@ -67,8 +68,9 @@ class Stage:
         """Calibrate until the robot turns at full rate, and return the answer to come."""
         for _ in range(5):
             answer = self.call()
-            self.wait_until(lambda: abs(self.base.robot.rate) > FULL_RATE or answer.done(), 60.0,  # noqa: B023, at once
-                            'full rate')
+            self.wait_until(
+                lambda: abs(self.base.robot.rate) > FULL_RATE or answer.done(),  # noqa: B023
+                60.0, 'full rate')
             if not answer.done():
                 return answer
             assert answer.result().message.startswith(tuple(

@@ -1,4 +1,4 @@
-"""The example for robot_localization is what that program reads, and fuses what the node publishes."""
+"""The robot_localization example has the parameters of that program and the published topics."""
 
 import ast
 import math
@@ -12,10 +12,13 @@ from rig import INTERVAL, Robot, rested
 from gyro_calibration.log import DEGREE
 
 CONFIG = Path(__file__).parents[1] / 'config' / 'robot_localization.yaml'
-STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw', 'ax', 'ay', 'az']
-#: Names in the documentation of its state estimation nodes (of those for a sensor, what stands behind its name).
-PARAMETERS = {'frequency', 'sensor_timeout', 'two_d_mode', 'publish_tf', 'odom_frame', 'base_link_frame', 'world_frame'}
-OF_A_SENSOR = {'', '_config', '_queue_size', '_differential', '_relative', '_remove_gravitational_acceleration'}
+STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw',
+         'ax', 'ay', 'az']
+#: Names in the documentation of its state estimation nodes (for a sensor, what follows its name).
+PARAMETERS = {'frequency', 'sensor_timeout', 'two_d_mode', 'publish_tf', 'odom_frame',
+              'base_link_frame', 'world_frame'}
+OF_A_SENSOR = {'', '_config', '_queue_size', '_differential', '_relative',
+               '_remove_gravitational_acceleration'}
 
 
 @pytest.fixture(name='parameters')
@@ -32,7 +35,8 @@ def fused(parameters, sensor):
 
 def test_it_names_parameters_that_exist(parameters):
     known = PARAMETERS | {sensor + end for sensor in ('odom0', 'imu0') for end in OF_A_SENSOR}
-    assert set(parameters) <= known and all(isinstance(parameters[name], float) for name in ('frequency', 'sensor_timeout'))
+    assert set(parameters) <= known and all(isinstance(parameters[name], float)
+                                            for name in ('frequency', 'sensor_timeout'))
 
 
 def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
@@ -43,7 +47,8 @@ def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
 def test_the_launch_file_in_the_documentation_can_be_read():
     page = (CONFIG.parents[1] / 'docs' / 'nav2.md').read_text()
     code = page.partition('```python\n')[2].partition('```')[0]
-    assert 'generate_launch_description' in compile(code, 'launch', 'exec').co_names and CONFIG.name in code
+    assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
+            and CONFIG.name in code)
 
 
 def arguments_of(launch_file):
@@ -52,7 +57,8 @@ def arguments_of(launch_file):
     for node in ast.parse(launch_file.read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict):
             names[node.targets[0].id] = {key.value for key in node.value.keys}
-    return names['DRIVER'] | names['COMPENSATION'] | names['OTHERS'] | {'driver_config', 'compensation_config'}
+    return names['DRIVER'] | names['COMPENSATION'] | names['OTHERS'] | {
+        'driver_config', 'compensation_config'}
 
 
 def test_the_launch_arguments_that_the_documents_name_are_those_of_the_launch_file():
@@ -71,7 +77,8 @@ def test_the_launch_arguments_that_are_parameters_are_parameters_of_the_nodes():
     from gyro_calibration.ros import driver_node, pipeline
     tree = ast.parse((CONFIG.parents[1] / 'launch' / 'gyro.launch.py').read_text())
     for name, table in (('DRIVER', driver_node.PARAMETERS), ('COMPENSATION', pipeline.PARAMETERS)):
-        node = next(each.value for each in tree.body if isinstance(each, ast.Assign) and each.targets[0].id == name)
+        node = next(each.value for each in tree.body
+                    if isinstance(each, ast.Assign) and each.targets[0].id == name)
         wanted = {value.elts[0].value for value in node.values}
         assert wanted <= {parameter.name for parameter in table}
 

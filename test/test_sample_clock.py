@@ -1,4 +1,4 @@
-"""Stamps, against simulated gyros whose true times are known: clocks that are off, bursts, busy hosts, stalls, lost samples."""
+"""Stamps of simulated gyros with known times: clock errors, bursts, busy hosts, stalls, losses."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +17,7 @@ HOUR = 3600.0
 
 @dataclass
 class Run:
-    """What a clock made of a gyro: true times and stamps of the samples that came, and the number of those that did not."""
+    """Result of a clock: true times and stamps of the samples that came, and the number lost."""
 
     clock: SampleClock
     times: np.ndarray
@@ -31,16 +31,18 @@ class Run:
 
 
 def true_times(rate, off, seconds, drift=1e-4):
-    """Return when samples are sent: by a clock that is off, and drifts to and fro in ten minutes."""
+    """Return send times of a clock that is off and drifts with a period of 600 s."""
     number = np.arange(int(rate * seconds))
-    return 0.003 + np.cumsum((1.0 + off + drift * np.sin(2.0 * np.pi * number / rate / 600.0)) / rate)
+    return 0.003 + np.cumsum(
+        (1.0 + off + drift * np.sin(2.0 * np.pi * number / rate / 600.0)) / rate)
 
 
 def arrivals_of(times, generator, burst=BURST, stalls=()):
-    """Return when samples arrive: at the end of bursts, late by a host with a long tail, and after stalls of a second all at once."""
+    """Return arrival times: bursts, a host latency with a long tail, and stalls of 1 s."""
     sent = np.ceil(times / burst) * burst if burst else times
     _, first, which = np.unique(sent, return_index=True, return_inverse=True)
-    late = generator.exponential(1e-4, first.size) + (generator.random(first.size) < 0.02) * generator.exponential(0.01, first.size)
+    late = (generator.exponential(1e-4, first.size)
+            + (generator.random(first.size) < 0.02) * generator.exponential(0.01, first.size))
     arrivals = np.maximum.accumulate(sent[first] + late)
     for stall in stalls:
         arrivals[(arrivals > stall) & (arrivals < stall + 1.0)] = stall + 1.0
@@ -48,7 +50,7 @@ def arrivals_of(times, generator, burst=BURST, stalls=()):
 
 
 def chunks(arrivals):
-    """Give slices of samples that arrive together, no more than the buffer holds, each with its arrival."""
+    """Return slices of samples that arrive together, within the buffer, with their arrivals."""
     begins = np.flatnonzero(np.diff(arrivals, prepend=-1.0) > 0.0)
     for begin, end in pairwise([*begins, arrivals.size]):
         for number, part in enumerate(range(begin, end, BUFFER)):
@@ -56,10 +58,11 @@ def chunks(arrivals):
 
 
 def play(clock, times, arrivals, kept=None, **said):
-    """Let a clock stamp the samples that are kept; they say what arrays in `said` hold for each."""
+    """Let a clock stamp the kept samples, with fields from the arrays in `said`."""
     kept = np.ones(times.size, bool) if kept is None else kept
     columns = {name: values[kept].tolist() for name, values in said.items()}
-    samples = [Sample(0.0, **dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+    samples = [Sample(0.0, **dict(zip(columns, row, strict=True)))
+               for row in zip(*columns.values(), strict=True)]
     samples = samples or [Sample(0.0)] * int(kept.sum())
     stamps = []
     for part, arrival in chunks(arrivals[kept]):
@@ -81,7 +84,7 @@ def generator():
 @pytest.mark.parametrize('off', [-0.03, 0.002, 0.03])
 @pytest.mark.parametrize('rate', [10, 100, 500, 1000])
 def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off, generator):
-    """Far below the 16 ms and the period; time is conserved. Where bursts beat with samples, a few of 30000 may seem lost."""
+    """Far below 16 ms and the period; beats with bursts may make a few of 30000 seem lost."""
     times = true_times(rate, off, 60.0)
     run = play(SampleClock(rate), times, arrivals_of(times, generator, stalls=(20.0, 40.3)))
     assert run.error() < min(0.0015, 0.35 / rate)
@@ -94,7 +97,8 @@ def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off,
 
 def test_a_host_without_bursts_costs_nothing_but_its_latency(generator):
     times = true_times(1000, 0.01, 20.0)
-    assert play(SampleClock(1000.0), times, arrivals_of(times, generator, burst=0.0)).error() < 5e-5
+    assert (play(SampleClock(1000.0), times, arrivals_of(times, generator, burst=0.0)).error()
+            < 5e-5)
 
 
 def test_nothing_drifts_in_an_hour(generator):
@@ -128,9 +132,11 @@ RUNS = ((10.0, 1), (11.0, 2), (20.0, 50), (40.0, 300))
 def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
     times = true_times(rate, 0.02, 60.0)
     kept = lose(times, RUNS) & (generator.random(times.size) >= 0.01)
-    run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(30.0,)), kept, sequence=sequence(times))
+    run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(30.0,)), kept,
+               sequence=sequence(times))
     assert run.clock.lost == run.truly_lost
-    late = (run.times > 45.0) | (run.times < 40.0)  # for 0.3 s nobody knows how often the sequence has wrapped
+    # For 0.3 s the number of wraps of the sequence is unknown.
+    late = (run.times > 45.0) | (run.times < 40.0)
     assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.35 / rate
 
 
@@ -156,7 +162,8 @@ def test_one_percent_lost_without_a_trace_is_counted_nearly(rate, tolerance, gen
 def test_what_was_counted_too_often_is_taken_back(rate, generator):
     """A sample cannot arrive before it is sent."""
     times = true_times(rate, -0.01, 60.0)
-    missing = ((generator.random(times.size) < min(0.05, 2.5 / rate)) & (times > LEARNED)).astype(int)
+    missing = ((generator.random(times.size) < min(0.05, 2.5 / rate)) & (times > LEARNED)).astype(
+        int)
     run = play(SampleClock(rate), times, arrivals_of(times, generator), missing=missing)
     assert run.clock.lost <= 1 + 0.05 * missing.sum() < missing.sum()
     assert run.error() < 0.003
@@ -177,7 +184,8 @@ def test_the_time_of_the_device_is_fitted_like_a_number(generator):
     """Here it tells of lost samples, too, and of the uneven loop of a microcontroller."""
     times = true_times(100, 0.0, 30.0) + generator.uniform(-5e-4, 5e-4, 3000)
     kept = generator.random(times.size) >= 0.01
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, time=50.0 + times / 1.02)
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept,
+               time=50.0 + times / 1.02)
     assert run.error() < 0.001
     assert run.clock.lost == run.truly_lost
 
@@ -195,18 +203,21 @@ def test_a_damaged_time_of_the_device_harms_for_a_moment_only(jump, generator):
 
 def test_a_device_that_was_restarted_begins_anew(generator):
     times = true_times(100, 0.0, 30.0)
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=np.where(times < 15.0, times + 500.0, times - 15.0))
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator),
+               time=np.where(times < 15.0, times + 500.0, times - 15.0))
     assert run.error() < 0.003
 
 
 @pytest.mark.parametrize(('outage', 'first'), [(0.0, 0), (0.3, 64), (0.55, 0), (1.0, 64)])
-def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(outage, first, generator):
+def test_after_a_sequence_that_began_anew_stamps_are_soon_right_to_a_burst(
+        outage, first, generator):
     """As where the power of a gyro failed for a moment."""
     before, after = true_times(1000, 0.01, 20.0), true_times(1000, 0.01, 20.0)
     times = np.concatenate([before, before[-1] + outage + after])
     said = np.concatenate([sequence(before), (first + sequence(after)) % 128])
     run = play(SampleClock(1000.0, 128), times, arrivals_of(times, generator), sequence=said)
-    assert np.abs(run.stamps - run.times)[run.times > after[0] + before[-1] + outage + 3.0].max() < 0.02
+    assert (np.abs(run.stamps - run.times)[run.times > after[0] + before[-1] + outage + 3.0].max()
+            < 0.02)
     assert (np.diff(run.stamps) > 0.0).all()
 
 
@@ -250,7 +261,8 @@ def test_the_line_is_the_one_under_all_points_with_the_least_sum_of_distances(ge
     line = LowerLine(1.0)
     for point in zip(x, y, strict=True):
         line.add(*point)
-    sums = [(y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i))).sum() for i in range(30) for j in range(i + 1, 30)
+    sums = [(y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i))).sum() for i in range(30)
+            for j in range(i + 1, 30)
             if (y - (y[i] + (y[j] - y[i]) / (j - i) * (x - i)) > -1e-9).all()]
     assert sum(y - [line.at(each) for each in x]) == pytest.approx(min(sums))
 

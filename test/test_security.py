@@ -1,4 +1,4 @@
-"""What the package may do, and what it cannot: the policy of a secured graph is what the nodes really have, none drives unasked."""
+"""The security policy: it equals what the nodes really have, and none drives unless asked."""
 
 import ast
 import signal
@@ -35,9 +35,11 @@ FILES = sorted(PACKAGE.rglob('*.py'))
 def names(path):
     """Return what a file imports, and what it calls, with its dots: ``yaml.load``."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
-    imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    imported = {alias.name for node in nodes if isinstance(node, ast.Import)
+                for alias in node.names}
     imported |= {node.module or '' for node in nodes if isinstance(node, ast.ImportFrom)}
-    imported |= {f'{node.module}.{alias.name}' for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    imported |= {f'{node.module}.{alias.name}'
+                 for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
     return imported, {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
 
 
@@ -46,12 +48,15 @@ def belongs(name, roots):
     return any(name == root or name.startswith(f'{root}.') for root in roots)
 
 
-NETWORK = {'socket', 'socketserver', 'ssl', 'asyncio', 'http', 'urllib.request', 'xmlrpc', 'ftplib', 'smtplib', 'telnetlib', 'requests',
-           'urllib3', 'zmq', 'websockets', 'multiprocessing'}
-CODE_FROM_DATA = {'pickle', 'cPickle', 'dill', 'joblib', 'marshal', 'shelve', 'runpy', 'imp', 'code', 'ctypes'}
-RUNS_CODE = {'eval', 'exec', 'compile', '__import__', 'yaml.load_all', 'yaml.unsafe_load', 'yaml.full_load', 'os.system',
-             'os.popen', 'numpy.load', 'np.load'}
-each_file = pytest.mark.parametrize('path', FILES, ids=[str(path.relative_to(PACKAGE)) for path in FILES])
+NETWORK = {'socket', 'socketserver', 'ssl', 'asyncio', 'http', 'urllib.request', 'xmlrpc',
+           'ftplib', 'smtplib', 'telnetlib', 'requests', 'urllib3', 'zmq', 'websockets',
+           'multiprocessing'}
+CODE_FROM_DATA = {'pickle', 'cPickle', 'dill', 'joblib', 'marshal', 'shelve', 'runpy', 'imp',
+                  'code', 'ctypes'}
+RUNS_CODE = {'eval', 'exec', 'compile', '__import__', 'yaml.load_all', 'yaml.unsafe_load',
+             'yaml.full_load', 'os.system', 'os.popen', 'numpy.load', 'np.load'}
+each_file = pytest.mark.parametrize('path', FILES,
+                                    ids=[str(path.relative_to(PACKAGE)) for path in FILES])
 
 
 @each_file
@@ -62,18 +67,21 @@ def test_no_file_opens_the_network(path):
 @each_file
 def test_no_file_makes_code_of_data(path):
     imported, called = names(path)
-    assert not {name for name in imported if belongs(name, CODE_FROM_DATA)} and not called & RUNS_CODE
+    assert (not {name for name in imported if belongs(name, CODE_FROM_DATA)}
+            and not called & RUNS_CODE)
 
 
 def test_what_is_imported_late_is_named_in_the_code():
     late = {path.name: path for path in FILES if 'importlib.import_module' in names(path)[1]}
     assert set(late) <= {'storage.py', 'recorder_node.py'}
-    calls = [node for node in ast.walk(ast.parse(late['storage.py'].read_text())) if isinstance(node, ast.Call)]
+    calls = [node for node in ast.walk(ast.parse(late['storage.py'].read_text()))
+             if isinstance(node, ast.Call)]
     asked = [call.args[0] for call in calls if ast.unparse(call.func) == '_library']
     assert asked and all(isinstance(name, ast.Constant) for name in asked)
 
 
-@pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'os/path', 'a.b/msg/Imu', '../msg/Imu', 'sensor_msgs/srv/SetCameraInfo', ''])
+@pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'os/path', 'a.b/msg/Imu', '../msg/Imu',
+                                  'sensor_msgs/srv/SetCameraInfo', ''])
 def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
     from gyro_calibration.ros.recorder_node import load
@@ -84,7 +92,8 @@ def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
 def test_yaml_is_read_as_plain_data_at_one_place():
     assert {path.name for path in FILES if 'yaml.load' in names(path)[1]} <= {'settings_file.py'}
     from gyro_calibration import settings_file
-    assert 'yaml.load(read_bytes(path, most).decode(\'utf-8-sig\'), _Loader)' in Path(settings_file.__file__).read_text()
+    assert ('yaml.load(read_bytes(path, most).decode(\'utf-8-sig\'), _Loader)'
+            in Path(settings_file.__file__).read_text())
     assert issubclass(settings_file._Loader, yaml.SafeLoader)
     assert not [tag for tag in settings_file._Loader.yaml_constructors if tag and 'python' in tag]
     assert not [tag for tag in settings_file._Loader.yaml_multi_constructors if tag]
@@ -93,14 +102,15 @@ def test_yaml_is_read_as_plain_data_at_one_place():
 @each_file
 def test_only_the_demonstration_starts_processes(path):
     imported, called = names(path)
-    starts = {name for name in imported | called if belongs(name, {'subprocess', 'pty.spawn'}) or name.startswith(('os.exec', 'os.spawn'))}
+    starts = {name for name in imported | called if belongs(name, {'subprocess', 'pty.spawn'})
+              or name.startswith(('os.exec', 'os.spawn'))}
     assert path.name == 'demo.py' or not starts
 
 
 # The policy of a secured graph
 
-ACCESS = {('topics', 'publish'): 'publisher', ('topics', 'subscribe'): 'subscriber', ('services', 'reply'): 'service',
-          ('services', 'request'): 'client'}
+ACCESS = {('topics', 'publish'): 'publisher', ('topics', 'subscribe'): 'subscriber',
+          ('services', 'reply'): 'service', ('services', 'request'): 'client'}
 
 
 def resolved(name, namespace, node):
@@ -111,36 +121,41 @@ def resolved(name, namespace, node):
 
 
 def allowed(enclave, namespace='/'):
-    """Return what the profile of an enclave allows its node in a namespace: pairs of a kind of end point and a name."""
+    """Return the end points that an enclave allows in a namespace: pairs of kind and name."""
     profile, = ENCLAVES[enclave].iter('profile')
     assert profile.get('ns') == '/'
     return {(ACCESS[rules.tag, key], resolved(rule.text, namespace, profile.get('node')))
-            for rules in profile for key, value in rules.items() if value == 'ALLOW' for rule in rules}
+            for rules in profile for key, value in rules.items() if value == 'ALLOW'
+            for rule in rules}
 
 
 def really(node, name, namespace):
     """Return what a node of the graph has, alike."""
-    ways = {'publisher': node.get_publisher_names_and_types_by_node, 'subscriber': node.get_subscriber_names_and_types_by_node,
-            'service': node.get_service_names_and_types_by_node, 'client': node.get_client_names_and_types_by_node}
+    ways = {'publisher': node.get_publisher_names_and_types_by_node,
+            'subscriber': node.get_subscriber_names_and_types_by_node,
+            'service': node.get_service_names_and_types_by_node,
+            'client': node.get_client_names_and_types_by_node}
     return {(kind, topic) for kind, ask in ways.items() for topic, _ in ask(name, namespace)}
 
 
 def test_the_policy_has_the_form_that_the_tools_read():
     """As the schema of sros2 wants it; the schema itself is not part of this package."""
     assert (POLICY.tag, POLICY.get('version')) == ('policy', '0.2.0')
-    forms = {'policy': {'enclaves'}, 'enclaves': {'enclave'}, 'enclave': {'profiles'}, 'profiles': {'profile'},
-             'profile': {'topics', 'services'}, 'topics': {'topic'}, 'services': {'service'}, 'topic': set(), 'service': set()}
+    forms = {'policy': {'enclaves'}, 'enclaves': {'enclave'}, 'enclave': {'profiles'},
+             'profiles': {'profile'}, 'profile': {'topics', 'services'}, 'topics': {'topic'},
+             'services': {'service'}, 'topic': set(), 'service': set()}
     assert all(child.tag in forms[element.tag] for element in POLICY.iter() for child in element)
     assert all(profile.get('ns') and profile.get('node') for profile in POLICY.iter('profile'))
-    rules = [(element.tag, key, value) for element in POLICY.iter() for key, value in element.items()
-             if element.tag in ('topics', 'services')]
+    rules = [(element.tag, key, value) for element in POLICY.iter()
+             for key, value in element.items() if element.tag in ('topics', 'services')]
     assert rules and all((tag, key) in ACCESS and value == 'ALLOW' for tag, key, value in rules)
 
 
 def test_among_the_enclaves_stands_nothing_else():
     """The tools of sros2 take a comment there for an enclave, and give up."""
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
-    enclaves, = ElementTree.parse(ROOT / 'config/sros2/policy.xml', parser).getroot().iter('enclaves')
+    enclaves, = ElementTree.parse(ROOT / 'config/sros2/policy.xml', parser).getroot().iter(
+        'enclaves')
     assert {child.tag for child in enclaves} == {'enclave'}
 
 
@@ -152,7 +167,7 @@ def test_no_rule_is_a_pattern_or_stands_twice():
             assert not [text for _, text in rules if set(text) & set('*?[]')]
 
 
-#: Of each enclave the node, and settings of its parameters that together bring everything that it may have.
+#: Parameters of each enclave's node that together bring every end point that it may have.
 SETTINGS = {
     'driver_node': [{}, {'use_sim_time': True}],
     'compensation_node': [{}, {'wheels': 'both', 'cmd_vel_stamped': True, 'use_sim_time': True}],
@@ -163,22 +178,24 @@ ONLY_THEN = {('subscriber', '/clock')}
 
 
 def begun(start_node, tmp_path, enclave):
-    """Start the node of an enclave with each of its settings, each in a namespace of its own; return name, namespaces and processes."""
+    """Start an enclave's node once for each setting; return name, namespaces and processes."""
     name = next(ENCLAVES[enclave].iter('profile')).get('node')
     namespaces = [f'/{enclave}_{number}' for number in range(len(SETTINGS[enclave]))]
     processes = []
     for namespace, settings in zip(namespaces, SETTINGS[enclave], strict=True):
-        files = {'calibration_file': tmp_path / f'{namespace[1:]}.yaml'} if name == 'compensation_node' else {}
+        files = ({'calibration_file': tmp_path / f'{namespace[1:]}.yaml'}
+                 if name == 'compensation_node' else {})
         processes.append(start_node(name, {**files, **settings}, {'__ns': namespace}))
     return name, namespaces, processes
 
 
 def settled(node, wait_until, name, namespaces):
-    """Return what the nodes of one name in some namespaces have, when the graph tells of all of them, and twice the same."""
+    """Return the end points of the nodes of one name, once the graph shows all and is settled."""
     seen = []
 
     def stands():
-        if {(name, namespace) for namespace in namespaces} <= set(node.get_node_names_and_namespaces()):
+        if {(name, namespace) for namespace in namespaces} <= set(
+                node.get_node_names_and_namespaces()):
             seen.append([really(node, name, namespace) for namespace in namespaces])
         return len(seen) > 100 and seen[-1] == seen[-100]
     wait_until(stands, 60.0, f'{name} in {namespaces}')
@@ -190,9 +207,12 @@ def test_the_policy_allows_each_node_exactly_what_it_has(start_node, ros, wait_u
     for enclave, (name, namespaces, processes) in nodes.items():
         have = settled(ros.node, wait_until, name, namespaces)
         rights = [allowed(enclave, namespace) for namespace in namespaces]
-        assert not [ends - right for ends, right in zip(have, rights, strict=True) if not ends <= right], f'{enclave} has more than it may'
-        used = {(kind, topic.replace(namespace, '', 1)) for ends, namespace in zip(have, namespaces, strict=True) for kind, topic in ends}
-        assert used == allowed(enclave), f'{enclave} may more than it has: {allowed(enclave) - used}'
+        assert not [ends - right for ends, right in zip(have, rights, strict=True)
+                    if not ends <= right], f'{enclave} has more than it may'
+        used = {(kind, topic.replace(namespace, '', 1))
+                for ends, namespace in zip(have, namespaces, strict=True) for kind, topic in ends}
+        assert used == allowed(enclave), (
+            f'{enclave} may more than it has: {allowed(enclave) - used}')
         if not SETTINGS[enclave][0]:
             special = {(kind, resolved(topic, namespaces[0], name)) for kind, topic in ONLY_THEN}
             assert have[0] == rights[0] - special
@@ -200,28 +220,34 @@ def test_the_policy_allows_each_node_exactly_what_it_has(start_node, ros, wait_u
             process.interrupt()
 
 
-def test_the_policy_allows_a_recording_exactly_what_it_takes(start_node, ros, wait_until, tmp_path):
+def test_the_policy_allows_a_recording_exactly_what_it_takes(
+        start_node, ros, wait_until, tmp_path):
     kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry}
     publishers = [ros.publisher(kind, topic) for topic, kind in kinds.items()]
     out = tmp_path / 'log.mcap'
-    command = [sys.executable, '-m', 'gyro_calibration', 'record', '--reference-topic', 'odom', '--out', out]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+    command = [sys.executable, '-m', 'gyro_calibration', 'record',
+               '--reference-topic', 'odom', '--out', out]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL,
+                          stdout=subprocess.DEVNULL) as process:
         try:
-            wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers), 20.0, 'the recorder')
+            wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers),
+                       20.0, 'the recorder')
             name = 'gyro_calibration_recorder'
-            wait_until(lambda: name in ros.node.get_node_names() and really(ros.node, name, '/') == allowed('record'), 20.0, 'all of it')
+            wait_until(lambda: name in ros.node.get_node_names()
+                       and really(ros.node, name, '/') == allowed('record'), 20.0, 'all of it')
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(20.0)
 
 
 def called_with_names(path):
-    """Return the names of topics and services that a file writes down where it makes an end point."""
+    """Return the constant names of topics and services in the calls that make end points."""
     calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
     makers = ('create_publisher', 'create_subscription', 'create_service', 'create_client',
               'publish_on', 'subscribe_to')
     made = [call for call in calls if ast.unparse(call.func).rpartition('.')[2] in makers]
-    given = [argument.value for call in made for argument in call.args if isinstance(argument, ast.Constant)]
+    given = [argument.value for call in made
+             for argument in call.args if isinstance(argument, ast.Constant)]
     return {value for value in given if isinstance(value, str)}
 
 
@@ -239,12 +265,14 @@ def test_a_client_may_what_every_node_has_and_what_it_is_for(enclave, ros, wait_
     mine = allowed(enclave)
     assert {name for kind, name in mine if kind == 'client'} <= offered
     assert {name for kind, name in mine if kind == 'subscriber'} <= told | {'/clock'}
-    plain = {(kind, name.replace(enclave, 'test_client')) for kind, name in mine if kind in ('publisher', 'service')}
+    plain = {(kind, name.replace(enclave, 'test_client'))
+             for kind, name in mine if kind in ('publisher', 'service')}
     wait_until(lambda: really(ros.node, 'test_client', '/') == plain, what=f'{plain}')
 
 
 def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
-    assert not [name for kind, name in allowed('operator') if kind == 'client' and 'parameter' in name]
+    assert not [name
+                for kind, name in allowed('operator') if kind == 'client' and 'parameter' in name]
     publishers = {enclave for enclave in ENCLAVES if ('publisher', '/cmd_vel') in allowed(enclave)}
     assert publishers == {'compensation_node_that_drives'}
 
@@ -282,21 +310,27 @@ def test_the_node_is_no_publisher_of_commands_before_it_may_drive(start_node, ro
     assert not drivers(ros)
     value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
     allowing = SetParameters.Request(parameters=[Parameter(name='calibration.drive', value=value)])
-    assert ros.call(SetParameters, '/compensation_node/set_parameters', allowing).results[0].successful
+    assert ros.call(SetParameters, '/compensation_node/set_parameters',
+                    allowing).results[0].successful
     answer = ros.call(Trigger, '/compensation_node/calibrate')
     assert 'no sample comes on imu/data_raw' in answer.message
     wait_until(lambda: drivers(ros) == {'compensation_node'}, what='a publisher of commands')
 
 
 @pytest.mark.parametrize('node', ['driver_node', 'compensation_node'])
-def test_no_client_changes_which_files_and_ports_a_running_node_uses(node, start_node, ros, tmp_path):
-    start_node(node, {'calibration_file': tmp_path / 'calibration.yaml'} if node == 'compensation_node' else {})
+def test_no_client_changes_which_files_and_ports_a_running_node_uses(
+        node, start_node, ros, tmp_path):
+    start_node(node, {'calibration_file': tmp_path / 'calibration.yaml'}
+               if node == 'compensation_node' else {})
     names = ros.call(ListParameters, f'/{node}/list_parameters').result.names
     chosen = sorted(name for name in names if name == 'port' or name.endswith('_file'))
-    assert chosen == (['port'] if node == 'driver_node' else ['calibration.profile_file', 'calibration_file', 'model_file'])
+    assert chosen == (['port'] if node == 'driver_node'
+                      else ['calibration.profile_file', 'calibration_file', 'model_file'])
     for name in chosen:
-        given = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_STRING, string_value='/tmp/other'))
-        answers = [ros.call(SetParameters, f'/{node}/set_parameters', SetParameters.Request(parameters=[given])).results[0],
+        given = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_STRING,
+                                                          string_value='/tmp/other'))
+        answers = [ros.call(SetParameters, f'/{node}/set_parameters',
+                            SetParameters.Request(parameters=[given])).results[0],
                    ros.call(SetParametersAtomically, f'/{node}/set_parameters_atomically',
                             SetParametersAtomically.Request(parameters=[given])).result]
         assert [answer.successful for answer in answers] == [False, False], name

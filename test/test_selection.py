@@ -1,4 +1,4 @@
-"""The choice of effects: what is there is found, what is not there is not, and what cannot be told is said."""
+"""The selection of effects: present ones are found, absent ones not, confounded ones reported."""
 
 import runpy
 from dataclasses import replace
@@ -9,14 +9,21 @@ import pytest
 from scipy.stats import binom
 
 from gyro_calibration.dwells import join
-from gyro_calibration.effects import BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, CUBIC_NONLINEARITY, SINE_RESPONSE
+from gyro_calibration.effects import (
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CUBIC_NONLINEARITY,
+    SINE_RESPONSE,
+)
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.selection import FALSE_ALARM_RATE, PARTED, TECHNOLOGIES, select_effects
 
 BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
-RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py')) for name in ('recovery', 'rate_table'))
-Table, TRUTH, LINEAR, CUBIC, SINE = (RECOVERY[name] for name in ('Table', 'TRUTH', 'LINEAR', 'CUBIC', 'SINE'))
+RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
+                        for name in ('recovery', 'rate_table'))
+Table, TRUTH, LINEAR, CUBIC, SINE = (RECOVERY[name]
+                                     for name in ('Table', 'TRUTH', 'LINEAR', 'CUBIC', 'SINE'))
 #: A test of the choice fails by chance as rarely as this.
 RARE = 1e-4
 WANDERING = Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)
@@ -31,10 +38,12 @@ def measured(table, terms, seed=1):
     return table.measure(GyroModel(terms), np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize('table', [Table(), WANDERING, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)])
+@pytest.mark.parametrize(
+    'table', [Table(), WANDERING, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)])
 def test_effects_that_are_not_there_are_hardly_ever_taken(table):
     generator, runs = np.random.default_rng(2), 15
-    wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator))) != {'bias', 'scale_factor_error'} for _ in range(runs))
+    wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator)))
+                != {'bias', 'scale_factor_error'} for _ in range(runs))
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
 
 
@@ -44,7 +53,8 @@ def test_effects_of_clear_size_are_found(terms, technology):
                'bias_temperature_quadratic': Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 1e-5))}
     terms = [thermal.get(term.effect.name, term) for term in terms]
     generator, runs = np.random.default_rng(3), 8
-    found = [names(select_effects(Table().measure(GyroModel(terms), generator), technology)) for _ in range(runs)]
+    found = [names(select_effects(Table().measure(GyroModel(terms), generator), technology))
+             for _ in range(runs)]
     right = sum(each == {term.effect.name for term in terms} for each in found)
     assert right >= binom.ppf(RARE, runs, 1 - FALSE_ALARM_RATE)
 
@@ -52,7 +62,8 @@ def test_effects_of_clear_size_are_found(terms, technology):
 def test_a_curve_over_temperature_is_found_where_its_slope_alone_explains_little():
     terms = (*SINE, Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 5e-6)))
     table = replace(WANDERING, temperatures=(0.0, 60.0))
-    assert {'bias_temperature', 'bias_temperature_quadratic'} <= names(select_effects(measured(table, terms), 'open_loop_fog'))
+    assert {'bias_temperature', 'bias_temperature_quadratic'} <= names(
+        select_effects(measured(table, terms), 'open_loop_fog'))
 
 
 def test_two_sweeps_at_two_temperatures_show_the_slope_between_them():
@@ -76,19 +87,21 @@ def test_the_rate_that_is_said_to_part_look_alikes_parts_them():
     for _ in range(12):
         table = Table().measure(truth, generator)
         rate = select_effects(table).twins[0].rate
-        more, fast = Table(sweeps=1, rates=4).measure(truth, generator), np.array([rate, -rate, rate, -rate])
+        more, fast = (Table(sweeps=1, rates=4).measure(truth, generator),
+                      np.array([rate, -rate, rate, -rate]))
         noise = more.output - truth.output(more.rate, more.temperature)
         more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
         pair = select_effects(join([table, more])).twins[0]
         sigmas.append(pair.sigmas if pair.taken == 'sine_response' else -pair.sigmas)
-    # One more than needed is aimed at, so that they are parted mostly; a single pair of fits varies by one.
+    # The aim is one sigma more than needed; a single pair of fits varies by one sigma.
     assert np.mean(sigmas) > PARTED - 3.7 / np.sqrt(12), sigmas
 
 
 def test_every_effect_has_its_reason():
     selection = select_effects(measured(WANDERING, SINE), 'open_loop_fog')
     reasons = {choice.effect: choice for choice in selection.choices}
-    assert reasons['bias'].taken and reasons['scale_factor_asymmetry'].reason == 'no better than chance'
+    assert (reasons['bias'].taken
+            and reasons['scale_factor_asymmetry'].reason == 'no better than chance')
     assert reasons['cubic_nonlinearity'].reason.startswith('explains the same as sine_response')
     taken = reasons['scale_factor_temperature']
     assert taken.taken and taken.with_it < taken.without and taken.chance < FALSE_ALARM_RATE
@@ -112,10 +125,13 @@ def test_on_the_recorded_table_the_default_predicts_rates_beyond_those_it_saw(da
     assert RATE_TABLE['beyond'](RATE_TABLE['chosen'](technology), dwells) < 0.085 * DEGREE
 
 
-def test_on_the_recorded_table_sine_and_cubic_are_hardly_parted_and_the_rates_that_would_are_said(data):
+def test_on_the_recorded_table_sine_and_cubic_are_hardly_parted_and_the_rates_that_would_are_said(
+        data):
     dwells = RATE_TABLE['table'](data)
     selection = select_effects(dwells, 'open_loop_fog')
-    assert names(selection) == {'bias', 'scale_factor_error', 'sine_response', 'scale_factor_temperature'}
+    assert names(selection) == {'bias', 'scale_factor_error', 'sine_response',
+                                'scale_factor_temperature'}
     pair, = selection.twins
-    assert pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < PARTED and 110.0 < pair.rate / DEGREE < 200.0
+    assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < PARTED
+            and 110.0 < pair.rate / DEGREE < 200.0)
     assert selection.calibration.left_out_rms < 0.05 * DEGREE
