@@ -1,6 +1,7 @@
 """
-Self-calibration: the paper's two methods show the paper's numbers, the likelihood fit finds the truth and says how well, and what
-cannot be believed is refused.
+Self-calibration: the paper's two methods, the likelihood fit, and refused data.
+
+The methods reproduce the paper's numbers, and the fit finds the truth with its stated deviation.
 
 """
 
@@ -25,14 +26,14 @@ from gyro_calibration.self_calibration import (
 
 #: Hong and Park, section 3.1.3: s = -10 %, b = 0.1 rad/s.
 S, B = -0.1, 0.1
-#: Their XV3500: 2.5 deg/sqrt(h); s and b as their experiment found them, b in deg/min (see sources).
+#: Their XV3500: 2.5 deg/sqrt(h); s and b of their experiment, b in deg/min (see sources).
 XV3500, XV3500_S, XV3500_B = Noise(2.5 * DEGREE / 60), 0.0373, 0.75 * DEGREE / 60
 TIME = np.arange(2001) / 100.0
 RATE = CALIBRATION.rate_at(TIME)
 
 
 def sampled(motion, rate=20.0, step=0.0, phase=0.0):
-    """Return the motion as a heading reference gives it, `rate` times a second, by an encoder of that step, rad, if there is one."""
+    """Return a heading reference of the motion at `rate`, Hz, with encoder steps, rad, if any."""
     time = np.arange(round(motion.duration * rate) + 1) / rate
     heading = motion.heading_at(time) + phase
     return from_headings(time, np.round(heading / step) * step if step else heading)
@@ -45,7 +46,7 @@ MOVE_RATE = (1 + S) * MOVE.rate_at(MOVE_TIME) + B
 
 
 def test_the_heading_reference_errs_as_published():
-    """Printed are 4.8 % and 20.26 %: the rectangle rule of eq. 4 gives them for s_bar and b_bar, not for s and b, which err by more."""
+    """Eq. 4 gives the printed 4.8 and 20.26 % for s_bar and b_bar; s and b err by more."""
     fit = fit_heading(MOVE_TIME, MOVE_RATE, MOVE)
     scale, offset = 1 / (1 + fit.scale_factor_error), -fit.bias / (1 + fit.scale_factor_error)
     assert scale * (1 + S) - 1 == pytest.approx(-0.0482, abs=0.0002)
@@ -64,7 +65,8 @@ def test_the_rate_reference_shows_no_error():
     assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-12)
 
 
-@pytest.mark.parametrize('reference', [MOVE, sampled(MOVE)], ids=['rate profile', 'sampled heading'])
+@pytest.mark.parametrize('reference', [MOVE, sampled(MOVE)],
+                         ids=['rate profile', 'sampled heading'])
 def test_the_likelihood_shows_no_error_on_their_move(reference):
     fit = fit_likelihood(MOVE_TIME, MOVE_RATE, reference, 0.5)
     assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-9)
@@ -77,7 +79,8 @@ def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference
     rate = (1 + S) * CALIBRATION.rate_at(time - offset) + B
     fit = fit_likelihood(time, rate, sampled(CALIBRATION, reference) if reference else CALIBRATION)
     # at 20 Hz it is the trapezoid rule between the samples about a corner that errs
-    assert (fit.scale_factor_error, fit.bias) == pytest.approx((S, B), abs=1e-6 if gyro == 100 else 1e-5)
+    assert (fit.scale_factor_error, fit.bias) == pytest.approx(
+        (S, B), abs=1e-6 if gyro == 100 else 1e-5)
     assert fit.time_offset == pytest.approx(offset, abs=1e-5)
 
 
@@ -85,7 +88,7 @@ def test_equation_8_as_printed_returns_its_unknowns_swapped():
     true = MOVE.rate_at(MOVE_TIME)
     printed = np.array([[MOVE_RATE.sum(), MOVE_RATE @ MOVE_RATE], [len(true), MOVE_RATE.sum()]])
     first, second = np.linalg.solve(printed, [true @ MOVE_RATE, true.sum()])
-    assert (round(second, 3), round(first, 3)) == (1.111, -0.111)  # they name the first s_bar and the second b_bar
+    assert (round(second, 3), round(first, 3)) == (1.111, -0.111)  # s_bar, b_bar
 
 
 STEP = 0.088 * DEGREE
@@ -94,12 +97,14 @@ RUNS = 300
 
 @cache
 def honest(reference):
-    """Return, for noisy runs with known truth, errors of (s, b), their claimed standard deviations, and how many were refused."""
+    """Return errors of (s, b), their claimed deviations, and the number refused, of noisy runs."""
     errors, deviations, refused = [], [], 0
     for seed in range(RUNS):
         generator = np.random.default_rng([seed, len(reference)])
-        rate = (1 + XV3500_S) * RATE + XV3500_B + simulate_noise(XV3500, len(TIME), 0.01, generator)
-        motion = CALIBRATION if reference == 'profile' else sampled(CALIBRATION, 20.0, STEP, generator.uniform(0.0, STEP))
+        rate = (1 + XV3500_S) * RATE + XV3500_B + simulate_noise(
+            XV3500, len(TIME), 0.01, generator)
+        motion = (CALIBRATION if reference == 'profile'
+                  else sampled(CALIBRATION, 20.0, STEP, generator.uniform(0.0, STEP)))
         try:
             fit = self_calibrate(TIME, rate, motion)
         except DataRefused:
@@ -111,35 +116,39 @@ def honest(reference):
 
 
 def bound(reference):
-    """Return the Cramer-Rao bound of s and b: white noise of the rate, encoder steps as noise of step / sqrt(12), time offset unknown."""
+    """Return the Cramer-Rao bound of s and b: white noise, encoder steps, unknown time offset."""
     time = TIME if reference == 'profile' else np.arange(401) / 20.0
     heading, rate = CALIBRATION.heading_at(time), CALIBRATION.rate_at(time)
     columns = np.column_stack([np.diff(heading), np.diff(time), np.diff(rate)])
     differences = np.diff(np.eye(len(time)), axis=0)
     steps = 0.0 if reference == 'profile' else ((1 + XV3500_S) * STEP) ** 2 / 12
-    noise = np.diag(np.diff(time)) * XV3500.angle_random_walk ** 2 + steps * differences @ differences.T
+    noise = (np.diag(np.diff(time)) * XV3500.angle_random_walk ** 2
+             + steps * differences @ differences.T)
     return np.sqrt(np.diag(np.linalg.inv(columns.T @ np.linalg.solve(noise, columns))))[:2]
 
 
 @pytest.mark.parametrize('reference', ['profile', 'encoder'])
 def test_the_likelihood_is_unbiased(reference):
     errors, _, _ = honest(reference)
-    assert (np.abs(errors.mean(axis=0)) < 4.0 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))).all()
+    assert (np.abs(errors.mean(axis=0))
+            < 4.0 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))).all()
 
 
 @pytest.mark.parametrize('reference', ['profile', 'encoder'])
 def test_the_95_percent_intervals_cover_the_truth(reference):
-    """Measured over 600 runs: 93 to 95 %, as the number of blocks leaves Student's distribution some 34 degrees of freedom."""
+    """600 runs gave 93 to 95 %: the blocks leave Student's t about 34 degrees of freedom."""
     errors, deviations, _ = honest(reference)
     covered = (np.abs(errors) < 1.96 * deviations).mean(axis=0)
-    assert (covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / RUNS)).all() and (covered <= 0.995).all(), covered
+    assert ((covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / RUNS)).all()
+            and (covered <= 0.995).all()), covered
 
 
 @pytest.mark.parametrize('reference', ['profile', 'encoder'])
 def test_the_likelihood_comes_near_the_cramer_rao_bound(reference):
     """Measured: 1.0 to 1.1 times the bound, in standard deviations; 300 runs tell it to 4 %."""
     errors, _, _ = honest(reference)
-    assert (errors.std(axis=0, ddof=1) < 1.2 * bound(reference)).all(), errors.std(axis=0, ddof=1) / bound(reference)
+    assert (errors.std(axis=0, ddof=1) < 1.2 * bound(reference)).all(), (
+        errors.std(axis=0, ddof=1) / bound(reference))
 
 
 @pytest.mark.parametrize('reference', ['profile', 'encoder'])
@@ -148,7 +157,7 @@ def test_honest_runs_are_not_refused(reference):
 
 
 def lagging(constant, every=10):
-    """Return the rate of a robot that follows the calibration with a first-order lag, s, every so many ms."""
+    """Return the rate of a robot with a first-order lag, s, sampled every so many ms."""
     fine = np.arange(20001) / 1000.0
     decay, state, rates = math.exp(-0.001 / constant), 0.0, []
     for wanted in CALIBRATION.rate_at(fine):
@@ -157,8 +166,10 @@ def lagging(constant, every=10):
     return np.array(rates[::every])
 
 
-SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)], ramp=0.7).rate_at(TIME)
-ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1), 'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
+SOFT = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30), (1, 0)],
+             ramp=0.7).rate_at(TIME)
+ROBOTS = {'late by 0.3 s': (CALIBRATION.rate_at(TIME - 0.3), 0.1),
+          'lag of 0.1 s': (lagging(0.1), 0.2), 'lag of 0.3 s': (lagging(0.3), 1.0),
           'ramps of 0.7 instead of 0.5 s': (SOFT, 0.5)}
 
 
@@ -172,18 +183,20 @@ def test_a_robot_that_follows_late_or_softly_is_calibrated_all_the_same(rate, pe
 
 
 def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
-    """Its noise in the rate and the acceleration, sample by sample, must not be taken for what a delay and a lag do."""
+    """Sample noise in rate and acceleration must not be taken for a delay or a lag."""
     fine, true, sizes = np.arange(20001) / 1000.0, lagging(0.15, 1), []
     for seed in range(20):
         noise = simulate_noise(XV3500, len(fine), 0.001, np.random.default_rng([8, seed]))
         fit = self_calibrate(fine, (1 + XV3500_S) * true + XV3500_B + noise, CALIBRATION)
         sizes.append((fit.scale_factor_error - XV3500_S) / math.sqrt(fit.covariance[0, 0]))
-    assert abs(np.mean(sizes)) < 4.0 / math.sqrt(20) and np.sum(np.abs(sizes) < 1.96) >= 15, np.round(sizes, 1)
+    assert (abs(np.mean(sizes)) < 4.0 / math.sqrt(20)
+            and np.sum(np.abs(sizes) < 1.96) >= 15), np.round(sizes, 1)
 
 
 def run(seed=0, true=RATE, s=XV3500_S):
     """Return the output of the XV3500 on this true rate."""
-    return (1 + s) * true + XV3500_B + simulate_noise(XV3500, len(true), 0.01, np.random.default_rng(seed))
+    return (1 + s) * true + XV3500_B + simulate_noise(XV3500, len(true), 0.01,
+                                                      np.random.default_rng(seed))
 
 
 def bumped(seed, degrees):
@@ -205,7 +218,8 @@ def test_a_slip_or_bump_is_refused(degrees):
 
 
 def test_a_bump_below_the_limit_does_little_harm():
-    errors = [self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION).scale_factor_error - XV3500_S for seed in range(10)]
+    errors = [self_calibrate(TIME, run(seed, bumped(seed, 0.5)), CALIBRATION).scale_factor_error
+              - XV3500_S for seed in range(10)]
     assert np.abs(errors).max() < 0.005
 
 
@@ -218,16 +232,21 @@ REFUSED = {
     'a gap': (TIME[GAP], run()[GAP], CALIBRATION, 'no samples came for 1.0'),
     'dead': (TIME, np.zeros(len(TIME)), CALIBRATION, 'the gyro is dead'),
     'stuck': (TIME, np.full(len(TIME), 0.02), CALIBRATION, 'the gyro is dead'),
-    'a lost sample': (TIME, np.where(TIME == 5.0, np.nan, run()), CALIBRATION, 'not a finite number'),
-    'a lost reference': (TIME, run(), from_headings(TIME, np.where(TIME == 5.0, np.nan, RATE)), 'the reference was lost'),
+    'a lost sample': (TIME, np.where(TIME == 5.0, np.nan, run()), CALIBRATION,
+                      'not a finite number'),
+    'a lost reference': (TIME, run(), from_headings(TIME, np.where(TIME == 5.0, np.nan, RATE)),
+                         'the reference was lost'),
     'one speed': (TIME, run(), ONE_SPEED, 'the profile turns at one speed'),
-    'half the motion': (TIME[:1000], run()[:1000], CALIBRATION, 'the samples cover 10.0 s of the profile\'s 20.0 s'),
+    'half the motion': (TIME[:1000], run()[:1000], CALIBRATION,
+                        'the samples cover 10.0 s of the profile\'s 20.0 s'),
     'not moved': (TIME, run(true=0.0 * RATE), CALIBRATION, 'did the robot move'),
     'wrong sign': (TIME, -run(), CALIBRATION, 'the gyro turns the other way'),
     'another profile': (TIME, run(true=OTHER.rate_at(TIME)), CALIBRATION, ''),
     'degrees for radians': (TIME, run() / DEGREE, CALIBRATION, ''),
-    'half of the scale': (TIME, run(s=-0.4), CALIBRATION, 'a scale factor error of -40 % is beyond 30 %'),
-    'carried round': (TIME, run() + 0.3, CALIBRATION, 'is beyond 10 deg/s: was the robot turned by hand?'),
+    'half of the scale': (TIME, run(s=-0.4), CALIBRATION,
+                          'a scale factor error of -40 % is beyond 30 %'),
+    'carried round': (TIME, run() + 0.3, CALIBRATION,
+                      'is beyond 10 deg/s: was the robot turned by hand?'),
 }
 
 
@@ -246,12 +265,13 @@ def test_no_method_calibrates_by_a_dead_gyro(method):
 
 def test_the_wander_of_the_bias_is_in_its_standard_deviation():
     flicker = Noise(bias_instability=18 * DEGREE / 3600)
-    without, with_it = (self_calibrate(TIME, run(), CALIBRATION, noise=noise).covariance[1, 1] for noise in (None, flicker))
+    without, with_it = (self_calibrate(TIME, run(), CALIBRATION, noise=noise).covariance[1, 1]
+                        for noise in (None, flicker))
     assert with_it - without == pytest.approx((ALLAN_FLOOR * flicker.bias_instability) ** 2)
 
 
 def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():
-    """Ojeda et al., eq. 1. A standard deviation from 10 blocks is good to 24 %; its interval is Student's, 2.26 for 95 %."""
+    """Ojeda et al., eq. 1; 10 blocks give the deviation to 24 % and Student's 95 % factor 2.26."""
     covered, runs = 0, 400
     for seed in range(runs):
         rate = run(seed, np.zeros(1000))
@@ -263,9 +283,12 @@ def test_the_bias_is_the_mean_at_rest_and_its_deviation_is_true():
 
 NOT_RESTING = {
     'turned once': (np.where((TIME > 5) & (TIME < 6), 0.1, 0.0), 'the gyro was moved'),
-    'a slow turn that begins midway': (np.where(TIME > 10, 1.0 * DEGREE, 0.0), 'the gyro was moved'),
-    'a turn of 0.3 deg/s that begins midway': (np.where(TIME > 10, 0.3 * DEGREE, 0.0), 'the gyro was moved'),
-    'a turn of 0.3 deg/s that ends midway': (np.where(TIME < 10, 0.3 * DEGREE, 0.0), 'the gyro was moved'),
+    'a slow turn that begins midway': (np.where(TIME > 10, 1.0 * DEGREE, 0.0),
+                                       'the gyro was moved'),
+    'a turn of 0.3 deg/s that begins midway': (np.where(TIME > 10, 0.3 * DEGREE, 0.0),
+                                               'the gyro was moved'),
+    'a turn of 0.3 deg/s that ends midway': (np.where(TIME < 10, 0.3 * DEGREE, 0.0),
+                                             'the gyro was moved'),
     'shaken': (0.2 * np.sin(2 * np.pi * 7.0 * TIME), 'stop the robot and its motors'),
     'turning steadily': (np.full(len(TIME), 15 * DEGREE), 'beyond 10 deg/s'),
 }
@@ -279,14 +302,17 @@ def test_a_bias_is_not_taken_in_motion(true, reason):
 
 def test_an_honest_rest_is_not_refused():
     flicker = Noise(XV3500.angle_random_walk, 100 * DEGREE / 3600)
-    rests = (simulate_noise(flicker, len(TIME), 0.01, np.random.default_rng(seed)) for seed in range(200))
+    rests = (simulate_noise(flicker, len(TIME), 0.01, np.random.default_rng(seed))
+             for seed in range(200))
     assert all(abs(calibrate_bias(TIME, rest, noise=flicker)[0]) < 0.1 * DEGREE for rest in rests)
 
 
-@pytest.mark.parametrize('count, rate, reason', [(40, None, 'only 40 samples'), (500, 0.0, 'dead')])
+@pytest.mark.parametrize('count, rate, reason',
+                         [(40, None, 'only 40 samples'), (500, 0.0, 'dead')])
 def test_a_bias_is_not_taken_from_a_dead_gyro_or_a_few_samples(count, rate, reason):
     with pytest.raises(DataRefused, match=reason):
-        calibrate_bias(TIME[:count], run(0, np.zeros(count)) if rate is None else np.full(count, rate))
+        calibrate_bias(TIME[:count],
+                       run(0, np.zeros(count)) if rate is None else np.full(count, rate))
 
 
 def test_limits_are_for_the_caller_to_set():
@@ -295,12 +321,13 @@ def test_limits_are_for_the_caller_to_set():
 
 
 def heading_error(log, start, calibrated):
-    """Return the rms heading error, deg, over the 300 s from `start`, with the calibration of its first 20 s or without."""
+    """Return the rms heading error, deg, over 300 s from `start`, calibrated on 20 s or not."""
     used = (log.time >= start) & (log.time < start + 300.0)
-    time, output = log.time[used] - log.time[used][0], -log.output[used]  # the gyro was mounted upside down
+    time, output = log.time[used] - log.time[used][0], -log.output[used]  # mounted upside down
     heading, first, fit = log.reference_heading[used], time < 20.0, None
     if calibrated:
-        fit = self_calibrate(time[first], output[first], from_headings(time[first], heading[first]))
+        fit = self_calibrate(time[first], output[first],
+                             from_headings(time[first], heading[first]))
         output = (output - fit.bias) / (1.0 + fit.scale_factor_error)
     error = integrate(time, output) - (heading - heading[0])
     return math.sqrt(np.mean(error ** 2)) / DEGREE
@@ -309,7 +336,8 @@ def heading_error(log, start, calibrated):
 def test_20_s_by_an_encoder_take_two_thirds_off_the_error_of_a_measured_gyro(data):
     log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
     starts = (0, 100, 300, 500, 700, 1000, 1200)
-    table = {start: (heading_error(log, start, True), heading_error(log, start, False)) for start in starts}
+    table = {start: (heading_error(log, start, True), heading_error(log, start, False))
+             for start in starts}
     ratios = [calibrated / pure for calibrated, pure in table.values()]
     assert ratios[0] < 1 / 3 and max(ratios) < 0.6 and np.median(ratios) < 1 / 3, table
 
@@ -317,5 +345,7 @@ def test_20_s_by_an_encoder_take_two_thirds_off_the_error_of_a_measured_gyro(dat
 def test_a_log_of_25_minutes_is_fitted_within_seconds_and_by_1e_3(data):
     """The encoder's firmware is trusted to 0.2 %; long and short runs must agree."""
     log = read_log(data / 'mems_encoder_turntable' / 'yaw_slow.csv.gz')
-    fit = fit_likelihood(log.time - log.time[0], -log.output, from_headings(log.time, log.reference_heading))
-    assert fit.scale_factor_error == pytest.approx(0.006, abs=0.002) and math.sqrt(fit.covariance[0, 0]) < 2e-4
+    fit = fit_likelihood(log.time - log.time[0], -log.output,
+                         from_headings(log.time, log.reference_heading))
+    assert (fit.scale_factor_error == pytest.approx(0.006, abs=0.002)
+            and math.sqrt(fit.covariance[0, 0]) < 2e-4)

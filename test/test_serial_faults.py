@@ -33,9 +33,11 @@ def test_a_doubled_byte_comes_twice_in_its_place():
 
 
 def test_a_flipped_byte_has_one_bit_flipped():
-    differences = np.frombuffer(arrived(flipped_bytes=0.1), np.uint8) ^ np.frombuffer(DATA, np.uint8)
+    differences = (np.frombuffer(arrived(flipped_bytes=0.1), np.uint8)
+                   ^ np.frombuffer(DATA, np.uint8))
     assert np.isin(differences, [0, *(1 << np.arange(8))]).all()
-    assert np.count_nonzero(differences) == pytest.approx(0.1 * len(DATA), abs=5 * (0.09 * len(DATA)) ** 0.5)
+    assert np.count_nonzero(differences) == pytest.approx(0.1 * len(DATA),
+                                                          abs=5 * (0.09 * len(DATA)) ** 0.5)
 
 
 def test_all_can_be_lost():
@@ -58,15 +60,17 @@ def test_pieces_come_at_the_pace_of_the_line():
 
 def test_a_source_is_not_asked_before_what_it_gave_was_delivered():
     asked = []
-    pieces = delivered(SerialFaults(), (asked.append(number) or (float(number), b'x') for number in range(9)), 9600)
+    pieces = delivered(SerialFaults(), (asked.append(number) or (float(number), b'x')
+                                        for number in range(9)), 9600)
     next(pieces)
     assert asked == [0]
 
 
-@pytest.mark.parametrize('fault, words', [({'lost_bytes': 1.5}, 'lost_bytes is 1.5, but must be a probability'),
-                                          ({'flipped_bytes': float('nan')}, 'flipped_bytes is nan'),
-                                          ({'lost_bytes': 0.6, 'doubled_bytes': 0.6}, 'more than 1'),
-                                          ({'burst': -1.0}, 'burst is -1.0 s'), ({'piece': -1}, 'piece -1')])
+@pytest.mark.parametrize('fault, words',
+                         [({'lost_bytes': 1.5}, 'lost_bytes is 1.5, but must be a probability'),
+                          ({'flipped_bytes': float('nan')}, 'flipped_bytes is nan'),
+                          ({'lost_bytes': 0.6, 'doubled_bytes': 0.6}, 'more than 1'),
+                          ({'burst': -1.0}, 'burst is -1.0 s'), ({'piece': -1}, 'piece -1')])
 def test_a_line_that_is_not_possible_is_refused(fault, words):
     with pytest.raises(ValueError, match=words):
         SerialFaults(**fault)

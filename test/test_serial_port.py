@@ -22,7 +22,7 @@ def terminal():
 
 
 def holds(port, count):
-    """Tell whether so many bytes can be read: the system takes its time from one end of a terminal to the other."""
+    """Return whether so many bytes wait; a terminal passes them on with a delay."""
     return port._port.in_waiting == count
 
 

@@ -1,4 +1,4 @@
-"""Files of settings: what a person writes is read, what only an attacker or an accident writes is refused at once, in one sentence."""
+"""Settings files: a valid one is read, a hostile one is refused at once, in one sentence."""
 
 import math
 import os
@@ -9,7 +9,8 @@ import pytest
 from gyro_calibration.files import read_bytes
 from gyro_calibration.settings_file import read_settings, settings_text
 
-LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n' for i in range(40))
+LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n'
+                                        for i in range(40))
 
 REFUSED = {
     'ten to the nineteenth laughs': (LAUGHS, 'line 1: an anchor or alias is not read'),
@@ -46,14 +47,16 @@ def test_what_is_no_file_of_settings_is_refused_in_a_line_and_soon(tmp_path, con
     path, before = written(tmp_path, content), time.process_time()
     with pytest.raises(ValueError) as refused:
         read_settings(path)
-    assert message in str(refused.value) and '\n' not in str(refused.value) and len(str(refused.value)) < 300
+    assert (message in str(refused.value) and '\n' not in str(refused.value)
+            and len(str(refused.value)) < 300)
     assert time.process_time() - before < 5.0
 
 
 @pytest.mark.parametrize('text, value', [
-    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10), ('-.inf', -math.inf), ('true', True), ('', None), ('~', None),
-    ('yes', 'yes'), ('2026-11-21', '2026-11-21'), ('2024-13-45', '2024-13-45'), ('0x10', '0x10'), ('1_0', '1_0'), ('1:30', '1:30'),
-    ('<<', '<<'), ('"1"', '1'), ('9' * 401, '9' * 401), ('9' * 400, 10 ** 400 - 1)])
+    ('1e-4', 1e-4), ('-2E+5', -2e5), ('.5', 0.5), ('1.', 1.0), ('010', 10), ('-.inf', -math.inf),
+    ('true', True), ('', None), ('~', None), ('yes', 'yes'), ('2026-11-21', '2026-11-21'),
+    ('2024-13-45', '2024-13-45'), ('0x10', '0x10'), ('1_0', '1_0'), ('1:30', '1:30'), ('<<', '<<'),
+    ('"1"', '1'), ('9' * 401, '9' * 401), ('9' * 400, 10 ** 400 - 1)])
 def test_a_value_is_what_a_person_takes_it_for(tmp_path, text, value):
     found = read_settings(written(tmp_path, f'a: {text}'))['a']
     assert found == value and type(found) is type(value)
@@ -64,9 +67,10 @@ def test_a_byte_order_mark_hides_no_name(tmp_path):
 
 
 def test_texts_are_read_back_whatever_they_look_like(tmp_path):
-    content = {'texts': ['1e4', '010', '09', '1.5e3', 'null', '', 'true', 'yes', '<<', '=', '*a', '&a', '!!int', 'a\nb', '\x85',
-                         '\u2028', '😀', ' x ', '#', '1:30', '2026-11-21', "it's", '9' * 500],
-               '010': 1e-7, 'yes': [[], {}, None, True, -1, 1e22]}
+    content = {'texts': ['1e4', '010', '09', '1.5e3', 'null', '', 'true', 'yes', '<<', '=', '*a',
+                         '&a', '!!int', 'a\nb', '\x85', '\u2028', '😀', ' x ', '#', '1:30',
+                         '2026-11-21', "it's", '9' * 500], '010': 1e-7,
+               'yes': [[], {}, None, True, -1, 1e22]}
     content['again'] = content['texts']
     assert read_settings(written(tmp_path, settings_text(content))) == content
 

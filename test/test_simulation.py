@@ -11,7 +11,8 @@ from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import respond, simulate
 
-GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=Noise(7e-4), reference_temperature=33.0)
+GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=Noise(7e-4),
+                 reference_temperature=33.0)
 
 
 def test_the_output_is_equation_1_of_hong_and_park():
@@ -32,12 +33,14 @@ def test_the_temperature_is_the_one_given_or_the_models():
 
 
 def test_the_same_generator_gives_the_same_log_and_another_one_another():
-    logs = [simulate(GYRO, CALIBRATION, 100.0, np.random.default_rng(seed)).output for seed in (1, 1, 2)]
+    logs = [simulate(GYRO, CALIBRATION, 100.0, np.random.default_rng(seed)).output
+            for seed in (1, 1, 2)]
     assert np.array_equal(logs[0], logs[1]) and not np.array_equal(logs[0], logs[2])
 
 
 def test_the_noise_is_that_of_the_model():
-    quiet, noisy = simulate(GYRO, ROBOT, 100.0), simulate(GYRO, ROBOT, 100.0, np.random.default_rng(0))
+    quiet, noisy = (simulate(GYRO, ROBOT, 100.0),
+                    simulate(GYRO, ROBOT, 100.0, np.random.default_rng(0)))
     noise = noisy.output - quiet.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
 
@@ -49,20 +52,28 @@ def test_a_simulated_log_is_a_log(tmp_path):
 
 
 def test_a_log_is_replayed_with_its_motion_and_surroundings():
-    """What a simulated gyro said in a temperature that changed is said again by the model in the channels of its log."""
-    model = GyroModel((*GYRO.terms, Term(CATALOGUE['thermal_lag'], (5.0, 1e-3)), Term(CATALOGUE['warm_up'], (10.0, 0.01)),
-                       Term(CATALOGUE['heading_sensitivity'], (1e-3, 0.0)), Term(CATALOGUE['time_offset'], (0.02,))))
-    log = simulate(model, CALIBRATION, 50.0, temperature=25.0 + 10.0 * np.sin(np.arange(1001) / 200.0))
+    """The model reproduces the simulated output from the channels of the log."""
+    model = GyroModel((*GYRO.terms, Term(CATALOGUE['thermal_lag'], (5.0, 1e-3)),
+                       Term(CATALOGUE['warm_up'], (10.0, 0.01)),
+                       Term(CATALOGUE['heading_sensitivity'], (1e-3, 0.0)),
+                       Term(CATALOGUE['time_offset'], (0.02,))))
+    log = simulate(model, CALIBRATION, 50.0,
+                   temperature=25.0 + 10.0 * np.sin(np.arange(1001) / 200.0))
     channels = channels_of(log)
-    assert np.array_equal(respond(model, log.time, channels.moving(log.reference_rate, log.reference_rate)), log.output)
+    assert np.array_equal(respond(
+        model, log.time, channels.moving(log.reference_rate, log.reference_rate)), log.output)
     error = log.output - simulate(GYRO, CALIBRATION, 50.0).output
     late = 0.9 * (CALIBRATION.rate_at(log.time - 0.02) - log.reference_rate)
     lagging = 1e-3 * (channels.lagged('temperature', 5.0) - log.temperature)
-    assert error - late - lagging == pytest.approx(0.01 * np.exp(-log.time / 10.0) + 1e-3 * np.sin(log.reference_heading), abs=1e-12)
+    assert error - late - lagging == pytest.approx(
+        0.01 * np.exp(-log.time / 10.0) + 1e-3 * np.sin(log.reference_heading), abs=1e-12)
 
 
 def test_the_verb_simulates_what_a_gyro_makes_of_time_and_heading(tmp_path, run):
-    (tmp_path / 'model.yaml').write_text('effects: {warm_up: {warm_up: 0.01, time_constant: 5}, quantization: {quantization: 1e-3}}')
-    code, *_ = run('simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest', '--out', tmp_path / 'log.csv')
+    (tmp_path / 'model.yaml').write_text('effects: {warm_up: {warm_up: 0.01, time_constant: 5}, '
+                                         'quantization: {quantization: 1e-3}}')
+    code, *_ = run('simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest',
+                   '--out', tmp_path / 'log.csv')
     log = read_log(tmp_path / 'log.csv')
-    assert code == 0 and log.output == pytest.approx(1e-3 * np.round(10.0 * np.exp(-log.time / 5.0)), abs=1e-12)
+    assert code == 0 and log.output == pytest.approx(
+        1e-3 * np.round(10.0 * np.exp(-log.time / 5.0)), abs=1e-12)

@@ -1,4 +1,4 @@
-"""The soak of `benchmarks/soak.py`, short: every sample that the emulated gyro sends arrives corrected, once."""
+"""The soak of `benchmarks/soak.py`, short: every emulated sample arrives corrected, once."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Stamps that a host gives on arrival: what only waited there is not lost, and what is lost is counted beside it."""
+"""Stamps that a host gives on arrival: delayed samples are not lost, and lost ones are counted."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ INTERVAL = 0.01
 
 
 def stalled(seconds, count=6000, begin=20.0):
-    """Return stamps of a host that does nothing for some seconds, and then takes what waited, 0.2 ms a sample."""
+    """Return stamps of a host that stalls for some seconds, then takes 0.2 ms a sample."""
     due = np.arange(count) * INTERVAL
     late = begin + seconds + 2e-4 * np.arange(count)
     first = int(np.searchsorted(due, begin))
@@ -21,7 +21,8 @@ def stalled(seconds, count=6000, begin=20.0):
 @pytest.mark.parametrize('seconds', [0.05, 0.3, 1.0])
 @pytest.mark.parametrize('jitter', [0.0, 1e-3])
 def test_what_waited_at_a_host_is_not_lost(seconds, jitter):
-    time = stalled(seconds) + jitter * np.random.default_rng(1).random(6000) * (np.arange(6000) < 2000)
+    time = (stalled(seconds)
+            + jitter * np.random.default_rng(1).random(6000) * (np.arange(6000) < 2000))
     stamps = number_stamps(time)
     assert not stamps.bursts and not stamps.lost.any()
     noise = 1e-3 * np.random.default_rng(2).standard_normal(6000)
