@@ -1,4 +1,4 @@
-"""The heading that rests teach: filter against least squares, rest and motion, slow turns, continuity, and how true its variance is."""
+"""Heading with stationary updates: least squares, motion, slow turns, continuity, and variance."""
 
 import math
 
@@ -27,33 +27,37 @@ def sensitivity_of(rate):
 
 
 def gyro(motion, generator, noise=XV3500, bias=None):
-    """Return time, true rate, heading, and rates of a gyro that was calibrated on the 20 s before, as a run of the paper is."""
+    """Return time, true rate, heading, and rates of a gyro calibrated on the 20 s before."""
     known, time = round(20.0 / INTERVAL), np.arange(0.0, motion.duration, INTERVAL)
     drawn = simulate_noise(noise, known + len(time), INTERVAL, generator)
     left = drawn[:known].mean() if bias is None else bias
     true = motion.rate_at(time)
-    return time, true, motion.heading_at(time), (1.0 + SCALE * generator.standard_normal()) * true + drawn[known:] - left
+    return (time, true, motion.heading_at(time),
+            (1.0 + SCALE * generator.standard_normal()) * true + drawn[known:] - left)
 
 
 def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False):
-    return track(time, rate, sensitivity_of(rate), noise, KNOWN, settings or Settings(), wheels, hindsight)
+    return track(time, rate, sensitivity_of(rate), noise, KNOWN, settings or Settings(),
+                 wheels, hindsight)
 
 
 # the filter
 
 def random_way(generator, noise, count=14):
-    """Return turns of random rates and one that nobody saw, which of them are at rest, and the state before."""
+    """Return random turns and an unseen one, which of them are rests, and the state before."""
     durations = generator.uniform(0.3, 3.0, count)
-    ways = [Turn(duration, 0.02 * generator.standard_normal() * duration, np.array([-0.3 * generator.standard_normal(), -duration]))
+    ways = [Turn(duration, 0.02 * generator.standard_normal() * duration,
+                 np.array([-0.3 * generator.standard_normal(), -duration]))
             for duration in durations]
     resting = list(generator.random(count) < 0.5)
     ways.append(Turn(5.0, 0.0, np.zeros(2), lost=1e-4, unseen=True))
     half = count // 2
-    return ways[half:] + ways[:half], resting[half:] + [False] + resting[:half], begin(noise, np.diag([1e-4, 1e-5]), age=0.0)
+    return (ways[half:] + ways[:half], resting[half:] + [False] + resting[:half],
+            begin(noise, np.diag([1e-4, 1e-5]), age=0.0))
 
 
 def by_least_squares(start, ways, resting):
-    """Return mean and covariance of all headings, from the joint distribution of everything, without any recursion."""
+    """Return mean and covariance of all headings from the joint distribution, not recursively."""
     size, count = len(start.mean), len(ways)
     transitions, grown, pushed, measured = [], [], [], []
     for way, rest in zip(ways, resting):
@@ -83,11 +87,14 @@ def by_least_squares(start, ways, resting):
     for row, (k, (seen, _, _)) in zip(rows, known):
         row[k * size:(k + 1) * size] = seen
     left = np.array([turned for _, (_, turned, _) in known]) - rows @ mean.ravel()
-    gain = whole @ rows.T @ np.linalg.inv(rows @ whole @ rows.T + np.diag([variance for _, (_, _, variance) in known]))
-    return (mean.ravel() + gain @ left)[HEADING::size], np.diagonal(whole - gain @ rows @ whole)[HEADING::size]
+    gain = whole @ rows.T @ np.linalg.inv(
+        rows @ whole @ rows.T + np.diag([variance for _, (_, _, variance) in known]))
+    return ((mean.ravel() + gain @ left)[HEADING::size],
+            np.diagonal(whole - gain @ rows @ whole)[HEADING::size])
 
 
-@pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5), Noise(1e-3)], ids=['flicker', 'walk', 'white'])
+@pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5), Noise(1e-3)],
+                         ids=['flicker', 'walk', 'white'])
 def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(noise):
     ways, resting, start = random_way(np.random.default_rng(1), noise)
     states = [start]
@@ -98,11 +105,13 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
     assert states[-1].mean[HEADING] == pytest.approx(mean[-1], abs=1e-9)
     assert states[-1].covariance[HEADING, HEADING] == pytest.approx(variance[-1], rel=1e-6)
     assert [state.mean[HEADING] for state in later] == pytest.approx(mean, abs=1e-8)
-    assert [state.covariance[HEADING, HEADING] for state in later] == pytest.approx(variance, rel=1e-4, abs=1e-12)
+    assert [state.covariance[HEADING, HEADING] for state in later] == pytest.approx(
+        variance, rel=1e-4, abs=1e-12)
 
 
 def test_one_long_turn_is_as_many_short_ones():
-    start, part = begin(XV3500, np.diag([1e-6, 1e-8]), age=100.0), Turn(0.7, 0.1, np.array([-0.1, -0.7]))
+    start, part = (begin(XV3500, np.diag([1e-6, 1e-8]), age=100.0),
+                   Turn(0.7, 0.1, np.array([-0.1, -0.7])))
     by_parts, whole = start, Turn(0.0, 0.0, np.zeros(2))
     for _ in range(30):
         by_parts, whole = by_parts.moved(part), whole + part
@@ -115,7 +124,8 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
     state = begin(XV3500, np.diag([0.0, 0.0]), age=0.0)
     for duration in (1.0, 10.0, 100.0, 1000.0):
         after = state.moved(Turn(duration, 0.0, np.array([0.0, -duration])))
-        assert after.covariance[HEADING, HEADING] == pytest.approx(XV3500.heading_variance(duration), rel=1e-6)
+        assert after.covariance[HEADING, HEADING] == pytest.approx(
+            XV3500.heading_variance(duration), rel=1e-6)
 
 
 # rest and motion
@@ -159,7 +169,8 @@ def test_a_rest_teaches_the_bias_as_well_as_it_says():
     for seed in range(40):
         generator = np.random.default_rng(seed)
         bias = BIAS * generator.standard_normal()
-        time, _, _, rate = gyro(from_rates(np.array([0.0, 40.0]), np.zeros(2)), generator, Noise(XV3500.angle_random_walk), bias=-bias)
+        time, _, _, rate = gyro(from_rates(np.array([0.0, 40.0]), np.zeros(2)), generator,
+                                Noise(XV3500.angle_random_walk), bias=-bias)
         tracker = HeadingTracker(Noise(XV3500.angle_random_walk), KNOWN, Settings())
         for at, value in zip(time, rate):
             tracker.add(at, value, np.array([-value, -1.0]))
@@ -176,21 +187,24 @@ def test_a_rest_that_was_too_short_to_learn_from_still_ends_in_time():
     assert np.abs(found.heading - heading).max() < 1.0 * DEGREE
 
 
-@pytest.mark.parametrize('slow, wheels', [(0.1, None), (0.05, True), (0.02, True)], ids=['no wheels', 'wheels', 'wheels and slower'])
+@pytest.mark.parametrize('slow, wheels', [(0.1, None), (0.05, True), (0.02, True)],
+                         ids=['no wheels', 'wheels', 'wheels and slower'])
 def test_a_slow_turn_that_lasts_is_followed(slow, wheels):
-    """For ten minutes; without wheels it is seen late, and what was taken for bias meanwhile is given back."""
-    motion = from_rates(np.array([0.0, 30.0, 30.1, 630.0]), np.array([0.0, 0.0, slow, slow]) * DEGREE)
+    """10 min; without wheels it is detected late, and the bias estimate is corrected then."""
+    motion = from_rates(np.array([0.0, 30.0, 30.1, 630.0]),
+                        np.array([0.0, 0.0, slow, slow]) * DEGREE)
     errors = []
     for seed in range(2):
         time, true, heading, rate = gyro(motion, np.random.default_rng(seed))
         found = follow(time, rate, wheels=None if wheels is None else list(true > 0.0))
         errors.append((found.heading[-1] - heading[-1]) / math.sqrt(found.variance[-1]))
-        assert np.abs(np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, 'the heading jumped'
+        assert np.abs(np.diff(found.heading)).max() < 10.0 * DEGREE * INTERVAL, (
+            'the heading jumped')
     assert np.abs(errors).max() < 4.0, errors
 
 
 def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading_drift_for_ever():
-    """By 0.04 deg/s at rest, which is noticed, taken for a turn, and after two minutes for what it is; the next turn puts it right."""
+    """A jump of 0.04 deg/s passes for a turn, after 2 min for bias; the next turn corrects it."""
     motion = turns([(600, 0), (4, 45), (10, 0)])
     time, _, heading, rate = gyro(motion, np.random.default_rng(4))
     found = follow(time, rate + 0.04 * DEGREE * (time > 100.0))
@@ -203,32 +217,38 @@ def test_a_bias_that_jumps_by_more_than_the_model_says_does_not_make_the_heading
 
 def test_wheels_that_move_are_motion_and_wheels_that_stand_are_no_turn():
     time = np.arange(0.0, 200.0, INTERVAL)
-    drift = simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(5)) + 0.06 * DEGREE * (time > 60.0)
+    drift = (simulate_noise(XV3500, len(time), INTERVAL, np.random.default_rng(5))
+             + 0.06 * DEGREE * (time > 60.0))
     assert not follow(time, drift, wheels=[True] * len(time)).resting.any()
     standing = follow(time, drift, wheels=[False] * len(time))
-    assert standing.resting[20:].all() and standing.heading[-1] == pytest.approx(standing.heading[40], abs=1e-12)
+    assert (standing.resting[20:].all()
+            and standing.heading[-1] == pytest.approx(standing.heading[40], abs=1e-12))
 
 
 @pytest.mark.parametrize('after', [None, False], ids=['silent', 'standing'])
 def test_a_slow_turn_until_the_wheels_stop_is_no_bias(after):
-    tracker, turning = HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]), Settings()), round(20.0 / INTERVAL)
+    tracker, turning = (HeadingTracker(XV3500, np.diag([0.03 ** 2, (0.5 * DEGREE) ** 2]),
+                                       Settings()), round(20.0 / INTERVAL))
     for index in range(2 * turning):
         rate = 0.2 * DEGREE if index < turning else 0.0
-        tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]), True if index < turning else after)
+        tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]),
+                    True if index < turning else after)
     assert tracker.resting and abs(tracker.bias[0]) < 1e-4 * DEGREE
     assert tracker.finish().mean[HEADING] == pytest.approx(4.0 * DEGREE, abs=0.01 * DEGREE)
 
 
 def test_the_slowest_turn_that_is_noticed_is_noticed():
     tracker = HeadingTracker(XV3500, KNOWN, Settings())
-    time, _, _, rate = gyro(from_rates(np.array([0.0, 60.0]), np.zeros(2)), np.random.default_rng(6))
+    time, _, _, rate = gyro(from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+                            np.random.default_rng(6))
     for at, value in zip(time, rate):
         tracker.add(at, value, np.array([-value, -1.0]))
     slowest = tracker.slowest_noticed
     assert 0.02 * DEGREE < slowest < 0.1 * DEGREE
     generator, noticed = np.random.default_rng(7), 0
     for _ in range(12):
-        motion = from_rates(np.array([0.0, 60.0, 60.1, 200.0]), np.array([0.0, 0.0, slowest, slowest]))
+        motion = from_rates(np.array([0.0, 60.0, 60.1, 200.0]),
+                            np.array([0.0, 0.0, slowest, slowest]))
         time, _, _, rate = gyro(motion, generator)
         noticed += not follow(time, rate).resting[time > 70.0].all()
     assert noticed >= 9, noticed
@@ -238,7 +258,8 @@ def test_false_alarms_are_as_rare_as_stated():
     """At a stated rate of 20 in an hour, over an hour of three gyros."""
     alarms = 0
     for seed in range(3):
-        time, _, _, rate = gyro(from_rates(np.array([0.0, 1200.0]), np.zeros(2)), np.random.default_rng(seed))
+        time, _, _, rate = gyro(from_rates(np.array([0.0, 1200.0]), np.zeros(2)),
+                                np.random.default_rng(seed))
         resting = follow(time, rate, Settings(false_alarms=20.0)).resting
         alarms += int(np.sum(np.diff(resting.astype(int)) == -1))
     assert 2 <= alarms <= 40, alarms
@@ -246,7 +267,8 @@ def test_false_alarms_are_as_rare_as_stated():
 
 def test_noise_that_is_twice_what_the_model_claims_is_learned():
     motion = turns([(40, 0), (4, 45), (30, 0), (4, -45), (30, 0)])
-    time, true, _, rate = gyro(motion, np.random.default_rng(8), Noise(2.0 * XV3500.angle_random_walk))
+    time, true, _, rate = gyro(motion, np.random.default_rng(8),
+                               Noise(2.0 * XV3500.angle_random_walk))
     found = follow(time, rate)
     assert found.resting[(true == 0.0) & (time > 20.0)].mean() > 0.9
 
@@ -266,8 +288,10 @@ def test_a_gap_and_a_jump_of_the_clock_leave_the_heading_where_it_was():
 
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
-def test_over_a_long_gap_the_heading_stands_whatever_rests_have_taught_or_teach_later(noise, later):
-    tracker, generator, still = HeadingTracker(noise, KNOWN, Settings(), 3600.0), np.random.default_rng(11), np.array([0.0, -1.0])
+def test_over_a_long_gap_the_heading_stands_whatever_rests_have_taught_or_teach_later(
+        noise, later):
+    tracker, generator, still = (HeadingTracker(noise, KNOWN, Settings(), 3600.0),
+                                 np.random.default_rng(11), np.array([0.0, -1.0]))
     headings, variances = [], []
     for index, bias in enumerate([0.05 * DEGREE] * 2400 + [later * DEGREE] * 2400):
         time = INTERVAL * index + 600.0 * (index >= 2400)
@@ -278,14 +302,17 @@ def test_over_a_long_gap_the_heading_stands_whatever_rests_have_taught_or_teach_
         if index in (2399, 2400, 4799):
             headings.append(tracker.finish().mean[HEADING])
             variances.append(tracker.variance - tracker._pending ** 2)
-    assert headings == pytest.approx([headings[0]] * 3, abs=0.5 * DEGREE), 'off by 30 degrees if what rests taught is taken for a turn'
+    assert headings == pytest.approx([headings[0]] * 3, abs=0.5 * DEGREE), (
+        'off by 30 degrees if what rests taught is taken for a turn')
     assert math.sqrt(variances[1] - variances[0]) == pytest.approx(0.05 * 600.0 * DEGREE, rel=0.01)
 
 
 def test_the_first_rate_after_a_gap_or_a_jump_back_is_as_rests_have_taught():
-    tracker, generator = HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings()), np.random.default_rng(12)
+    tracker, generator = (HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings()),
+                          np.random.default_rng(12))
     for index, true in enumerate([0.0] * 1200 + [0.2] * 200):
-        rate = true + 0.3 * DEGREE + XV3500.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL)
+        rate = (true + 0.3 * DEGREE
+                + XV3500.angle_random_walk * generator.standard_normal() / math.sqrt(INTERVAL))
         tracker.add(INTERVAL * index, rate, np.array([-rate, -1.0]), None, np.array([0.0, -1.0]))
     for time in (200.0, 20.0):
         rate = 0.2 + 0.3 * DEGREE
@@ -296,8 +323,10 @@ def test_the_first_rate_after_a_gap_or_a_jump_back_is_as_rests_have_taught():
 @pytest.mark.parametrize('interval', [0.45, 0.5], ids=['lost samples', '2 Hz'])
 def test_a_rest_is_found_where_one_interval_is_as_long_as_the_window(interval):
     generator = np.random.default_rng(9)
-    time = 0.5 * np.arange(200.0) if interval == 0.5 else np.cumsum(np.where(np.arange(3000) % 100, INTERVAL, interval))
-    rate = XV3500.angle_random_walk * generator.standard_normal(len(time)) / math.sqrt(np.median(np.diff(time)))
+    time = (0.5 * np.arange(200.0) if interval == 0.5
+            else np.cumsum(np.where(np.arange(3000) % 100, INTERVAL, interval)))
+    rate = (XV3500.angle_random_walk * generator.standard_normal(len(time))
+            / math.sqrt(np.median(np.diff(time))))
     resting = follow(time, rate).resting
     assert resting.mean() > 0.9 and resting[-1]
 
@@ -345,7 +374,8 @@ def test_another_calibration_at_rest_keeps_the_correction_that_waits_for_motion(
     tracker = HeadingTracker(XV3500, unknown, Settings())
     for index, rate in enumerate([5.0 * DEGREE] * 400 + [0.0] * 400 + [5.0 * DEGREE] * 400):
         if index == 799:
-            assert tracker.resting and tracker.heading == pytest.approx(106.0 * DEGREE, abs=0.5 * DEGREE)
+            assert (tracker.resting
+                    and tracker.heading == pytest.approx(106.0 * DEGREE, abs=0.5 * DEGREE))
             before, variance = tracker.heading, tracker.variance
             tracker.use(XV3500, unknown)
             assert tracker.heading == before and tracker.variance == pytest.approx(variance)
@@ -361,23 +391,28 @@ def random_drive(generator, duration):
     stretches, time = [(5.0, 0.0)], 5.0
     while time < duration:
         kind, way = generator.random(), generator.choice([-1.0, 1.0])
-        length, rate = ((generator.uniform(3, 20), 0.0) if kind < 0.4 else (generator.uniform(0.8, 2), 0.0) if kind < 0.5 else
-                        (generator.uniform(10, 40), way * generator.uniform(0.5, 3)) if kind < 0.6 else
-                        (generator.uniform(2, 8), way * generator.uniform(5, 60)))
+        length, rate = (
+            (generator.uniform(3, 20), 0.0) if kind < 0.4
+            else (generator.uniform(0.8, 2), 0.0) if kind < 0.5
+            else (generator.uniform(10, 40), way * generator.uniform(0.5, 3)) if kind < 0.6
+            else (generator.uniform(2, 8), way * generator.uniform(5, 60)))
         stretches.append((length, rate))
         time += length
     return turns(stretches)
 
 
 def test_errors_are_as_large_as_stated_and_hindsight_and_rests_help():
-    """The figures of many drives are those of the benchmark of headings; here a few show that nothing is far off."""
+    """Statistics of many drives are in the benchmark; here a few show no gross error."""
     squares, sizes = [], []
     for seed in range(16):
         generator = np.random.default_rng(seed)
         time, _, heading, rate = gyro(random_drive(generator, 300.0), generator)
         live, later = follow(time, rate), follow(time, rate, hindsight=True)
-        squares.append([np.mean((each.heading - heading)[1000::500] ** 2 / each.variance[1000::500]) for each in (live, later)])
-        sizes.append([np.abs(each - heading).mean() for each in (integrate(time, rate), live.heading, later.heading)])
-    assert np.mean(squares, axis=0) == pytest.approx(np.ones(2), abs=4.0 * math.sqrt(2.0 / 16) / 2.0)
+        squares.append([np.mean((each.heading - heading)[1000::500] ** 2
+                                / each.variance[1000::500]) for each in (live, later)])
+        sizes.append([np.abs(each - heading).mean()
+                      for each in (integrate(time, rate), live.heading, later.heading)])
+    assert np.mean(squares, axis=0) == pytest.approx(np.ones(2),
+                                                     abs=4.0 * math.sqrt(2.0 / 16) / 2.0)
     pure, live, later = np.mean(sizes, axis=0)
     assert later < live < 0.9 * pure, (pure, live, later)

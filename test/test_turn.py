@@ -1,4 +1,4 @@
-"""The error of a full turn: by hand, against turns that are simulated and integrated, and as the program tells it."""
+"""The error of a full turn: by hand, against simulated turns, and as the program reports it."""
 
 import hashlib
 import json
@@ -13,7 +13,12 @@ import pytest
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, take
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, SINE_RESPONSE, rate_temperature_polynomial
+from gyro_calibration.effects import (
+    BIAS,
+    SCALE_FACTOR_ERROR,
+    SINE_RESPONSE,
+    rate_temperature_polynomial,
+)
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
 from gyro_calibration.model import GyroModel, Term
@@ -35,7 +40,7 @@ def table(rates, errors, temperature=None, sweep=None):
 
 
 def static(found):
-    """Return the errors with the static bias only, deg per turn; the model is one that does nothing."""
+    """Return the errors with the static bias only, deg per turn; the model is the identity."""
     return turn_errors(found, found.output).static / DEGREE
 
 
@@ -61,11 +66,13 @@ def test_a_bias_changes_nothing_since_a_rest_shows_it():
 def test_slow_turns_are_left_out_and_a_rest_is_no_turn():
     found = table([0.0, 4.9, -4.9, 5.1, -60.0], [0.0] * 5)
     assert turn_errors(found, found.output).rate / DEGREE == pytest.approx([5.1, -60.0])
-    assert turn_errors(found, found.output, 1.0 * DEGREE).place == ('row 2', 'row 3', 'row 4', 'row 5')
+    assert turn_errors(found, found.output, 1.0 * DEGREE).place == (
+        'row 2', 'row 3', 'row 4', 'row 5')
 
 
 def test_every_sweep_has_its_own_rest_and_one_without_takes_that_of_the_nearest_temperature():
-    found = table([0, 10, 0, 10, 10], [0.1, 0.2, 0.5, 0.6, 0.6], [20, 21, 40, 41, 38], [0, 0, 1, 1, 2])
+    found = table([0, 10, 0, 10, 10], [0.1, 0.2, 0.5, 0.6, 0.6], [20, 21, 40, 41, 38],
+                  [0, 0, 1, 1, 2])
     errors = turn_errors(found, found.output)
     assert errors.static / DEGREE == pytest.approx([3.6, 3.6, 3.6])
     assert '1 of 3 sweeps have none' in errors.remarks[0]
@@ -75,7 +82,8 @@ def test_without_a_rest_the_error_between_the_slowest_turns_both_ways_stands_for
     rates = np.array([-30.0, -10.0, 6.0, 30.0])
     errors = turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
     assert errors.static == pytest.approx(TURN * 0.01 * np.sign(rates))
-    assert errors.remarks[0].startswith('no rest; the static bias is the error between the slowest turns')
+    assert errors.remarks[0].startswith(
+        'no rest; the static bias is the error between the slowest turns')
 
 
 def test_a_table_with_neither_rest_nor_turns_both_ways_is_refused():
@@ -98,9 +106,11 @@ def test_a_table_of_rests_is_refused():
 # a real turn
 
 NOISE = Noise(angle_random_walk=5e-5)
-GYRO = GyroModel((Term(BIAS, (0.004,)), Term(SCALE_FACTOR_ERROR, (0.01,)), Term(SINE_RESPONSE, (0.3, 1.0))), noise=NOISE)
+GYRO = GyroModel((Term(BIAS, (0.004,)), Term(SCALE_FACTOR_ERROR, (0.01,)),
+                  Term(SINE_RESPONSE, (0.3, 1.0))), noise=NOISE)
 #: Its calibration is not quite right.
-MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)), Term(SINE_RESPONSE, (0.25, 1.0))))
+MODEL = GyroModel((Term(BIAS, (0.003,)), Term(SCALE_FACTOR_ERROR, (0.014,)),
+                   Term(SINE_RESPONSE, (0.25, 1.0))))
 
 
 @pytest.mark.parametrize('rate', [7.2, -12.0, 36.0, -90.0])
@@ -109,13 +119,16 @@ def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
     found = replace(found, output=GYRO.output(found.rate, np.full(2, 25.0)))
     errors = turn_errors(found, compensate(MODEL, found.output).rate)
     rest, lasts = 10.0, 360.0 / abs(rate)
-    motion = from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]), np.array([0, 0, rate, rate, 0]) * DEGREE)
+    motion = from_rates(np.array([0.0, rest, rest + 0.1, rest + lasts, rest + lasts + 0.1]),
+                        np.array([0, 0, rate, rate, 0]) * DEGREE)
     log = simulate(GYRO, motion, 10.0, np.random.default_rng(1))
     assert log.reference_heading[-1] == pytest.approx(math.copysign(TURN, rate))
     deviation = NOISE.angle_random_walk * math.sqrt(lasts + lasts ** 2 / rest)
-    for expected, output in ((errors.static[0], log.output), (errors.modelled[0], compensate(MODEL, log.output).rate)):
-        turned = integrate(log.time[100:], output[100:] - output[:100].mean())[-1] - math.copysign(TURN, rate)
-        # The ramps of 0.1 s, at other rates than the turn, may add the error of a tenth of a second.
+    for expected, output in ((errors.static[0], log.output),
+                             (errors.modelled[0], compensate(MODEL, log.output).rate)):
+        turned = (integrate(log.time[100:], output[100:] - output[:100].mean())[-1]
+                  - math.copysign(TURN, rate))
+        # The ramps of 0.1 s, at other rates than the turn, may add the error of 0.1 s.
         assert turned == pytest.approx(expected, abs=4.0 * deviation + 0.1 * abs(expected) / lasts)
         assert abs(expected) > 5.0 * deviation, 'the claim would be lost in the noise'
 
@@ -123,11 +136,12 @@ def test_a_simulated_turn_integrated_at_10_hz_is_off_by_as_much(rate):
 # predictions
 
 def sweeps(seed=0, deviation=1e-5, odd=None):
-    """Return four sweeps of a gyro with a bias and a scale factor error, in deg/s; an odd one has a scale factor of its own."""
+    """Return four sweeps with a bias and a scale factor error, deg/s; `odd` has one of its own."""
     rates = np.tile(np.arange(-60.0, 61.0, 10.0), 4)
     number = np.repeat(np.arange(4), 13)
     errors = 0.2 + 0.01 * rates + np.where(number == odd, 0.02 * rates, 0.0)
-    return table(rates, errors + np.random.default_rng(seed).normal(0.0, deviation, len(rates)), sweep=number)
+    return table(rates, errors + np.random.default_rng(seed).normal(0.0, deviation, len(rates)),
+                 sweep=number)
 
 
 def test_a_sweep_has_no_part_in_the_model_that_corrects_it():
@@ -148,11 +162,13 @@ def test_errors_that_are_nothing_but_scatter_are_predicted_as_large_as_they_are(
 
 def test_a_single_sweep_is_predicted_dwell_by_dwell():
     found = take(sweeps(), sweeps().sweep == 0)
-    assert predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR))) == pytest.approx(found.rate, abs=1e-6)
+    assert (predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
+            == pytest.approx(found.rate, abs=1e-6))
 
 
 def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_said():
-    found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1001, 0.1, 0.0999], sweep=[0, 0, 0, 1, 1, 1])
+    found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1001, 0.1, 0.0999],
+                  sweep=[0, 0, 0, 1, 1, 1])
     rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
     assert np.isnan(rate[:3]).all()
     with pytest.raises(DataRefused, match='record faster turns, or several sweeps'):
@@ -160,10 +176,12 @@ def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_said():
 
 
 def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_rest():
-    found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21], [0, 0, 1, 1, 2])
+    found = table([0, 20, 0, 20, 20], [0.1, 0.3, 0.2, 0.4, 0.5], [20, 20, 30, 30, 21],
+                  [0, 0, 1, 1, 2])
     rate = np.where(found.sweep == 0, np.nan, found.rate + 0.1 * DEGREE)
     errors = turn_errors(found, rate)
-    assert errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0]) and errors.modelled == pytest.approx(0.0)
+    assert (errors.static / DEGREE == pytest.approx([0.2 * 18.0, 0.3 * 18.0])
+            and errors.modelled == pytest.approx(0.0))
     assert '1 turns are left out' in errors.remarks[1]
 
 
@@ -180,24 +198,26 @@ def test_the_measured_gyro_errs_by_less_than_2_percent_and_one_order_of_magnitud
 
 @pytest.fixture
 def run(run):
-    """Return a function that runs the verb and gives its exit code, standard output and standard error."""
+    """Return a function that runs the verb and returns exit code, output and error."""
     return partial(run, 'turn')
 
 
 @pytest.fixture
 def log(tmp_path):
-    """Return a file with four sweeps at 20 to 50 degC, with a bias of 0.2 deg/s and a scale factor error of 0.01."""
+    """Return a file of four sweeps at 20 to 50 degC, with b = 0.2 deg/s and s = 0.01."""
     found = sweeps(deviation=0.0)
-    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate, temperature=20.0 + 10.0 * found.sweep))
+    write_log(tmp_path / 'table.csv', Log(output=found.output, reference_rate=found.rate,
+                                          temperature=20.0 + 10.0 * found.sweep))
     return tmp_path / 'table.csv'
 
 
 @pytest.fixture
 def model(tmp_path):
-    """Return a model file that leaves 0.002 of the scale factor error, and holds for 35 deg/s and 30 degC."""
+    """Return a model file that leaves s = 0.002, valid to 35 deg/s and 30 degC."""
     path = tmp_path / 'model.yaml'
-    path.write_text('effects: {bias: {bias: 0.0}, scale_factor_error: {scale_factor_error: 0.008}}\n'
-                    'valid: {rate: [-0.611, 0.611], temperature: [0, 30]}')
+    path.write_text(
+        'effects: {bias: {bias: 0.0}, scale_factor_error: {scale_factor_error: 0.008}}\n'
+        'valid: {rate: [-0.611, 0.611], temperature: [0, 30]}')
     return path
 
 
@@ -209,7 +229,8 @@ def test_the_data_hold_every_turn_in_si(run, log, model):
     assert answer['static_rad_per_turn'] == pytest.approx(TURN * 0.01 * ways)
     assert answer['modelled_rad_per_turn'] == pytest.approx(TURN * (1.01 / 1.008 - 1.0) * ways)
     assert answer['ratio_rms'] == pytest.approx(0.01 / (1.01 / 1.008 - 1.0))
-    assert sum(each['turns'] for each in answer['by_rate']) == sum(each['turns'] for each in answer['by_temperature']) == 48
+    assert (sum(each['turns'] for each in answer['by_rate'])
+            == sum(each['turns'] for each in answer['by_temperature']) == 48)
 
 
 def test_turns_beyond_the_range_of_the_model_are_said(run, log, model):
@@ -218,14 +239,18 @@ def test_turns_beyond_the_range_of_the_model_are_said(run, log, model):
     assert '26 of 52 dwells are outside the calibrated temperatures' in text
 
 
-@pytest.mark.parametrize('origin, said', [
-    ('{}', 'if it was fitted to this log'), ('{files: [{name: table.csv, sha256: THIS}]}', 'it was fitted to this log'),
-    ('{files: [{name: table.csv, sha256: 00ff}]}', '')])
-def test_a_model_that_was_fitted_to_the_log_is_told_from_one_that_was_not(run, log, model, origin, said):
+@pytest.mark.parametrize(
+    'origin, said', [('{}', 'if it was fitted to this log'),
+                     ('{files: [{name: table.csv, sha256: THIS}]}', 'it was fitted to this log'),
+                     ('{files: [{name: table.csv, sha256: 00ff}]}', '')])
+def test_a_model_that_was_fitted_to_the_log_is_told_from_one_that_was_not(
+        run, log, model, origin, said):
     digest = hashlib.sha256(log.read_bytes()).hexdigest()
     model.write_text(model.read_text() + f'\norigin: {origin.replace("THIS", digest)}')
-    remark = next(each for each in json.loads(run(log, '--model', model, '--json')[1])['remarks'] if 'the model is' in each)
-    assert ('; ' in remark) == bool(said) and remark.count('errors of a fit') == bool(said) and f'; {said}' in remark + '; '
+    remark = next(each for each in json.loads(run(log, '--model', model, '--json')[1])['remarks']
+                  if 'the model is' in each)
+    assert (('; ' in remark) == bool(said) and remark.count('errors of a fit') == bool(said)
+            and f'; {said}' in remark + '; ')
 
 
 def test_two_dwells_are_enough_for_a_given_model(run, model, tmp_path):
@@ -236,9 +261,11 @@ def test_two_dwells_are_enough_for_a_given_model(run, model, tmp_path):
 
 def test_the_table_gives_degrees_and_per_cent(run, log, model):
     lines = run(log, '--model', model)[1].splitlines()
-    row = next(line.split() for line in lines if line.startswith('5 to 10 ') or line.startswith('10 to 20 '))
+    row = next(line.split()
+               for line in lines if line.startswith('5 to 10 ') or line.startswith('10 to 20 '))
     assert [float(cell) for cell in row[4:8]] == [3.6, 1.0, 3.6, 1.0]
-    assert any(line.startswith('rate [deg/s]') for line in lines) and any(line.startswith('temperature [degC]') for line in lines)
+    assert (any(line.startswith('rate [deg/s]') for line in lines)
+            and any(line.startswith('temperature [degC]') for line in lines))
 
 
 def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path):
@@ -254,10 +281,12 @@ def test_without_a_model_one_is_fitted_that_has_not_seen_the_sweep(run, tmp_path
 def test_the_file_has_a_row_for_every_turn(run, log, model, tmp_path):
     assert run(log, '--model', model, '--slowest', 25, '--out', tmp_path / 'turn.csv')[0] == 0
     header, *rows = (tmp_path / 'turn.csv').read_text().splitlines()
-    assert header == 'place,sweep,reference_rate_rad_s,temperature_degc,static_rad_per_turn,modelled_rad_per_turn'
+    assert header == ('place,sweep,reference_rate_rad_s,temperature_degc,'
+                      'static_rad_per_turn,modelled_rad_per_turn')
     assert len(rows) == 32
     place, sweep, rate, temperature, *errors = rows[0].split(',')
-    assert (place, sweep, float(rate) / DEGREE, float(temperature)) == ('row 1', '0', pytest.approx(-60.0), 20.0)
+    assert (place, sweep, float(rate) / DEGREE, float(temperature)) == (
+        'row 1', '0', pytest.approx(-60.0), 20.0)
     assert float(errors[0]) == pytest.approx(-TURN * 0.01)
 
 
@@ -266,7 +295,8 @@ def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
     cells = lines[4].split(',')
     lines[4] = ','.join([str(float(cells[0]) + 1.0), *cells[1:]])
     (tmp_path / 'wild.csv').write_text('\n'.join(lines))
-    assert '1 outlying dwells are left out: row 4' in run(tmp_path / 'wild.csv', '--model', model)[1]
+    assert ('1 outlying dwells are left out: row 4'
+            in run(tmp_path / 'wild.csv', '--model', model)[1])
 
 
 def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model, tmp_path):
@@ -277,20 +307,24 @@ def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model,
     answer = json.loads(text)
     assert code == 0 and answer['turns'] == 2
     rate = np.array(answer['rate_rad_s'])
-    expected = (GYRO.output(rate, np.full(2, 25.0)) - GYRO.output(0.0, 25.0) - rate) * TURN / np.abs(rate)
+    expected = ((GYRO.output(rate, np.full(2, 25.0)) - GYRO.output(0.0, 25.0) - rate) * TURN
+                / np.abs(rate))
     assert answer['static_rad_per_turn'] == pytest.approx(expected, abs=5e-3)
 
 
 def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_path):
-    """A supply that is higher while it turns one way would pass for an error of that way, by the means of dwells alone."""
-    (tmp_path / 'model.yaml').write_text('effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
+    """By means of dwells alone, a supply that follows the direction passes for an error of it."""
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {supply_sensitivity: {supply_sensitivity: 0.01}}')
     time = np.cumsum([0, 10, 0.5, 20, 0.5, 20, 0.5, 10])
     motion = from_rates(time, np.array([0, 0, 30, 30, -30, -30, 0, 0]) * DEGREE)
     log = simulate(GyroModel(), motion, 50.0, np.random.default_rng(2))
     supply = np.where(np.abs(log.time - 20.0) < 11.0, 6.0, 5.0)
-    write_log(tmp_path / 'log.csv', replace(log, output=log.output + 0.01 * (supply - 5.0), supply=supply))
+    write_log(tmp_path / 'log.csv',
+              replace(log, output=log.output + 0.01 * (supply - 5.0), supply=supply))
     answer = json.loads(run(tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json')[1])
-    assert answer['static']['largest_rad_per_turn'] > 0.1 and answer['modelled']['largest_rad_per_turn'] < 1e-9
+    assert (answer['static']['largest_rad_per_turn'] > 0.1
+            and answer['modelled']['largest_rad_per_turn'] < 1e-9)
 
 
 def test_a_table_of_counts_alone_is_wrong_use_that_names_the_sensitivity(run, tmp_path):
@@ -305,7 +339,8 @@ def test_a_log_without_a_reference_is_refused(run, tmp_path):
     assert code == 1 and not text and 'reference_rate_dps' in error
 
 
-def test_a_picture_without_matplotlib_is_refused_before_anything_is_computed(run, monkeypatch, tmp_path):
+def test_a_picture_without_matplotlib_is_refused_before_anything_is_computed(
+        run, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
     code, text, error = run(tmp_path / 'missing.csv', '--picture', 'turn.png')
     assert code == 2 and not text and 'needs matplotlib' in error

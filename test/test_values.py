@@ -1,8 +1,8 @@
 """
-No value poisons the state: all models of the catalogue, and all finite samples, temperatures and stamps.
+No value poisons the state: no catalogue model, finite sample, temperature or stamp.
 
-Hypothesis looks for values that break a claim. `make test` tries a fixed choice; GYRO_CALIBRATION_EXAMPLES multiplies their number, and
-lets them be chosen at random.
+Hypothesis looks for values that break a claim. `make test` tries a fixed choice;
+GYRO_CALIBRATION_EXAMPLES multiplies their number and chooses them at random.
 
 """
 
@@ -34,8 +34,9 @@ INTERVAL, NOW = 0.04, 1.7e9
 NOISE = Noise(7.3e-4, 8.7e-5)
 REST = simulate_noise(NOISE, 1500, INTERVAL, np.random.default_rng(0))  # a minute
 
-FINITE = st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.floats(-3.0, 3.0), st.sampled_from(
-    [0.0, 30.0, -30.0, 99.0, 500.0, -512.0, 1e16, -1e16, 1e155, 1e200, -1e308, 1.7e308]))
+FINITE = st.one_of(st.floats(allow_nan=False, allow_infinity=False), st.floats(-3.0, 3.0),
+                   st.sampled_from([0.0, 30.0, -30.0, 99.0, 500.0, -512.0, 1e16, -1e16, 1e155,
+                                    1e200, -1e308, 1.7e308]))
 DEGC = st.one_of(st.floats(-20.0, 60.0), FINITE, st.none())
 FORCE = st.one_of(st.none(), st.floats(-20.0, 20.0), FINITE)
 
@@ -44,7 +45,8 @@ def tries(examples):
     """Return the settings of a test that tries so many examples."""
     return hypothesis.settings(
         max_examples=examples * MORE, derandomize=MORE == 1, deadline=None, database=None,
-        suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture])
+        suppress_health_check=[hypothesis.HealthCheck.too_slow,
+                               hypothesis.HealthCheck.function_scoped_fixture])
 
 
 def value(parameter, largest):
@@ -60,21 +62,28 @@ def value(parameter, largest):
 def models(draw, largest=1e20, around=True):
     """Return models with one effect of the catalogue or several, and values up to some size."""
     polynomial = rate_temperature_polynomial(draw(st.integers(0, 4)), draw(st.integers(0, 3)))
-    effects = [polynomial, *(each for each in CATALOGUE.values() if around or each.looks_at <= {'rate', 'output', 'temperature'})]
-    chosen = draw(st.lists(st.sampled_from(effects), min_size=1, max_size=4, unique_by=lambda each: each.name))
-    terms = tuple(Term(each, tuple(draw(value(parameter, largest)) for parameter in each.parameters)) for each in chosen)
+    effects = [polynomial, *(
+        each for each in CATALOGUE.values()
+        if around or each.looks_at <= {'rate', 'output', 'temperature'})]
+    chosen = draw(st.lists(st.sampled_from(effects), min_size=1, max_size=4,
+                           unique_by=lambda each: each.name))
+    terms = tuple(Term(each, tuple(draw(value(parameter, largest))
+                                   for parameter in each.parameters)) for each in chosen)
     rates = draw(st.sampled_from([(-math.inf, math.inf), (-2.0, 2.0), (0.0, 0.0), (1.0, 2.0)]))
     temperatures = draw(st.sampled_from([(-math.inf, math.inf), (10.0, 40.0)]))
-    calibration = draw(st.sampled_from([None, SelfCalibration(0.04, 0.002), SelfCalibration(-0.9, 3.0)]))
+    calibration = draw(
+        st.sampled_from([None, SelfCalibration(0.04, 0.002), SelfCalibration(-0.9, 3.0)]))
     return GyroModel(terms, None, rates, temperatures, noise=NOISE, self_calibration=calibration)
 
 
 def every_effect_alone():
-    """Return models of each effect of the catalogue with each parameter at an end of its bounds, or at 1e20."""
+    """Return models of each effect with each parameter at an end of its bounds or at 1e20."""
     for effect in [*CATALOGUE.values(), rate_temperature_polynomial(4, 3)]:
         for end in (0, 1):
-            values = tuple(min(max(parameter.bounds[end], -1e20), 1e20) for parameter in effect.parameters)
-            yield pytest.param(GyroModel((Term(effect, values),), noise=NOISE), id=f'{effect.name} {end}')
+            values = tuple(min(max(parameter.bounds[end], -1e20), 1e20)
+                           for parameter in effect.parameters)
+            yield pytest.param(GyroModel((Term(effect, values),), noise=NOISE),
+                               id=f'{effect.name} {end}')
 
 
 EXTREMES = [0.5, -1.5, 30.0, -30.0, 99.0, 500.0, 1e16, -1e155, 1e308, -1.7e308]
@@ -84,12 +93,15 @@ EXTREMES = [0.5, -1.5, 30.0, -30.0, 99.0, 500.0, 1e16, -1e155, 1e308, -1.7e308]
 def test_every_effect_alone_gives_finite_rates(model):
     for output in EXTREMES:
         for temperature in (None, 25.0, -1e308, 1e308):
-            around = model.history().follow(0.0, temperature, 9.8, 5.0) if model.looks_around else None
+            around = (model.history().follow(0.0, temperature, 9.8, 5.0)
+                      if model.looks_around else None)
             done = compensate(model, output, temperature, around)
-            assert math.isfinite(done.rate) and math.isfinite(done.temperature) and (done.beyond_range or abs(output) < 100.0)
+            assert (math.isfinite(done.rate) and math.isfinite(done.temperature)
+                    and (done.beyond_range or abs(output) < 100.0))
 
 
-@pytest.mark.parametrize(('cubic', 'output'), [(1e-5, 500.0), (1e-3, 30.0), (-1e-3, 30.0), (1e-3, 1e155), (-1e-5, 1e308)])
+@pytest.mark.parametrize(('cubic', 'output'), [(1e-5, 500.0), (1e-3, 30.0), (-1e-3, 30.0),
+                                               (1e-3, 1e155), (-1e-5, 1e308)])
 def test_a_cubic_never_runs_away(cubic, output):
     model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (cubic,)),))
     one, many = compensate(model, output), compensate(model, np.array([output, 0.1]))
@@ -101,13 +113,16 @@ def test_a_cubic_never_runs_away(cubic, output):
 
 
 @tries(150)
-@hypothesis.given(models(), st.lists(st.tuples(FINITE, st.one_of(st.floats(-20.0, 60.0), FINITE)), min_size=1, max_size=5))
+@hypothesis.given(models(), st.lists(st.tuples(FINITE, st.one_of(st.floats(-20.0, 60.0), FINITE)),
+                                     min_size=1, max_size=5))
 def test_every_output_gives_a_finite_rate(model, samples):
     output, temperature = np.array(samples).T
     time = np.arange(len(output)) * INTERVAL
-    around = model.history().follow(time, temperature, 0.0 * time + 9.8) if model.looks_around else None
+    around = (model.history().follow(time, temperature, 0.0 * time + 9.8)
+              if model.looks_around else None)
     done = compensate(model, output, temperature, around)
-    assert np.isfinite(done.rate).all() and np.isfinite(done.modelled).all() and np.isfinite(done.temperature).all()
+    assert (np.isfinite(done.rate).all() and np.isfinite(done.modelled).all()
+            and np.isfinite(done.temperature).all())
     assert np.broadcast_to(done.beyond_range, len(output))[np.abs(output) > model.rate_limit].all()
     for one, degc in samples if not model.looks_around else ():
         single = compensate(model, one, degc)
@@ -115,8 +130,10 @@ def test_every_output_gives_a_finite_rate(model, samples):
 
 
 @tries(150)
-@hypothesis.given(models(0.1, around=False), st.lists(st.tuples(FINITE, st.floats(-20.0, 60.0)), min_size=1, max_size=5))
-def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inverted(model, samples):
+@hypothesis.given(models(0.1, around=False),
+                  st.lists(st.tuples(FINITE, st.floats(-20.0, 60.0)), min_size=1, max_size=5))
+def test_a_sample_alone_is_compensated_as_in_a_log_and_what_is_not_marked_is_inverted(
+        model, samples):
     output, temperature = np.array(samples).T
     many = compensate(model, output, temperature)
     for index, (one, degc) in enumerate(samples):
@@ -139,7 +156,8 @@ def rest_for_a_minute(add, begin):
 
 
 def estimator(model, **settings):
-    return HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(**settings), 10.0, NOW)
+    return HeadingEstimator(model, BiasTable(model), Assumptions(),
+                            Settings(**settings), 10.0, NOW)
 
 
 def is_sound(live):
@@ -148,13 +166,16 @@ def is_sound(live):
     return all(map(math.isfinite, shown)) and live.variance >= 0.0
 
 
-SAMPLES = st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, DEGC, FORCE), max_size=30)
+SAMPLES = st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, DEGC, FORCE),
+                   max_size=30)
 
 
 @tries(60)
 @hypothesis.given(models(), SAMPLES, st.sampled_from([0.0, 0.1]))
-def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(model, samples, false_alarms):
-    live, time = estimator(model, false_alarms=false_alarms, threshold=Threshold(0.3 * DEGREE)), 0.0
+def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(
+        model, samples, false_alarms):
+    live, time = (estimator(model, false_alarms=false_alarms, threshold=Threshold(0.3 * DEGREE)),
+                  0.0)
     for step, output, degc, force in samples:
         time = time + step if math.isfinite(time + step) else step
         if degc is not None:
@@ -173,7 +194,8 @@ ABSURD = FINITE.filter(lambda rate: abs(rate) > 100.0)
 
 
 @tries(12)
-@hypothesis.given(st.lists(st.tuples(st.integers(0, 1499), ABSURD, DEGC, st.booleans()), max_size=40))
+@hypothesis.given(
+    st.lists(st.tuples(st.integers(0, 1499), ABSURD, DEGC, st.booleans()), max_size=40))
 def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(absurd):
     model = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (1e-3,)),), noise=NOISE,
                       self_calibration=SelfCalibration(0.0, 0.0, ((1e-8, 0.0), (0.0, 1e-8))))
@@ -183,16 +205,19 @@ def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(
         other, degc, temperature_alone = places.get(place, (output, 25.0, False))
         live.hear_temperature(INTERVAL * place, 25.0 if degc is None else degc)
         live.add(INTERVAL * place, output if temperature_alone else other, NOW)
-    assert live.refused == sum(not each[2] for each in places.values()) and live.tracker.rebuilt == 0
+    assert (live.refused == sum(not each[2] for each in places.values())
+            and live.tracker.rebuilt == 0)
     turned = 0.5 * (1.0 - math.cos(INTERVAL * 1499))
     rest_for_a_minute(lambda time, output: live.add(time, output, NOW), INTERVAL * 1499)
     assert abs(live.tracker.heading - turned) < 4.5 * math.sqrt(live.tracker.variance)
 
 
 @tries(12)
-@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE), max_size=40), st.sampled_from([0.0, 0.1]))
+@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE), max_size=40),
+                  st.sampled_from([0.0, 0.1]))
 def test_no_stream_leaves_a_tracker_with_something_that_is_no_number(samples, false_alarms):
-    tracker, time = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings(false_alarms, Threshold(0.3 * DEGREE))), 0.0
+    tracker, time = (HeadingTracker(NOISE, np.diag([1e-4, 1e-8]),
+                                    Settings(false_alarms, Threshold(0.3 * DEGREE))), 0.0)
     for step, rate in samples:
         time = time + step if math.isfinite(time + step) else step
         tracker.add(time, rate, np.array([0.0 if abs(rate) > 1e9 else -rate, -1.0]))
@@ -215,14 +240,16 @@ def test_a_state_that_is_not_finite_is_said_and_built_anew_with_the_last_heading
         said.append(tracker.add(INTERVAL * 500, 0.3, np.array([math.nan, -1.0])))
     else:
         getattr(tracker._drift, place)[1] = math.nan
-    said += [tracker.add(INTERVAL * (501 + index), 0.3, np.array([-0.3, -1.0])) for index in range(200)]
+    said += [tracker.add(INTERVAL * (501 + index), 0.3, np.array([-0.3, -1.0]))
+             for index in range(200)]
     assert tracker.rebuilt == 1 and sum(map(bool, said)) == 1 and is_sound(tracker)
-    assert abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5 and tracker.variance > variance + 1.0
+    assert (abs(tracker.heading - heading - 0.3 * INTERVAL * 201) < 0.5
+            and tracker.variance > variance + 1.0)
 
 
 @tries(80)
-@hypothesis.given(st.lists(st.tuples(st.floats(1e-3, 0.3), FINITE), min_size=1, max_size=60), st.sampled_from([0.0, 0.2]),
-                  st.sampled_from([0.0, 7.3e-4]))
+@hypothesis.given(st.lists(st.tuples(st.floats(1e-3, 0.3), FINITE), min_size=1, max_size=60),
+                  st.sampled_from([0.0, 0.2]), st.sampled_from([0.0, 7.3e-4]))
 def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk):
     settings = Threshold(0.3 * DEGREE, window, walk)
     live, time = ThresholdFilter(settings), np.cumsum([step for step, _ in samples])
@@ -231,13 +258,15 @@ def test_the_threshold_filter_decides_by_its_window_alone(samples, window, walk)
     for index, at in enumerate(time):
         begin = min(int(np.searchsorted(time, at - window, side='right')), index)
         fresh = ThresholdFilter(settings)
-        alone = [fresh.filter(*sample) for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
+        alone = [fresh.filter(*sample)
+                 for sample in zip(time[begin:index + 1].tolist(), rate[begin:index + 1].tolist())]
         assert found[index] == alone[-1]
     assert filter_rates(settings, time, rate).tolist() == found
 
 
 @tries(40)
-@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE), max_size=300))
+@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE, FINITE),
+                           max_size=300))
 def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
     check, time = HealthMonitor(NOISE, 1e-3), 0.0
     for step, output, rate in samples:
@@ -246,13 +275,16 @@ def test_the_health_monitor_finds_a_rest_after_any_samples(samples):
             check.examine(1e-8, 0.0)
     check.restart()
     complete = []
-    rest_for_a_minute(lambda at, rate: complete.append(check.examine(1e-8, 0.0)) if check.add(at, rate, rate) else None, 0.0)
-    assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio) and rest.noise_fits for rest in complete)
+    rest_for_a_minute(lambda at, rate: complete.append(check.examine(1e-8, 0.0))
+                      if check.add(at, rate, rate) else None, 0.0)
+    assert len(complete) == 5 and all(rest is not None and math.isfinite(rest.noise_ratio)
+                                      and rest.noise_fits for rest in complete)
 
 
 @tries(60)
-@hypothesis.given(st.lists(st.tuples(DEGC.filter(lambda degc: degc is not None), FINITE, st.floats(0.0, 1.7e308), FINITE), max_size=12),
-                  FINITE, FINITE)
+@hypothesis.given(
+    st.lists(st.tuples(DEGC.filter(lambda degc: degc is not None), FINITE,
+                       st.floats(0.0, 1.7e308), FINITE), max_size=12), FINITE, FINITE)
 def test_a_bias_table_stays_finite(rests, temperature, time):
     table = BiasTable(GyroModel(noise=NOISE))
     for degc, bias, variance, when in rests:
@@ -264,10 +296,13 @@ def test_a_bias_table_stays_finite(rests, temperature, time):
 
 # verbs
 
-COLUMN = st.one_of(st.floats(-1e20, 1e20), st.floats(-3.0, 3.0), st.sampled_from([500.0, 1e16, -1e20, math.nan]))
-TURNING = np.concatenate([np.zeros(100), np.full(150, 0.7), np.zeros(100), np.full(150, -0.7), np.zeros(100)])
+COLUMN = st.one_of(st.floats(-1e20, 1e20), st.floats(-3.0, 3.0),
+                   st.sampled_from([500.0, 1e16, -1e20, math.nan]))
+TURNING = np.concatenate([np.zeros(100), np.full(150, 0.7), np.zeros(100), np.full(150, -0.7),
+                          np.zeros(100)])
 MODELS = ['effects: {bias: {bias: 0.002}}\nnoise: {angle_random_walk: 7.3e-4}',
-          'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\nvalid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}']
+          'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\n'
+          'valid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}']
 
 
 def absurd_log(changes):
@@ -277,18 +312,21 @@ def absurd_log(changes):
     for place, rate, degc in changes:
         output[place], temperature[place] = rate, degc
     heading = np.concatenate([[0.0], np.cumsum(0.5 * INTERVAL * (TURNING[1:] + TURNING[:-1]))])
-    return Log(output=output, time=time, temperature=temperature, reference_rate=TURNING, reference_heading=heading)
+    return Log(output=output, time=time, temperature=temperature, reference_rate=TURNING,
+               reference_heading=heading)
 
 
-CHANGES = st.lists(st.tuples(st.integers(0, len(TURNING) - 1), COLUMN, st.one_of(st.just(25.0), st.floats(-1e5, 1e5))), max_size=20)
+CHANGES = st.lists(st.tuples(st.integers(0, len(TURNING) - 1), COLUMN,
+                             st.one_of(st.just(25.0), st.floats(-1e5, 1e5))), max_size=20)
 
 
 def no_constant(name):
     raise AssertionError(f'{name} is no JSON')
 
 
-@pytest.mark.parametrize('verb', [('compensate', '--out'), ('compensate', '--rest', '--out'), ('compensate', '--hindsight', '--out'),
-                                  ('turn', ), ('self-calibrate', )], ids=' '.join)
+@pytest.mark.parametrize('verb', [('compensate', '--out'), ('compensate', '--rest', '--out'),
+                                  ('compensate', '--hindsight', '--out'), ('turn', ),
+                                  ('self-calibrate', )], ids=' '.join)
 @pytest.mark.parametrize('text', MODELS, ids=['bias', 'cubic'])
 def test_the_verbs_answer_in_json_whatever_a_log_holds(run, tmp_path, verb, text):
     (tmp_path / 'model.yaml').write_text(text)
@@ -298,7 +336,8 @@ def test_the_verbs_answer_in_json_whatever_a_log_holds(run, tmp_path, verb, text
     @hypothesis.given(CHANGES)
     def holds(changes):
         write_log(tmp_path / 'log.csv', absurd_log(changes))
-        code, said, problem = run(verb[0], tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--json', *verb[1:], *out)
+        code, said, problem = run(verb[0], tmp_path / 'log.csv',
+                                  '--model', tmp_path / 'model.yaml', '--json', *verb[1:], *out)
         assert code in (0, 1), problem
         if code == 0:
             assert json.loads(said, parse_constant=no_constant)
@@ -313,7 +352,8 @@ def test_a_log_with_a_lost_decimal_point_keeps_its_heading_and_counts_the_row(ru
     headings = []
     for changes in ([], [(200, 700.0, 25.0), (300, 1e155 ** 0.1, 25.0), (400, 0.0, 9e4)]):
         write_log(tmp_path / 'log.csv', absurd_log(changes))
-        code, said, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv', '--json')
+        code, said, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
+                            '--out', tmp_path / 'out.csv', '--json')
         answer = json.loads(said)
         assert code == 0 and answer['refused_samples'] == len(changes) == answer['lost_samples']
         headings.append((answer['heading_rad'], answer['heading_std_rad']))
@@ -322,7 +362,9 @@ def test_a_log_with_a_lost_decimal_point_keeps_its_heading_and_counts_the_row(ru
 
 
 def test_a_log_is_compensated_without_its_absurd_rows():
-    model, log = GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (-1e-3,)),)), absurd_log([(7, 1e20, 25.0), (8, 0.1, -1e5)])
+    model, log = (GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (-1e-3,)),)),
+                  absurd_log([(7, 1e20, 25.0), (8, 0.1, -1e5)]))
     rate = compensate_log(model, log)
     assert np.flatnonzero(np.isnan(rate)).tolist() == [7, 8]
-    assert np.isfinite(LogCompensation(model).add(log)[0].rate).all(), 'asked for all the same, they stay finite'
+    assert np.isfinite(LogCompensation(model).add(log)[0].rate).all(), (
+        'asked for all the same, they stay finite')
