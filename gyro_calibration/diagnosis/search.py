@@ -93,7 +93,7 @@ MOST_CAUSES = 6
 
 @dataclass(frozen=True)
 class Chance:
-    """Evidence of causes by chance: with probability `share` above `start`, then exponential."""
+    """Evidence of causes by chance: `share` exceeds `start`, and falls by e every `scale`."""
 
     start: Mapping[str, float]
     scale: Mapping[str, float]
@@ -214,9 +214,9 @@ def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
     for _ in range(DRAWS // 100):
         residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100,
                           generator)
-        found.append(_priced(evidence(
-            judge(sample(residuals, *single, done.field.starts), noises, by), by, stock.groups),
-            stock))
+        found.append(_priced(
+            evidence(judge(sample(residuals, *single, done.field.starts), noises, by), by,
+                     stock.groups), stock))
     return _chance(np.concatenate(found), by_cause(stock.candidates))
 
 
@@ -466,7 +466,7 @@ def _shape(at: float, begin: Candidate, place: int) -> float:
 
 
 def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[float, float]:
-    """Return where to look for a shape: between neighbours; moments apart, in logarithms."""
+    """Return where to look for a shape: between neighbours, in logarithms but for moments."""
     mine = begin.shapes[place]
     if begin.cause == 'bias_step':
         width = 1.5 * max(spacing_of_steps(each, len(replays)) for each in replays)
@@ -521,8 +521,7 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         return None, []
     top = max(first, key=lambda each: each.most)
-    # Causes that change the rate are alike to first order; of a large one, a first shape says
-    # little.
+    # Causes that change the rate look alike to first order; large ones need refined shapes.
     alike = is_of_the_rate(top.candidate.cause)
     worth = [each for each in first if each.most > 0.8 * top.most - 8.0
              or (alike and is_of_the_rate(each.candidate.cause))]
@@ -582,8 +581,7 @@ def searched(search: Search) -> tuple[Named, ...]:
     Return the causes that the data support, with values.
 
     Several causes along one variable together may look like none of them. So where something
-    without a name is found, the search is done without such things too, and the likelier list is
-    taken.
+    without a name is found, the search is repeated without them, and the likelier list is taken.
 
     """
     everything = _grown(search)

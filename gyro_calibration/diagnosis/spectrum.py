@@ -122,7 +122,7 @@ def level(angle: Array, found: Array) -> Array:
 
 
 def bands(angle: Array, interval: float, single: int = 24, ratio: float = 1.12) -> Array:
-    """Return the first index of each band of coefficients: the lowest alone, others in ratio."""
+    """Return the first index of each band of coefficients: the lowest alone, then by ratio."""
     edges, count = list(range(min(single, len(angle)))), len(angle)
     while edges and edges[-1] * ratio + 1.0 < count:
         edges.append(int(math.ceil(edges[-1] * ratio + 0.5)))

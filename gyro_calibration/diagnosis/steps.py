@@ -294,8 +294,8 @@ def _simplest(search: Search, named: tuple[Named, ...],
 def _size(search: Search, known: Named) -> int:
     """Return how many values a cause has."""
     candidate = known.candidate
-    return len(fitted_shapes(candidate)) + (0 if candidate.amplitude is not None else
-                                            len(candidate.columns(search.field.replays[0])))
+    return len(fitted_shapes(candidate)) + (
+        0 if candidate.amplitude is not None else len(candidate.columns(search.field.replays[0])))
 
 
 def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float,
@@ -367,9 +367,9 @@ def _of_model(found: Outcome, model: GyroModel, noise: Noise, rate: float) -> li
     scale, bias = found.scale_factor_error, float(np.mean(found.biases))
     own = [_own_deviation(model, name) for name in ('bias', 'scale_factor_error')]
     # A bias that a model allows to wander is no other bias; one log hardly says how far.
-    likely = Noise(noise.angle_random_walk, *(max(getattr(each, name)
-                                                  for each in (noise, model.noise))
-                                              for name in NAMES[1:]))
+    likely = Noise(noise.angle_random_walk,
+                   *(max(getattr(each, name) for each in (noise, model.noise))
+                     for name in NAMES[1:]))
     doubts = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
     told = [('bias', bias, doubts[0], ()),
             ('scale_factor_error', scale.value, doubts[1], ('reference_scale',))]
@@ -394,8 +394,9 @@ def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) 
         name, cause.sentence,
         {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
         float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins,
-        cause.separate_by if twins else '', 'it comes on top of that of the model, '
-        f'{abs(value) / deviation:.3g} standard deviations from nothing', cause.along)
+        cause.separate_by if twins else '',
+        f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard deviations '
+        'from nothing', cause.along)
 
 
 def _of_noise(figures: NoiseFigures, expected: Noise, rate: float,

@@ -153,7 +153,7 @@ def _in_the_band(honest: _Honest, band: DeadBand | None, seen: Compared) -> _Hon
 
 
 def _share_of_neighbours(change: Array, step: Array) -> float:
-    """Return the share of changes by one code or two, each way, with its uncertainty."""
+    """Return an upper bound of the share of changes by one code or two, each way."""
     size = np.abs(change)
     count = np.count_nonzero((size > 0.5 * step) & (size < 2.5 * step))
     return float((count + 2.0 * np.sqrt(count)) / 4.0 / len(change))

@@ -356,8 +356,7 @@ def _beside_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
     except DataRefused:
         return
     effects = ', '.join(effect.name for effect in named.effects)
-    # What effects of the rate leave is of the output; what a polynomial of the output leaves is of
-    # the rate already.
+    # Effects of the rate leave an error of the output, a polynomial of the output one of the rate.
     of_rate = rms((named.left_out
                    / named.model.steepness(channels_of(dwells)))[named.scatter.kept])
     yield (f'{effects} alone, {_values(named)} values, predict the rates of left-out sweeps to '

@@ -153,7 +153,7 @@ def shown_by(found: Finding) -> list[str]:
 
 
 def certainty(found: Finding) -> list[str]:
-    """Return whether a cause is confirmed, and its chance by noise alone; units need neither."""
+    """Return whether a cause is confirmed, and its chance by noise alone; nothing for units."""
     if not found.p_value and found.remedy:
         return []
     suspected = ['It is suspected, not established.'] if found.status == 'suspected' else []
