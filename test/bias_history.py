@@ -1,14 +1,23 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Gyros of known truth over days: what their rests show, and errors of a bias table of them."""
 
-import math
 from dataclasses import dataclass, replace
+import math
 
-import numpy as np
-
-from gyro_calibration.bias_table import BiasTable, Prior, carry
+from gyro_calibration.bias_table import BiasTable, carry, Prior
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
 
 #: Time between two rests, s.
 STEP = 60.0

@@ -1,8 +1,19 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Fixtures for tests with ROS 2 processes: local, apart from each other, always ended."""
 
 import contextlib
 import fcntl
 import os
+from pathlib import Path
 import random
 import re
 import shutil
@@ -12,7 +23,6 @@ import sys
 import tempfile
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -238,7 +248,7 @@ class NodeProcess:
 
     @property
     def output(self):
-        """What it has printed so far, standard error included."""
+        """Return what it has printed so far, standard error included."""
         return Path(self._output).read_text(errors='replace')
 
     def wait(self, timeout=30.0):

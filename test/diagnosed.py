@@ -1,14 +1,20 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Hidden logs given to the diagnosis, and how right its answers are."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
-from hidden import OUTSIDE, Cause, HiddenLog
-from hidden.effects import AGAINST_A_MODEL, COUNTED, STEPPED, WITHOUT_COLUMN
+import itertools
 
 from gyro_calibration.diagnosis.finding import Diagnosis, Finding
 from gyro_calibration.diagnosis.steps import diagnose
@@ -16,6 +22,9 @@ from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.log import COLUMNS, Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
+from hidden import Cause, HiddenLog, OUTSIDE
+from hidden.effects import AGAINST_A_MODEL, COUNTED, STEPPED, WITHOUT_COLUMN
+import numpy as np
 
 #: What no log can part.
 SAME = {'reference_scale': 'scale_factor_error'}

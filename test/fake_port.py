@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """A serial port with devices behind it, and a clock that goes on while somebody waits."""
 
 import heapq
@@ -5,7 +15,7 @@ import itertools
 import math
 
 from gyro_calibration.driver.connection import Connection
-from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import find, Sample, Settings
 from gyro_calibration.driver.serial_port import PortError
 
 BEGIN = 100.0  # s
@@ -103,11 +113,12 @@ class World:
 
 
 class _Port:
+
     def __init__(self, world, path, baud):
         self._world, self.path, self.baud = world, path, baud
         self.data, self.is_open, self.talks, self.answers = b'', False, math.inf, False
 
-    def open(self):
+    def open(self):  # noqa: A003
         self._world.attempts += 1
         if not self._world.plugged:
             raise PortError(f'cannot open {self.path}: it does not exist')

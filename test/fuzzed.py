@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Targets for fuzzing: each takes any bytes, and raises where a claim about its reader is broken.
 
@@ -9,42 +19,41 @@ several lines. `benchmarks/fuzz.py` runs them, guided by coverage.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 import contextlib
+from dataclasses import dataclass
+from functools import cache, partial
 import importlib.util
 import io
 import json
 import math
 import os
+from pathlib import Path
 import random
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
-from pathlib import Path
-
-import numpy as np
 
 from gyro_calibration.bias_table import BiasTable, carry, read_bias_table, write_bias_table
 from gyro_calibration.cli.main import _parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
 from gyro_calibration.compensation import compensate
-from gyro_calibration.driver.protocols import PROTOCOLS, Protocol, Sample, Settings
+from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.listening import recognize
 from gyro_calibration.driver.protocols.protocol import Splitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.files import LARGEST
-from gyro_calibration.log import QUANTITIES, Log, LogError, read_log, read_log_blocks, write_log
-from gyro_calibration.messages import IMU, LAYOUTS, TEMPERATURE, serialize
+from gyro_calibration.log import Log, LogError, QUANTITIES, read_log, read_log_blocks, write_log
+from gyro_calibration.messages import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model_file import ModelError, model_text, read_model, write_model
+from gyro_calibration.model_file import model_text, ModelError, read_model, write_model
 from gyro_calibration.motion import CALIBRATION, MotionError, read_motion
 from gyro_calibration.noise import Noise
-from gyro_calibration.recording import Topics, read_recording
+from gyro_calibration.recording import read_recording, Topics
+import numpy as np
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes
 #: that a decoder may hold back.
@@ -307,7 +316,7 @@ def _log_seeds(suffix: str = '.csv') -> list[bytes]:
 
 
 def check_model(data: bytes) -> bool:
-    """A model is refused in a line, or it compensates, and is the same after it was written."""
+    """Refuse a model in a line, or compensate with it and find it the same once written."""
     path = _file(data, '.yaml')
     try:
         model = read_model(path)
@@ -341,7 +350,7 @@ def _model_seeds() -> list[bytes]:
 
 
 def check_bias_table(data: bytes) -> bool:
-    """A bias table is read or told of in a line; what is read is of use."""
+    """Read a bias table or refuse it in a line; what is read is of use."""
     path = _file(data, '.yaml')
     table, said = read_bias_table(path, GyroModel())
     if said:
@@ -514,7 +523,7 @@ _program = cache(_parser)
 
 
 def check_arguments(data: bytes) -> bool:
-    """The program takes its arguments, or ends with 0 or 2; nothing is run."""
+    """Parse arguments, or end with 0 or 2; nothing is run."""
     words = data.replace(b'\0', b'').decode('utf-8', 'surrogateescape').split('\n')
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(
             io.StringIO()) as said:

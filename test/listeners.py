@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Subscribers in a process of their own, each a participant of its own, to all that nodes say.
 
@@ -9,13 +19,12 @@ import signal
 import sys
 import threading
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from gyro_calibration.ros.runner import SENSOR_QOS
+import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
-
-from gyro_calibration.ros.runner import SENSOR_QOS
 
 
 def listener(number):

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 A pipeline and the small robot, joined as the node joins them, with a clock that the test steps.
 
@@ -8,12 +18,11 @@ is what the compensation node does in the interval of one sample.
 
 import math
 
-from robot import INTERVAL, Robot
-
 from gyro_calibration.ros.calibration_session import PROFILE
 from gyro_calibration.ros.parameters import record
 from gyro_calibration.ros.pipeline import PARAMETERS, Pipeline
 from gyro_calibration.ros.wheels import Velocity
+from robot import INTERVAL, Robot
 
 BEGIN = 1_700_000_000  # s since 1970
 NSEC_PER_SEC = 10 ** 9
@@ -109,7 +118,7 @@ class Rig:
         if self.receivers:
             self.robot.command(rate)
 
-    def set(self, **parameters):
+    def set(self, **parameters):  # noqa: A003
         """Set parameters while it runs."""
         names = {each.attribute: each.name for each in PARAMETERS}
         self._given.update({names[attribute]: value for attribute, value in parameters.items()})

@@ -1,18 +1,27 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Allan deviation and its noise figures, against definitions, simulated truth and recordings."""
 
 import json
 import math
 
-import numpy as np
-import pytest
-from scipy.signal import lfilter
-
-from gyro_calibration.allan import PARTS, allan_deviation, even_record, fit_noise
+from gyro_calibration.allan import allan_deviation, even_record, fit_noise, PARTS
 from gyro_calibration.cli.main import main
-from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
+from gyro_calibration.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
 from gyro_calibration.stamps import number_stamps
+import numpy as np
+import pytest
+from scipy.signal import lfilter
 
 INTERVAL = 0.01
 WHITE = Noise(1e-3)

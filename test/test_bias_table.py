@@ -1,43 +1,52 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Bias tables: intervals hold, outliers and jumps do not spoil them, and no file is lost."""
 
-import math
 from dataclasses import replace
+import math
 
-import numpy as np
-import pytest
 from bias_history import (
-    CALIBRATION,
-    MODEL,
-    NOISE,
-    OWN,
-    WHITE,
     answers,
+    CALIBRATION,
     carried_answers,
     coverage,
     cubic,
     learn,
     learned,
     linear,
+    MODEL,
+    NOISE,
+    OWN,
     simulate,
+    WHITE,
 )
-
 from gyro_calibration.bias_table import (
-    BIN,
-    ENTRIES,
-    INTERVAL,
     BiasTable,
-    Entry,
-    Jump,
-    Prior,
+    BIN,
     carry,
+    ENTRIES,
+    Entry,
+    INTERVAL,
+    Jump,
     model_digest,
+    Prior,
     read_bias_table,
     write_bias_table,
 )
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term, same_effects
+from gyro_calibration.model import GyroModel, same_effects, Term
 from gyro_calibration.noise import Noise
+import numpy as np
+import pytest
 
 COMPENSATED = GyroModel((Term(CATALOGUE['bias_temperature'], (25.0, 1e-4)),),
                         temperature_range=(10.0, 40.0), noise=NOISE)

@@ -1,38 +1,47 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Calibration from dwells: on simulated rate tables of known truth, and beside least squares."""
 
-import math
-import runpy
 from dataclasses import replace
+import math
 from pathlib import Path
+import runpy
 
-import numpy as np
-import pytest
-from numpy.polynomial.polynomial import polyval2d
-from scipy.stats import binom, chi2
-from scipy.stats import t as student
-
-from gyro_calibration.calibration import EffectsNotParted, binned, channels_of, fit_effects
+from gyro_calibration.calibration import binned, channels_of, EffectsNotParted, fit_effects
 from gyro_calibration.dwells import Dwells, from_table, take
 from gyro_calibration.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
+    polynomial_to_matrix,
+    rate_temperature_polynomial,
     SCALE_FACTOR_ASYMMETRY,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
     STEADY,
-    polynomial_to_matrix,
-    rate_temperature_polynomial,
 )
-from gyro_calibration.log import DEGREE, DataRefused, read_log
+from gyro_calibration.log import DataRefused, DEGREE, read_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.scatter import (
-    Scatter,
-    Whitener,
     _restricted_likelihood,
     _surface,
     find_scatter,
+    Scatter,
+    Whitener,
 )
+import numpy as np
+from numpy.polynomial.polynomial import polyval2d
+import pytest
+from scipy.stats import binom, chi2
+from scipy.stats import t as student
 
 RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
 Table, LINEAR, CUBIC, SINE, run = (RECOVERY[name]
@@ -318,9 +327,7 @@ def test_fewer_dwells_than_values_are_refused():
 # a polynomial of the output
 
 def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
-    """
-    On this table 0.1.0 stated 46 deg/s for t0w1 = 0.097 deg/s, beside a residual of 0.045 deg/s.
-    """
+    """On this table 0.1.0 stated t0w1 = 0.097 +- 46 deg/s, beside a residual of 0.045."""
     fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
                       [rate_temperature_polynomial(3, 2)])
     assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms

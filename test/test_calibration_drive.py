@@ -1,23 +1,32 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Calibrations on a robot that obeys late: what they find, what ends them, and who is obeyed."""
 
 import math
-
-import numpy as np
-import pytest
-from rig import PROFILE, Rig, Robot, rested
 
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION, from_rates
 from gyro_calibration.ros.calibration_session import (
     DISCOVERY,
+    Drive,
     ODOMETRY,
     REST,
     SILENCE,
     TURNS,
-    Drive,
 )
 from gyro_calibration.ros.wheels import Velocity
+import numpy as np
+import pytest
+from rig import PROFILE, rested, Rig, Robot
 
 SCALE, BIAS = 0.0373, 0.01  # of the robot's gyro
 FULL = 45.0 * DEGREE

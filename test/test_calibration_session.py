@@ -1,25 +1,34 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """A running calibration: when it is complete, what it is compared with, and its results."""
 
 import math
 
-import numpy as np
-import pytest
-
-from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.log import DataRefused, DEGREE
 from gyro_calibration.motion import CALIBRATION, turns
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros.calibration_session import (
+    calibrated,
     LONGEST,
     MARKED,
     ODOMETRY,
     PROFILE,
     REST,
-    TURNS,
     Rules,
     Run,
-    calibrated,
+    TURNS,
 )
 from gyro_calibration.self_calibration import Limits, Reference
+import numpy as np
+import pytest
 
 INTERVAL, S, B = 0.02, 0.0373, 0.75 * DEGREE / 60
 ROUND = turns([(3.0, 0.0), (12.0, 60.0), (3.0, 0.0)])

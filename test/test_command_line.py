@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The program as people and other programs call it."""
 
 import hashlib
@@ -8,16 +18,15 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
-from tqdm import tqdm
-
 from gyro_calibration import cli as verbs
 from gyro_calibration.cli.main import main
 from gyro_calibration.driver.protocols import find
 from gyro_calibration.log import DEGREE, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
 from gyro_calibration.motion import CALIBRATION
+import numpy as np
+import pytest
+from tqdm import tqdm
 
 TURN = 2.0 * math.pi
 VERBS = [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS]
@@ -272,7 +281,7 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
 def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
         ros_domain, capsys, refusals):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    from gyro_calibration.demo import ATTEMPTS, Refused, calibrate
+    from gyro_calibration.demo import ATTEMPTS, calibrate, Refused
     answers = iter([Refused('calibrate: the gyro slipped')] * refusals + ['done'])
 
     def call(*_):

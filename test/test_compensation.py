@@ -1,24 +1,33 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Compensation: model, then self-calibration; outside the valid range; sensitivity to values."""
 
-import math
 from dataclasses import replace
-
-import numpy as np
-import pytest
+import math
 
 from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
 from gyro_calibration.effects import (
     BIAS,
     CATALOGUE,
-    SCALE_FACTOR_ERROR,
     Channels,
     polynomial_from_matrix,
     rate_temperature_polynomial,
+    SCALE_FACTOR_ERROR,
 )
-from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
+from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
 from gyro_calibration.log import CACHED
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise
+import numpy as np
+import pytest
 
 WARM = Term(*polynomial_from_matrix([[0.1], [0.0]]))  # the bias is 0.1 deg/s a degC
 CALIBRATION = SelfCalibration(0.04, 0.002, ((1e-6, 1e-8), (1e-8, 1e-6)))

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The compensation node as a robot has it: its own process, messages, parameters, services."""
 
 import math
@@ -5,13 +15,12 @@ import os
 import signal
 import time
 
-import numpy as np
-import pytest
-from fake_gyro import INTERVAL, PACE, FakeGyro
-
+from fake_gyro import FakeGyro, INTERVAL, PACE
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
 from gyro_calibration.ros import UNMEASURED_VARIANCE
+import numpy as np
+import pytest
 
 try:
     from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """A gyro on a port that is found, recognized, lost, and found again, by an injected clock."""
 
 import itertools
@@ -6,15 +16,14 @@ import os
 import random
 import threading
 
-import numpy as np
-import pytest
 from fake_port import BEGIN, Reading, World
-
 from gyro_calibration.driver.connection import Connection, resolve
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import SerialFaults, damaged
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.serial_faults import damaged, SerialFaults
 from gyro_calibration.driver.serial_port import PortError
+import numpy as np
+import pytest
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
 SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None)

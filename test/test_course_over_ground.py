@@ -1,12 +1,21 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Calibration against a course over ground: late, smoothed, lost, and at times far off."""
 
 import math
 
+from gyro_calibration.encoder import calibrate_encoder
+from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
 import pytest
-
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
 
 SCALE, BIAS = 1.01, 0.4 * DEGREE
 

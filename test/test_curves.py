@@ -1,7 +1,14 @@
-"""The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
 
-import numpy as np
-import pytest
+"""The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
 from gyro_calibration.diagnosis.curves import curves, what_is_left
 from gyro_calibration.diagnosis.field import field, work
@@ -9,6 +16,8 @@ from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.log import Log
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
+import pytest
 
 WHITE = 1e-4
 NOISES = {'white': Noise(WHITE), 'flicker': Noise(WHITE, bias_instability=1e-4),

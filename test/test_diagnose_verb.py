@@ -1,16 +1,25 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The verb diagnose: what it prints and writes, and its messages where data do not suffice."""
 
+from dataclasses import replace
 import json
 import os
-from dataclasses import replace
-
-import numpy as np
-import pytest
-from hidden import hide
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.log import COLUMNS, DEGREE, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
+from hidden import hide
+import numpy as np
+import pytest
 
 FILES = {'diagnosis.json', 'report.html', 'model.yaml'}
 SHORT = {'duration': 400.0, 'sample_rate': 20.0}
@@ -157,8 +166,7 @@ REFUSED = {'without reference': (lambda log: replace(log, reference_rate=None, m
            'nan everywhere': (lambda log: replace(log, output=np.nan * log.output),
                               'has a value in 0 of'),
            'reference lost': (lambda log: replace(log, reference_rate=np.where(
-               log.time < 2.0, log.reference_rate, np.nan)), 'reference has a value'),
-}
+               log.time < 2.0, log.reference_rate, np.nan)), 'reference has a value')}
 
 
 @pytest.mark.parametrize('spoilt, reason', REFUSED.values(), ids=REFUSED)

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 The diagnosis names hidden effects with their size, wins what is possible, and adds no others.
 
@@ -6,16 +16,11 @@ are places in lists; those of the last test vary from run to run, and are printe
 
 """
 
-import secrets
 from dataclasses import replace
+import secrets
 
-import numpy as np
-import pytest
 from diagnosed import described as told
 from diagnosed import diagnosis_of, held, judged_diagnosis, log_of, model_of, won
-from hidden import FORMS, KINDS, OUTSIDE, NoiseFigures, described, draw_gyro, hide, record, session
-from hidden.effects import AGAINST_A_MODEL
-
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.effects import CATALOGUE
@@ -23,6 +28,10 @@ from gyro_calibration.history import channels_of
 from gyro_calibration.log_compensation import compensate_log
 from gyro_calibration.model_file import model_text, read_model
 from gyro_calibration.simulation import respond
+from hidden import described, draw_gyro, FORMS, hide, KINDS, NoiseFigures, OUTSIDE, record, session
+from hidden.effects import AGAINST_A_MODEL
+import numpy as np
+import pytest
 
 SHORT = {'duration': 600.0, 'sample_rate': 25.0}
 #: References in turn.
@@ -152,8 +161,7 @@ def test_a_strobe_of_another_frequency_is_named_beside_the_scale_of_the_gyro():
 
 LARGE = {'time_offset': lambda sessions: {'size': 0.02},
          'scale_factor_error': lambda sessions: {'size': 0.05}, 'saturation': lambda sessions: {
-             'size': 0.5 * max(np.abs(each.rate).max() for each in sessions)},
-}
+             'size': 0.5 * max(np.abs(each.rate).max() for each in sessions)}}
 
 
 @pytest.mark.parametrize('seed', range(2))

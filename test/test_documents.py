@@ -1,15 +1,24 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Documents hold: links lead somewhere, tables agree with the code, commands are understood."""
 
+from pathlib import Path
 import re
 import shlex
-from pathlib import Path
-
-import pytest
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.driver.protocols import PROTOCOLS
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.model_file import POLYNOMIAL, read_model
+import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst',

@@ -1,16 +1,25 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The door: the usable reference is taken, noise is no motion, huge data are refused."""
 
 from dataclasses import replace
-
-import numpy as np
-import pytest
 
 from gyro_calibration.diagnosis.door import MOST_ROWS, prepared, refuse, rests
 from gyro_calibration.diagnosis.hygiene import inspect
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE, DataRefused, Log
+from gyro_calibration.log import DataRefused, DEGREE, Log
+import numpy as np
+import pytest
 
 INTERVAL = 0.01
 COUNT = 12_000

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The driver as a robot runs it: its own process, a pseudo-terminal for the gyro, and DDS."""
 
 import itertools
@@ -9,11 +19,10 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import find, Sample
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
-
-from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import Sample, find
 
 
 class Robot:
@@ -42,7 +51,7 @@ class Robot:
 
 @pytest.fixture
 def robot(ros, start_node, wait_until):
-    """Return a function that starts a driver: ``robot(port, protocol, **parameters)``."""
+    """Return a function of port, protocol and parameters that starts a driver."""
     def start(port, protocol='csv', **parameters):
         return Robot(ros, start_node, wait_until, port, protocol, parameters)
     return start

@@ -1,21 +1,31 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Parameters, messages and diagnostics of the driver, by an injected clock and port."""
 
 import itertools
 import math
-import re
 from pathlib import Path
+import re
 
+from fake_port import World
 import pytest
 import yaml
-from fake_port import World
 
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from gyro_calibration.driver.connection import Connection
 from gyro_calibration.driver.decimation import Mean
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, WARN
-from gyro_calibration.ros.driver_node import PARAMETERS, Messages, settings
+from gyro_calibration.ros.driver_node import Messages, PARAMETERS, settings
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import record
 

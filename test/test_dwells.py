@@ -1,18 +1,27 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Dwells: what a rate table's file holds, and what is found in a log, on simulated truth."""
 
-import math
 from dataclasses import replace
-
-import numpy as np
-import pytest
-from scipy.signal import lfilter
+import math
 
 from gyro_calibration.dwells import dwells, find_dwells, from_table, join
 from gyro_calibration.dwells.averaging import moderated
 from gyro_calibration.dwells.samples import code_step
-from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
+from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
+import pytest
+from scipy.signal import lfilter
 
 RATES = (0, *(sign * rate for rate in range(10, 101, 10) for sign in (1, -1)))
 RUN = turns([(16.0, rate) for rate in RATES])

@@ -1,10 +1,17 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Each effect's formula, and one test for all: simulate, compensate, and the rate is back."""
 
-import math
 from dataclasses import replace
-
-import numpy as np
-import pytest
+import math
 
 from gyro_calibration.compensation import compensate, rate_sensitivity
 from gyro_calibration.effects import (
@@ -21,6 +28,8 @@ from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import CALIBRATION
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import respond, simulate
+import numpy as np
+import pytest
 
 #: A matrix C of eq. 11 of Ojeda et al. of the size in their figures 5 and 6: errors of some tenths
 #: of a deg/s at 100 deg/s.

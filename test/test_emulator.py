@@ -1,5 +1,16 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The emulated gyro, read through a real pseudo-terminal."""
 
+from dataclasses import replace
 import itertools
 import math
 import os
@@ -7,15 +18,13 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 
-import numpy as np
-import pytest
-
-from gyro_calibration.driver.emulator import Emulator, emulate
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.emulator import emulate, Emulator
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.driver.serial_port import PortError, SerialPort
+import numpy as np
+import pytest
 
 
 def samples(count=None, rate=100.0):

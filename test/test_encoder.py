@@ -1,21 +1,30 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Calibration against an encoder.
 
 What was put in is found, with true intervals, on simulated logs and on measured ones.
 """
 
-import math
-import runpy
 from dataclasses import replace
+import math
 from pathlib import Path
-
-import numpy as np
-import pytest
+import runpy
 
 from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE, DataRefused, Log, read_log
+from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
 from gyro_calibration.motion import from_rates
 from gyro_calibration.noise import Noise, simulate_noise
+import numpy as np
+import pytest
 
 S, B = 0.02, 0.3 * DEGREE
 INTERVAL = 0.01
@@ -242,9 +251,7 @@ def shaken(bias, generator):
 
 
 def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
-    """
-    Least squares would be off by 0.15 deg/s on such logs, five times as far as no calibration.
-    """
+    """Least squares is off by 0.15 deg/s on such logs, five times more than nothing."""
     errors, refused = [], 0
     for seed in range(20):
         generator = np.random.default_rng(seed)

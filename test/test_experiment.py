@@ -1,19 +1,23 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Experiments: the proposed one, once carried out, distinguishes what one log confounds."""
 
+from dataclasses import replace
 import re
 import zlib
-from dataclasses import replace
-
-import numpy as np
-import pytest
-from hidden.log import hide, record
-from hidden.motion import described
-from hidden.twins import TWINS, twin
 
 from gyro_calibration.diagnosis.candidates import Candidate, effect
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.experiment import ENOUGH, separating
-from gyro_calibration.diagnosis.field import Named, field
+from gyro_calibration.diagnosis.field import field, Named
 from gyro_calibration.diagnosis.menu import menu, reach
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import alternatives, begin, searched
@@ -21,6 +25,11 @@ from gyro_calibration.log import DEGREE, Log
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import from_rates
 from gyro_calibration.simulation import simulate
+from hidden.log import hide, record
+from hidden.motion import described
+from hidden.twins import twin, TWINS
+import numpy as np
+import pytest
 
 #: In multiples of the minimum detectable effect: large ones are distinguishable by their second
 #: order, slow ones are lost in wander.

@@ -1,16 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The extended model: the findings in it, what it keeps of the given model, and its messages."""
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
 from diagnosed import log_of
-from hidden import hide
-
 from gyro_calibration.compensation import compensate
 from gyro_calibration.diagnosis.candidates import effect
 from gyro_calibration.diagnosis.extension import calibrated, extended, left_out
-from gyro_calibration.diagnosis.field import Named, field, work
+from gyro_calibration.diagnosis.field import field, Named, work
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.report import report
@@ -23,6 +29,9 @@ from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.motion import turns
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
+from hidden import hide
+import numpy as np
+import pytest
 
 NOISE = Noise(1.5e-4)
 LINEAR = (Term(BIAS, (2e-3,)), Term(SCALE_FACTOR_ERROR, (0.01,)))
@@ -79,8 +88,7 @@ BESIDE = {'bias_temperature': (term('bias_temperature', 25.0, 1e-4), 'bias_tempe
                                        'scale_factor_temperature', 34.0),
           'supply_sensitivity': (term('supply_sensitivity', 12.0, 1e-4), 'supply_sensitivity',
                                  5.0),
-          'cubic_nonlinearity': (term('cubic_nonlinearity', 1e-3), 'cubic_nonlinearity'),
-}
+          'cubic_nonlinearity': (term('cubic_nonlinearity', 1e-3), 'cubic_nonlinearity')}
 
 
 @pytest.mark.parametrize('own, found, shapes',

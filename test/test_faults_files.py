@@ -1,19 +1,28 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Files of a robot, through kills at any moment and a full disk: the old file or the new one."""
 
 import json
 import os
+from pathlib import Path
 import resource
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
-
-import pytest
-from rig import rested
 
 from gyro_calibration.files import remove_leftovers, replacing, write_atomically
 from gyro_calibration.model_file import read_model
 from gyro_calibration.ros.calibration_session import REST
+import pytest
+from rig import rested
 
 
 @pytest.mark.parametrize('kills', [60, pytest.param(500, marks=pytest.mark.evidence)])

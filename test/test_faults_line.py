@@ -1,13 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Bytes lost, doubled and flipped: what the checks of each format let through."""
 
 import math
 
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.serial_faults import damaged, SerialFaults
+from gyro_calibration.log import DEGREE
 import numpy as np
 import pytest
-
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
-from gyro_calibration.driver.serial_faults import SerialFaults, damaged
-from gyro_calibration.log import DEGREE
 
 SHARES = (0.001, 0.01, 0.1)
 RATE = 100.0

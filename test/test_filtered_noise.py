@@ -1,14 +1,19 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Noise that a filter or rounding shaped passes for no cause, and hides none."""
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
 from diagnosed import described as told
 from diagnosed import log_of, model_of
-from hidden import hide
-from scipy.signal import butter, lfilter
-
 from gyro_calibration.diagnosis.field import field, filtered, work
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.steps import diagnose
@@ -16,6 +21,10 @@ from gyro_calibration.effects import QUANTIZATION
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
+from hidden import hide
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
 
 #: Numerator and denominator.
 FILTERS = {'exponential smoothing': ([0.5], [1.0, -0.5]), 'mean of two': ([0.5, 0.5], [1.0]),

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 What docs/findings.md says of measured recordings is what the program finds in them.
 
@@ -8,14 +18,13 @@ of the width of the interval of the improvement.
 """
 
 import json
+from pathlib import Path
 import re
 import shlex
-from pathlib import Path
-
-import pytest
 
 from gyro_calibration.diagnosis.finding import Estimate
 from gyro_calibration.diagnosis.units import amount, quantity
+import pytest
 
 TEXT = (Path(__file__).parents[1] / 'docs/findings.md').read_text()
 COMMANDS = re.findall(r'^ +gyro_calibration (.+)$', TEXT, re.MULTILINE)

@@ -1,15 +1,24 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The verb fit, as people and other programs call it."""
 
 import json
-import runpy
 from pathlib import Path
-
-import numpy as np
-import pytest
+import runpy
 
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import read_model
+import numpy as np
+import pytest
 
 RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
 Table, SINE = RECOVERY['Table'], RECOVERY['SINE']

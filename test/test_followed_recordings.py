@@ -1,26 +1,35 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Recordings of gyros: calibrated on seconds, followed for minutes, and the errors as stated."""
 
-import math
 from dataclasses import replace
-
-import numpy as np
-import pytest
+import math
 
 from gyro_calibration.compensation import quadratic_form
 from gyro_calibration.doubt import (
-    ASYMMETRY,
     allow_asymmetry,
+    ASYMMETRY,
     look_slower,
     refuse_repeating,
     refuse_useless,
 )
 from gyro_calibration.heading import integrate
 from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, DataRefused, read_log
+from gyro_calibration.log import DataRefused, DEGREE, read_log
 from gyro_calibration.motion import CALIBRATION, from_headings
 from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import Limits, calibrate_bias, self_calibrate
+from gyro_calibration.self_calibration import calibrate_bias, Limits, self_calibrate
 from gyro_calibration.stamps import even_times
+import numpy as np
+import pytest
 
 FOLLOWED = 300.0
 STARTS = (0.0, 290.0, 580.0, 870.0, 1160.0)

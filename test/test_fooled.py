@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Self-calibration: bad runs are refused by name, good ones accepted, and rests check them.
 
@@ -5,19 +15,16 @@ Self-calibration: bad runs are refused by name, good ones accepted, and rests ch
 
 """
 
+from functools import cache
 import json
 import math
+from pathlib import Path
 import runpy
 import time as clock
-from functools import cache
-from pathlib import Path
-
-import numpy as np
-import pytest
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.likelihood import UNLIKELY, Fit, fit_likelihood
-from gyro_calibration.log import DEGREE, DataRefused
+from gyro_calibration.likelihood import Fit, fit_likelihood, UNLIKELY
+from gyro_calibration.log import DataRefused, DEGREE
 from gyro_calibration.mishap import pieces, unit_error
 from gyro_calibration.model import GyroModel
 from gyro_calibration.model_file import write_model
@@ -25,13 +32,15 @@ from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turn
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
 from gyro_calibration.self_calibration import (
+    check_rest,
     Limits,
     Reference,
-    check_rest,
     rest_after,
     self_calibrate,
 )
 from gyro_calibration.whole_turns import calibrate_turns
+import numpy as np
+import pytest
 
 FOOLED = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'fooled.py'))
 WAYS = FOOLED['WAYS']

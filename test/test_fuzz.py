@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Any bytes or arguments: only documented errors are raised, nothing hangs, memory is bounded.
 
@@ -12,17 +22,16 @@ import io
 import itertools
 import json
 import os
+from pathlib import Path
 import random
 import subprocess
 import sys
 import tracemalloc
-from pathlib import Path
 
-import pytest
 from fuzzed import SECONDS, TARGETS, WIRES
-
 from gyro_calibration import cli as verbs
 from gyro_calibration.cli.main import _parser
+import pytest
 
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.

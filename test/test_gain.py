@@ -1,7 +1,14 @@
-"""The stated improvement by an extended model on held-out blocks: the state before, and limits."""
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
 
-import numpy as np
-import pytest
+"""The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
 from gyro_calibration.diagnosis.gain import change_over, gain
 from gyro_calibration.diagnosis.replay import replay
@@ -11,6 +18,8 @@ from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
+import numpy as np
+import pytest
 
 #: Standard deviation of a sample, rad/s, and samples a second.
 WHITE, RATE = 1e-3, 10.0

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Lost samples: how many, what they leave unknown of the heading, and rests across them.
 
@@ -7,19 +17,18 @@ samples, over many drives.
 """
 
 import math
-import runpy
 from pathlib import Path
-
-import numpy as np
-import pytest
+import runpy
 
 from gyro_calibration.gaps import Gaps, Intervals
-from gyro_calibration.heading import BlockIntegrator, Threshold, integrate
+from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
 from gyro_calibration.log import DEGREE, Log, write_log
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.model_file import write_model
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.tracking import HeadingTracker, Settings, track
+import numpy as np
+import pytest
 
 #: Of an Epson XV-3500 (Hong and Park, section 1).
 XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)

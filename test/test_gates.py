@@ -1,14 +1,23 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What keeps gyro and reference from being compared is the only finding, with its remedy."""
 
 from dataclasses import replace
-
-import numpy as np
-import pytest
 
 from gyro_calibration.diagnosis.gates import gates
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.log import DEGREE, Log
+import numpy as np
+import pytest
 
 TIME = np.arange(0.0, 120.0, 0.01)
 MOTION = 0.6 * np.sin(0.7 * TIME) + 0.3 * np.sin(1.9 * TIME + 1.0) + 0.1 * np.sin(0.11 * TIME)

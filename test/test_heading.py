@@ -1,23 +1,32 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Heading from rates: trapezoid rule, threshold filter, and a variance that Monte Carlo checks."""
 
 import math
 
-import numpy as np
-import pytest
-
 from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
 from gyro_calibration.heading import (
     BlockIntegrator,
-    Threshold,
-    ThresholdFilter,
     filter_rates,
     integrate,
+    Threshold,
+    ThresholdFilter,
 )
 from gyro_calibration.log import CACHED, DEGREE
 from gyro_calibration.model import GyroModel, SelfCalibration
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.tracking import HeadingTracker, Settings
+import numpy as np
+import pytest
 
 INTERVAL = 0.01
 XV3500 = Noise(2.5 * DEGREE / 60)

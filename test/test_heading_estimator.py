@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 The heading on a robot, sample by sample: rests, temperature, earlier runs, and stamp jumps.
 
@@ -5,14 +15,11 @@ The gyro is simulated with the noise of the XV-3500 at 25 Hz.
 
 """
 
-import math
 from dataclasses import replace
 from datetime import datetime, timezone
+import math
 
-import numpy as np
-import pytest
-
-from gyro_calibration.assumptions import Assumptions, Way, assumed, sensitive, uncertain
+from gyro_calibration.assumptions import assumed, Assumptions, sensitive, uncertain, Way
 from gyro_calibration.bias_table import BiasTable, Entry, Prior
 from gyro_calibration.compensation import covariance, rate_sensitivity
 from gyro_calibration.effects import BIAS, BIAS_TEMPERATURE, RATE_RAMP
@@ -22,6 +29,8 @@ from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.ros.health_monitor import changed
 from gyro_calibration.tracking import Settings
+import numpy as np
+import pytest
 
 INTERVAL, NOW = 0.04, 1.7e9
 NOISE = Noise(2.5 * DEGREE / 60, 18 * DEGREE / 3600)

@@ -1,10 +1,16 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The diagnosis by a course over ground: gaps, side slip, fixes and another clock."""
 
 from dataclasses import replace
-
-import numpy as np
-import pytest
-from scipy.signal import lfilter
 
 from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.report import report
@@ -13,6 +19,9 @@ from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.effects import BIAS
 from gyro_calibration.log import DEGREE, Log
 from gyro_calibration.model import GyroModel, Term
+import numpy as np
+import pytest
+from scipy.signal import lfilter
 
 RATE, BIAS_TRUE, SCALE, DELAY = 25.0, 0.3 * DEGREE, 0.004, 0.4
 

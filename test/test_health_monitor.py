@@ -1,17 +1,26 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The live health monitor on simulated gyros: its false alarm rate at rest and its detections."""
 
-import math
 from dataclasses import replace
-
-import numpy as np
-import pytest
+import math
 
 from gyro_calibration.allan import even_record, fit_noise
 from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.model import SelfCalibration
 from gyro_calibration.motion import ROBOT
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import STRETCH, HealthMonitor, changed, examine, step_of
+from gyro_calibration.ros.health_monitor import changed, examine, HealthMonitor, step_of, STRETCH
+import numpy as np
+import pytest
 
 INTERVAL = 0.02
 MEMS = Noise(1e-4, 3e-5, 2e-6)
@@ -81,7 +90,7 @@ def test_a_check_of_a_day_at_rest_is_silent():
 
 
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
-def test_three_times_the_noise_is_found_in_one_stretch_where_rest_was_promised_and_in_three_otherwise(noise):
+def test_three_times_the_noise_is_found_in_one_promised_rest_or_three_others(noise):
     outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
     assert 'the noise at rest is 3.' in fed(HealthMonitor(noise, 0.001), outputs[:2],
                                             promised=True).noise_alarm.replace('2.9', '3.0')

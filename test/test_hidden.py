@@ -1,33 +1,43 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The generator of hidden effects: its noise, physics, sizes, and independence of the package."""
 
 import ast
 import math
-import secrets
 from pathlib import Path
+import secrets
 
-import numpy as np
-import pytest
 from hidden import (
-    DETECTABLE,
-    FORMS,
-    KINDS,
-    OUTSIDE,
-    TWINS,
-    NoiseFigures,
     described,
+    DETECTABLE,
     draw_gyro,
+    FORMS,
     hide,
+    KINDS,
+    NoiseFigures,
     oracle_gain,
+    OUTSIDE,
     part,
     record,
     session,
     twin,
+    TWINS,
 )
-from hidden.effects import COUNTED, STEPPED, UNIT_FACTORS, errors
+from hidden.effects import COUNTED, errors, STEPPED, UNIT_FACTORS
 from hidden.filters import lag
 from hidden.log import ALL
-from hidden.noise import Whitening, divergence, draw_figures, make, processes
+from hidden.noise import divergence, draw_figures, make, processes, Whitening
 from hidden.size import Metric
+import numpy as np
+import pytest
 
 FOLDER = Path(__file__).parent / 'hidden'
 COARSE = {'duration': 300.0, 'sample_rate': 20.0}

@@ -1,12 +1,21 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Channels with memory: against exact responses, and equal for a stream, a log, and its blocks."""
 
 import time as clock
 
+from gyro_calibration.history import channels_of, History
+from gyro_calibration.log import Log
 import numpy as np
 import pytest
-
-from gyro_calibration.history import History, channels_of
-from gyro_calibration.log import Log
 
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
 LAGS = [('temperature', 0.01), ('temperature', 20.0), ('temperature', 3000.0),

@@ -1,26 +1,35 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Hygiene: faults are found at stated sizes, good records pass, and useless ones are refused."""
 
+from dataclasses import replace
 import math
 import os
 import re
-from dataclasses import replace
-
-import numpy as np
-import pytest
-from hidden.log import hide
 
 from gyro_calibration.diagnosis.codes import codes_of
 from gyro_calibration.diagnosis.compared import compare
 from gyro_calibration.diagnosis.door import refuse, rests
 from gyro_calibration.diagnosis.factors import FACTORS, unit_of_offset, unit_of_scale
-from gyro_calibration.diagnosis.hygiene import LEVEL, encoder_step, inspect, update_interval
+from gyro_calibration.diagnosis.hygiene import encoder_step, inspect, LEVEL, update_interval
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.stuck import stuck_samples
 from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import COLUMNS, DEGREE, DataRefused, Log, read_log
+from gyro_calibration.log import COLUMNS, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.stamps import number_stamps
+from hidden.log import hide
+import numpy as np
+import pytest
 
 INTERVAL = 0.01
 WHITE = Noise(1e-4)
@@ -104,8 +113,7 @@ CLEAN = {'white': lambda generator: swing(generator),
          'fine codes': lambda generator: coarse(swing(generator), 0.1 * SIGMA),
          'at rest': lambda generator: replace(swing(generator, scale=0.0), reference_rate=None,
                                               moving=np.zeros(6000)),
-         'late stamps': lambda generator: late(swing(generator), generator),
-}
+         'late stamps': lambda generator: late(swing(generator), generator)}
 
 
 @pytest.mark.parametrize('kind', CLEAN)
@@ -428,8 +436,7 @@ REFUSED = {
                                      'of other units, or of another gyro'),
     'noise in deg': (replace(GOOD, output=GOOD.output - 1.01 * GOOD.reference_rate,
                              reference_rate=None),
-                     GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk'),
-}
+                     GyroModel(noise=Noise(1e-4 / DEGREE)), 'times the angle random walk')}
 
 
 @pytest.mark.parametrize('log, model, reason', REFUSED.values(), ids=REFUSED)
@@ -466,8 +473,7 @@ RECORDINGS = {
                                                'reference_quantization'],
     'mems_encoder_turntable/pitch_slow.csv.gz': ['dropped_samples', 'reference_quantization'],
     'mems_static/mpu6050_host_clock.csv.gz': [], 'mems_motion_capture/fast.csv.gz': [],
-    'fog_rate_table/table.csv': [],
-}
+    'fog_rate_table/table.csv': []}
 
 
 @pytest.mark.parametrize('name', RECORDINGS)

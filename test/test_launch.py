@@ -1,10 +1,20 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The launch files: the nodes start, the heading follows the gyro, and all end cleanly."""
 
+from importlib.util import find_spec
+from pathlib import Path
 import random
 import time
 import unittest
-from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
@@ -19,9 +29,9 @@ needs_launch = unittest.skipIf(MISSING, f'{" and ".join(MISSING)} not installed'
 @pytest.mark.launch_test
 def generate_test_description():
     """Start the demo, and the nodes alone in a namespace with a port that does not exist."""
-    import launch_testing.actions
     from launch import LaunchDescription
     from launch.actions import SetEnvironmentVariable
+    import launch_testing.actions
     skip_where_not_installed()
     domain = SetEnvironmentVariable('ROS_DOMAIN_ID', str(DOMAIN))
     nodes = include('gyro.launch.py', {
@@ -40,7 +50,7 @@ def include(name, arguments):
 
 def skip_where_not_installed():
     """Skip where launch would not find the package."""
-    from ament_index_python import PackageNotFoundError, get_package_prefix
+    from ament_index_python import get_package_prefix, PackageNotFoundError
     try:
         get_package_prefix('gyro_calibration')
     except PackageNotFoundError:

@@ -1,12 +1,21 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Listening: each format is recognized from few bytes; noise and a wrong baud match none."""
 
 import math
 import random
 
-import pytest
-
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.listening import BAUDS, recognize
+import pytest
 
 ALL = sorted(PROTOCOLS)
 SETTINGS = {name: Settings() for name in ALL} | {'fizoptika': Settings(sensitivity=1e-6)}

@@ -1,10 +1,17 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Logs as files: their columns, their units, and what is refused, as the log format states."""
 
 import gzip
 import math
-
-import numpy as np
-import pytest
 
 from gyro_calibration.log import (
     Log,
@@ -14,6 +21,8 @@ from gyro_calibration.log import (
     write_log,
     write_log_blocks,
 )
+import numpy as np
+import pytest
 
 DEGREE = math.pi / 180.0
 

@@ -1,19 +1,28 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Compensation of logs with surroundings: in one piece, in blocks, and as a stream."""
 
 from dataclasses import replace
-
-import numpy as np
-import pytest
 
 from gyro_calibration.compensation import covariance, quadratic_form
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.heading import integrate
 from gyro_calibration.history import channels_of
 from gyro_calibration.log import Log, read_log, write_log
-from gyro_calibration.log_compensation import LogCompensation, compensate_log, rows_of
+from gyro_calibration.log_compensation import compensate_log, LogCompensation, rows_of
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.model_file import read_model, write_model
 from gyro_calibration.simulation import respond
+import numpy as np
+import pytest
 
 VALUES = {
     'bias': (0.01,), 'scale_factor_error': (0.02,), 'bias_temperature_rate': (10.0, 0.05),

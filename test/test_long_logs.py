@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Logs of any length: compensate reads them in blocks, with memory independent of the length."""
 
 import itertools
@@ -5,12 +15,11 @@ import math
 import subprocess
 import sys
 
-import numpy as np
-import pytest
-
 from gyro_calibration.cli.main import main
 from gyro_calibration.log import Log, read_log, read_log_blocks, write_log
 from gyro_calibration.motion import ROBOT
+import numpy as np
+import pytest
 
 MODEL = (
     '\neffects:\n  rate_temperature_polynomial:\n'

@@ -1,13 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What the project writes as MCAP is read by others: here by the library mcap."""
 
 import io
 
+from gyro_calibration.driver.mcap_writer import McapWriter
+from gyro_calibration.messages import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
+from gyro_calibration.recording import read_recording
 import numpy as np
 import pytest
-
-from gyro_calibration.driver.mcap_writer import McapWriter
-from gyro_calibration.messages import DEFINITIONS, IMU, RATE_Z, TEMPERATURE, serialize
-from gyro_calibration.recording import read_recording
 
 NOTES = {'recorded by': 'a test', 'gyro': '12°'}
 TIMES = [10**18 + 10**7 * number for number in range(300)]

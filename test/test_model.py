@@ -1,23 +1,32 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Model files: a good one is read as written, a bad one is a ModelError of one sentence."""
 
 import math
 import random
 import tracemalloc
 
-import numpy as np
-import pytest
-import yaml
-
 from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model import (
     GyroModel,
+    same_effects,
     SelfCalibration,
     Term,
-    same_effects,
     with_self_calibration,
 )
 from gyro_calibration.model_file import ModelError, read_model, write_model
 from gyro_calibration.noise import Noise
+import numpy as np
+import pytest
+import yaml
 
 TERMS = (Term(CATALOGUE['bias'], (0.01,)), Term(CATALOGUE['scale_factor_error'], (-0.1,)),
          Term(CATALOGUE['sine_response'], (0.2, 1.0)),
@@ -204,7 +213,7 @@ def test_a_file_cut_off_anywhere_is_a_model_or_refused(tmp_path):
     assert len(read_at) < len(data), 'no cut was refused'
 
 
-JUNK = ['.nan', '-.inf', '1e400', '1' + '0' * 330, 'null', 'true', '[]', '{}', '[[[]]]', '"', '\'',
+JUNK = ['.nan', '-.inf', '1e400', '1' + '0' * 330, 'null', 'true', '[]', '{}', '[[[]]]', '"', "'",
         ':', '\x00', '- ', '&a', '*a', '!!set', '!!binary x', '2024-02-30', '0o9', '0x', '1_0',
         '? ', '%', '\t', '\ufeff', '\n', '~: ~', '<<: 1', '9' * 20, '-1', '1e308', 'abc']
 

@@ -1,21 +1,30 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Motions: the heading is the exact integral of the rate; files are read by their columns."""
 
 import math
 
-import numpy as np
-import pytest
-
 from gyro_calibration.log import DEGREE
 from gyro_calibration.motion import (
     CALIBRATION,
-    NAMED,
-    ROBOT,
-    MotionError,
     from_headings,
     from_rates,
+    MotionError,
+    NAMED,
     read_motion,
+    ROBOT,
     turns,
 )
+import numpy as np
+import pytest
 
 
 @pytest.mark.parametrize('name', NAMED)

@@ -1,19 +1,27 @@
-"""The likelihood over a grid of noise sizes: it is the restricted likelihood, its intervals hold,
-and gaps are long spans."""
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""The restricted likelihood over a grid of noise sizes: its intervals, and gaps as long spans."""
 
 import math
 
-import numpy as np
-import pytest
-
 from gyro_calibration.noise_grid import (
     BandedNoise,
-    SharedNoise,
-    Tridiagonal,
     heading_noise,
     noise_grid,
+    SharedNoise,
+    Tridiagonal,
     wander,
 )
+import numpy as np
+import pytest
 
 DEGREE = math.pi / 180.0
 SCALE, BIAS = 1.01, 0.3 * DEGREE

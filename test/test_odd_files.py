@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Files that are no files, that cannot be opened, that grow without end, or that say odd things.
 
@@ -18,11 +28,8 @@ import subprocess
 import sys
 import tracemalloc
 
-import numpy as np
-import pytest
-
 from gyro_calibration.bias_table import BiasTable, Prior
-from gyro_calibration.files import InputError, explained, plain, reason, write_atomically
+from gyro_calibration.files import explained, InputError, plain, reason, write_atomically
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import Log, LogError, read_log, write_log
 from gyro_calibration.model import GyroModel, SelfCalibration
@@ -32,6 +39,8 @@ from gyro_calibration.noise import Noise
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.storage import Contents, read_messages
 from gyro_calibration.tracking import Settings
+import numpy as np
+import pytest
 
 MODEL = 'effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 1.0e-4}\n'
 ROWS = ''.join(f'{row / 100:.2f},{0.1 * (row % 7)}\n' for row in range(400))

@@ -1,19 +1,28 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The package as installed by colcon and by pip, with data files and programs for `ros2 run`."""
 
 import ast
 import importlib.metadata
 import os
+from pathlib import Path
 import shutil
 import subprocess
 import sys
-import zipfile
-from pathlib import Path
 from xml.etree import ElementTree
+import zipfile
 
 import conftest
-import pytest
-
 import gyro_calibration
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',

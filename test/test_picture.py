@@ -1,10 +1,17 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Pictures: units on every axis, no overlapping texts, and nothing stated by colour alone."""
 
 from dataclasses import replace
 from functools import cache
-
-import numpy as np
-import pytest
 
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.dwells import Dwells, take
@@ -16,7 +23,9 @@ from gyro_calibration.picture import (
     draw_residuals,
     draw_turn_errors,
 )
-from gyro_calibration.turn import SLOWEST, predicted_rates, turn_errors
+from gyro_calibration.turn import predicted_rates, SLOWEST, turn_errors
+import numpy as np
+import pytest
 
 
 def table():

@@ -1,14 +1,19 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What comes of samples, temperatures, wheels and clocks: rates, headings, variances, reports."""
 
-import math
-import re
 from itertools import count
+import math
 from pathlib import Path
-
-import numpy as np
-import pytest
-import yaml
-from rig import INTERVAL, Rig, Robot, rested
+import re
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.history import channels_of
@@ -19,6 +24,10 @@ from gyro_calibration.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import REST
 from gyro_calibration.simulation import respond
+import numpy as np
+import pytest
+from rig import INTERVAL, rested, Rig, Robot
+import yaml
 
 NOISE, BIAS, SLOW = 5e-4, 0.012, 0.04  # rad/√s, rad/s, s between samples
 KNOWN = ('effects: {bias: {bias: 0.01}}\n'
@@ -200,8 +209,7 @@ def test_stamps_that_interleave_are_an_error_and_the_heading_stands(tmp_path, sh
     assert abs(turned) < 0.7 * 0.5, 'half a second at most'
 
 
-def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on_with_a_variance_that_holds(
-        tmp_path):
+def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_path):
     rig = rested(tmp_path, stationary_method='none', robot=Robot(scale_factor_error=0.0, bias=0.0))
     begin = len(rig.outputs) - 1
     rig.publishers = ['/a/driver_node', '/b/driver_node']
@@ -549,8 +557,8 @@ OK, WARN, ERROR = range(3)
     (lambda rig: setattr(rig, 'ros_speed', 0.0), ERROR, 'ROS time stands still'),
     (lambda rig: setattr(rig.robot, 'bias', 1e9), ERROR, 'beyond what this gyro reports'),
 ], ids=['none', 'unplugged', 'stamps', 'publishers', 'clock', 'absurd rates'])
-def test_the_diagnostics_name_what_is_wrong_within_two_seconds(tmp_path, reported, fault, level,
-                                                              words):
+def test_the_diagnostics_name_what_is_wrong_within_two_seconds(
+        tmp_path, reported, fault, level, words):
     rig = rested(tmp_path, ros=1000.0)
     reported(rig)
     fault(rig)

@@ -1,20 +1,29 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The planned motion: feasible, accepted, better than a plain one, and as good as predicted."""
 
+from functools import cache
 import json
 import math
-from functools import cache
-
-import numpy as np
-import pytest
-import yaml
 
 from gyro_calibration.cli.plan import write_motion
 from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DEGREE, DataRefused
-from gyro_calibration.motion import CALIBRATION, ROBOT, from_rates, read_motion, turns
+from gyro_calibration.log import DataRefused, DEGREE
+from gyro_calibration.motion import CALIBRATION, from_rates, read_motion, ROBOT, turns
 from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.plan import Ability, Forecast, _Family, able, best, plain, profile
+from gyro_calibration.plan import _Family, Ability, able, best, Forecast, plain, profile
 from gyro_calibration.self_calibration import self_calibrate
+import numpy as np
+import pytest
+import yaml
 
 XV3500 = Noise(2.5 * DEGREE / 60, 18 * DEGREE / 3600)
 WHITE = Noise(XV3500.angle_random_walk)
@@ -240,7 +249,7 @@ WRONG = {
     'unknown': ({'maximum_speed': 3}, 'maximum_speed'),
     'no acceleration': ({'maximum_acceleration_dps2': 0},
                         'maximum_acceleration_dps2 is 0; wanted a number from 0.01'),
-    'a text': ({'maximum_rate_dps': 'fast'}, 'maximum_rate_dps is \'fast\''),
+    'a text': ({'maximum_rate_dps': 'fast'}, "maximum_rate_dps is 'fast'"),
     'not a number': ({'maximum_rate_dps': math.nan}, 'maximum_rate_dps is nan'),
     'yes': ({'rest_s': True}, 'rest_s is True'),
     'start outside the place': ({'minimum_heading_deg': 10},

@@ -1,12 +1,21 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The KVH 1750: the frame of the manual field by field, the CRC, and the settings."""
 
 import math
 import struct
 
-import pytest
-
-from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import find, Sample, Settings
 from gyro_calibration.driver.protocols.frames import FrameSplitter
+import pytest
 
 #: Interface control document 56-0298, section 5.2.1.
 GOLDEN = bytes.fromhex('FE81FF5537A96A6E38586C1FB75BF862BF803E78BB650D283B0A37AC773D00284BFA34D8')

@@ -1,13 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The wire formats: their bytes on the line, decoding of any bytes, and refused settings."""
 
+from dataclasses import replace
 import math
 import random
 import time
-from dataclasses import replace
 
+from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 import pytest
-
-from gyro_calibration.driver.protocols import PROTOCOLS, Sample, Settings, find
 
 ALL = sorted(PROTOCOLS)
 DPS = math.radians(1.0)

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Recording with real processes: from a port and from topics, interrupted, killed, disk full."""
 
 import contextlib
@@ -5,24 +15,23 @@ import json
 import math
 import multiprocessing
 import os
+from pathlib import Path
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
-
-import numpy as np
-import pytest
-from recordings import rosbags
 
 from gyro_calibration.cli import main as command_line
 from gyro_calibration.cli import record as record_verb
 from gyro_calibration.driver.emulator import Emulator
-from gyro_calibration.driver.protocols import Sample, Settings, find
+from gyro_calibration.driver.protocols import find, Sample, Settings
 from gyro_calibration.log import read_log
-from gyro_calibration.recording import Topics, read_recording
+from gyro_calibration.recording import read_recording, Topics
+import numpy as np
+import pytest
+from recordings import rosbags
 
 RATE = 200.0
 KINDS = ['a.csv', 'a.csv.gz', 'a.mcap']
@@ -84,7 +93,7 @@ class Recording:
 
     @property
     def error(self):
-        """What it has printed on standard error so far."""
+        """Return what it has printed on standard error so far."""
         return self._files[1].read_text()
 
 
@@ -534,10 +543,9 @@ def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
 
 
 def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_domain):
+    from gyro_calibration.ros.recorder_node import RecorderNode
     import rclpy
     from rclpy.clock import ClockType
-
-    from gyro_calibration.ros.recorder_node import RecorderNode
     context = rclpy.Context()
     rclpy.init(args=[], context=context)
     node = RecorderNode([], False, print, context)

@@ -1,25 +1,34 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What is recorded is in the file, whole piece by whole piece: rows of a log, chunks of MCAP."""
 
 import gzip
 from pathlib import Path
 
-import numpy as np
-import pytest
-from recordings import BEGIN, Messages, rosbags
-
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.recorder import (
+    about,
     AtomicAppender,
     CsvRecorder,
     DiskFull,
     McapRecorder,
     MessageLog,
-    about,
 )
 from gyro_calibration.log import LogError, read_log
 from gyro_calibration.messages import IMU, TEMPERATURE
-from gyro_calibration.recording import Topics, read_recording
+from gyro_calibration.recording import read_recording, Topics
 from gyro_calibration.storage import Message
+import numpy as np
+import pytest
+from recordings import BEGIN, Messages, rosbags
 
 TOPICS = {'gyro': '/imu', 'temperature': '/t', 'reference': '/odom'}
 

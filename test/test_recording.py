@@ -1,15 +1,24 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """A measured gyro on a turntable: calibrated on 20 s, its heading follows the encoder 5 min."""
 
 import math
-
-import numpy as np
-import pytest
-from rig import Rig
 
 from gyro_calibration.heading import integrate
 from gyro_calibration.log import DEGREE, read_log
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.wheels import Velocity
+import numpy as np
+import pytest
+from rig import Rig
 
 DURATION = 300.0  # s
 

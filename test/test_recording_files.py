@@ -1,6 +1,17 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """ROS 2 recordings as logs: written by rosbags in each storage, whole, torn and hostile."""
 
 import contextlib
+from dataclasses import replace
 import hashlib
 import json
 import shutil
@@ -8,17 +19,15 @@ import sqlite3
 import struct
 import sys
 import tracemalloc
-from dataclasses import replace
-
-import numpy as np
-import pytest
-import yaml
-from recordings import BEGIN, DELAY, KINDS, Messages, file_of, of_log, write
 
 from gyro_calibration.log import LogError, read_log, write_log
-from gyro_calibration.messages import IMU, LAYOUTS, TEMPERATURE, MessageError, parse, serialize
-from gyro_calibration.recording import Topics, blocks_of, read_recording
+from gyro_calibration.messages import IMU, LAYOUTS, MessageError, parse, serialize, TEMPERATURE
+from gyro_calibration.recording import blocks_of, read_recording, Topics
 from gyro_calibration.storage import is_recording
+import numpy as np
+import pytest
+from recordings import BEGIN, DELAY, file_of, KINDS, Messages, of_log, write
+import yaml
 
 RATE = 100.0
 

@@ -1,9 +1,16 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """A log is laid out for the search whatever its reference lost, and however it was smoothed."""
 
 from dataclasses import replace
-
-import numpy as np
-import pytest
 
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.replay import replay
@@ -11,6 +18,8 @@ from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Log
 from gyro_calibration.model import GyroModel, Term
+import numpy as np
+import pytest
 
 LATE = 0.004
 

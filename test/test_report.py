@@ -1,18 +1,25 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The report of a diagnosis: one self-contained page, opened in a browser, narrow and wide."""
 
 import base64
+from dataclasses import replace
+from html.parser import HTMLParser
 import json
 import os
+from pathlib import Path
 import select
 import signal
 import subprocess
 import time
-from dataclasses import replace
-from html.parser import HTMLParser
-from pathlib import Path
-
-import numpy as np
-import pytest
 
 from gyro_calibration.diagnosis.finding import (
     Change,
@@ -33,6 +40,8 @@ from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.noise import Noise
+import numpy as np
+import pytest
 
 CHROMIUM = Path('/usr/bin/chromium')
 HOSTILE = ('</title></script><script>document.title = "taken"</script><img '
@@ -219,7 +228,7 @@ class Page(HTMLParser):
 
     @property
     def text(self):
-        """What a person can read."""
+        """Return what a person can read."""
         return ' '.join(' '.join(self.texts).split())
 
 

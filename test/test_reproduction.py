@@ -1,23 +1,32 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The sources reproduced: each number equals an independent computation, and verdicts can fail."""
 
 import ast
-import json
-import math
 from dataclasses import replace
 from functools import cache
+import json
+import math
 from pathlib import Path
-
-import numpy as np
-import pytest
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.cli.reproduce import page
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel
 from gyro_calibration.motion import CALIBRATION, ROBOT
-from gyro_calibration.reproduction import SOURCES, bot_thoughts, hong_park
+from gyro_calibration.reproduction import bot_thoughts, hong_park, SOURCES
 from gyro_calibration.reproduction import ojeda_chung_borenstein as ojeda
 from gyro_calibration.reproduction.finding import Comparison
+import numpy as np
+import pytest
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'gyro_calibration/reproduction').glob('*.py'))

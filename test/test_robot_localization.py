@@ -1,15 +1,24 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The robot_localization example has the parameters of that program and the published topics."""
 
 import ast
 import math
-import re
 from pathlib import Path
-
-import pytest
-import yaml
-from rig import INTERVAL, Robot, rested
+import re
 
 from gyro_calibration.log import DEGREE
+import pytest
+from rig import INTERVAL, rested, Robot
+import yaml
 
 CONFIG = Path(__file__).parents[1] / 'config' / 'robot_localization.yaml'
 STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw',

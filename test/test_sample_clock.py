@@ -1,13 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Stamps of simulated gyros with known times: clock errors, bursts, busy hosts, stalls, losses."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numpy as np
-import pytest
-
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import LowerLine, NodeTime, SampleClock
+import numpy as np
+import pytest
 
 BURST = 0.016  # s; latency_timer of an FTDI adapter
 BUFFER = 113  # samples of 36 bytes that a port holds at most

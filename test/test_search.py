@@ -1,21 +1,36 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The search covers all logs, pays for all that it could have found, and bounds each value."""
 
 import math
 
-import numpy as np
-import pytest
 from diagnosed import diagnosis_of, held
-from hidden import hide
-
-from gyro_calibration.diagnosis.candidates import (Candidate, candidates, columns_of, effect,
-                                                   fitted_shapes, with_shape)
-from gyro_calibration.diagnosis.field import Named, field, work
+from gyro_calibration.diagnosis.candidates import (
+    Candidate,
+    candidates,
+    columns_of,
+    effect,
+    fitted_shapes,
+    with_shape,
+)
+from gyro_calibration.diagnosis.field import field, Named, work
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin, evidence_of, searched
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Log
+from hidden import hide
+import numpy as np
+import pytest
 
 NOISE = 1e-3  # rad/s, of a sample
 TIME = np.arange(8000) / 20.0

@@ -1,18 +1,27 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The security policy: it equals what the nodes really have, and none drives unless asked."""
 
 import ast
+from functools import cache
+from pathlib import Path
 import signal
 import subprocess
 import sys
-from functools import cache
-from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
-import yaml
-from rig import rested
-
 import gyro_calibration
+import pytest
+from rig import rested
+import yaml
 
 try:
     from nav_msgs.msg import Odometry
@@ -92,7 +101,7 @@ def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
 def test_yaml_is_read_as_plain_data_at_one_place():
     assert {path.name for path in FILES if 'yaml.load' in names(path)[1]} <= {'settings_file.py'}
     from gyro_calibration import settings_file
-    assert ('yaml.load(read_bytes(path, most).decode(\'utf-8-sig\'), _Loader)'
+    assert ("yaml.load(read_bytes(path, most).decode('utf-8-sig'), _Loader)"
             in Path(settings_file.__file__).read_text())
     assert issubclass(settings_file._Loader, yaml.SafeLoader)
     assert not [tag for tag in settings_file._Loader.yaml_constructors if tag and 'python' in tag]
@@ -300,8 +309,8 @@ def drivers(ros):
     return {info.node_name for info in ros.node.get_publishers_info_by_topic('/cmd_vel')}
 
 
-def test_the_node_is_no_publisher_of_commands_before_it_may_drive(start_node, ros, wait_until,
-                                                                 tmp_path):
+def test_the_node_is_no_publisher_of_commands_before_it_may_drive(
+        start_node, ros, wait_until, tmp_path):
     start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml'})
     put = ros.node.create_client(SetParameters, '/compensation_node/set_parameters')
     assert put.wait_for_service(30.0) and not drivers(ros)

@@ -1,12 +1,18 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The selection of effects: present ones are found, absent ones not, confounded ones reported."""
 
-import runpy
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-import pytest
-from scipy.stats import binom
+import runpy
 
 from gyro_calibration.dwells import join
 from gyro_calibration.effects import (
@@ -17,7 +23,10 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.selection import FALSE_ALARM_RATE, PARTED, TECHNOLOGIES, select_effects
+from gyro_calibration.selection import FALSE_ALARM_RATE, PARTED, select_effects, TECHNOLOGIES
+import numpy as np
+import pytest
+from scipy.stats import binom
 
 BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
 RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))

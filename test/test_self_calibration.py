@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Self-calibration: the paper's two methods, the likelihood fit, and refused data.
 
@@ -5,24 +15,23 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 
 """
 
-import math
 from functools import cache
-
-import numpy as np
-import pytest
+import math
 
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, DataRefused, read_log
+from gyro_calibration.log import DataRefused, DEGREE, read_log
 from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turns
 from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
 from gyro_calibration.self_calibration import (
-    Limits,
     calibrate_bias,
     fit_heading,
     fit_likelihood,
     fit_rate,
+    Limits,
     self_calibrate,
 )
+import numpy as np
+import pytest
 
 #: Hong and Park, section 3.1.3: s = -10 %, b = 0.1 rad/s.
 S, B = -0.1, 0.1
@@ -238,7 +247,7 @@ REFUSED = {
                          'the reference was lost'),
     'one speed': (TIME, run(), ONE_SPEED, 'the profile turns at one speed'),
     'half the motion': (TIME[:1000], run()[:1000], CALIBRATION,
-                        'the samples cover 10.0 s of the profile\'s 20.0 s'),
+                        "the samples cover 10.0 s of the profile's 20.0 s"),
     'not moved': (TIME, run(true=0.0 * RATE), CALIBRATION, 'did the robot move'),
     'wrong sign': (TIME, -run(), CALIBRATION, 'the gyro turns the other way'),
     'another profile': (TIME, run(true=OTHER.rate_at(TIME)), CALIBRATION, ''),

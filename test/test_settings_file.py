@@ -1,13 +1,22 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Settings files: a valid one is read, a hostile one is refused at once, in one sentence."""
 
 import math
 import os
 import time
 
-import pytest
-
 from gyro_calibration.files import read_bytes
 from gyro_calibration.settings_file import read_settings, settings_text
+import pytest
 
 LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n'
                                         for i in range(40))

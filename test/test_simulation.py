@@ -1,7 +1,14 @@
-"""A simulated log is what the model says of the motion, and says so itself."""
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
 
-import numpy as np
-import pytest
+"""A simulated log is what the model says of the motion, and says so itself."""
 
 from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.history import channels_of
@@ -10,6 +17,8 @@ from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import CALIBRATION, ROBOT
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import respond, simulate
+import numpy as np
+import pytest
 
 GYRO = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=Noise(7e-4),
                  reference_temperature=33.0)

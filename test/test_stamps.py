@@ -1,11 +1,20 @@
-"""Stamps that a host gives on arrival: delayed samples are not lost, and lost ones are counted."""
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
 
-import numpy as np
-import pytest
+"""Stamps that a host gives on arrival: delayed samples are not lost, and lost ones are counted."""
 
 from gyro_calibration.diagnosis.hygiene import inspect
 from gyro_calibration.log import Log
 from gyro_calibration.stamps import number_stamps
+import numpy as np
+import pytest
 
 INTERVAL = 0.01
 

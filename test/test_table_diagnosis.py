@@ -1,27 +1,41 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The diagnosis of rate tables: hidden effects are found, absent ones not, limits are stated."""
 
+from dataclasses import replace
 import json
+from pathlib import Path
 import re
 import runpy
-from dataclasses import replace
-from pathlib import Path
-
-import numpy as np
-import pytest
-from scipy.stats import binom
-from scipy.stats import t as student
 
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.diagnosis import dwell_rest
 from gyro_calibration.diagnosis import table as diagnosis
 from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.dwells import join
-from gyro_calibration.effects import (BIAS, CATALOGUE, SCALE_FACTOR_ERROR, STEADY,
-                                      rate_temperature_polynomial)
-from gyro_calibration.log import DEGREE, DataRefused, Log
-from gyro_calibration.model import GyroModel, SelfCalibration, Term, same_effects
+from gyro_calibration.effects import (
+    BIAS,
+    CATALOGUE,
+    rate_temperature_polynomial,
+    SCALE_FACTOR_ERROR,
+    STEADY,
+)
+from gyro_calibration.log import DataRefused, DEGREE, Log
+from gyro_calibration.model import GyroModel, same_effects, SelfCalibration, Term
 from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.scatter import Scatter, rms
+from gyro_calibration.scatter import rms, Scatter
+import numpy as np
+import pytest
+from scipy.stats import binom
+from scipy.stats import t as student
 
 BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
 RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))

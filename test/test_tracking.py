@@ -1,16 +1,25 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Heading with stationary updates: least squares, motion, slow turns, continuity, and variance."""
 
 import math
 
-import numpy as np
-import pytest
-
-from gyro_calibration.drift import HEADING, Turn, begin, smoothed
-from gyro_calibration.heading import Threshold, integrate
+from gyro_calibration.drift import begin, HEADING, smoothed, Turn
+from gyro_calibration.heading import integrate, Threshold
 from gyro_calibration.log import DEGREE
 from gyro_calibration.motion import from_rates, turns
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.tracking import HeadingTracker, Settings, track
+import numpy as np
+import pytest
 
 #: Of an Epson XV-3500 (Hong and Park, section 1).
 XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)

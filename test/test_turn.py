@@ -1,31 +1,40 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """The error of a full turn: by hand, against simulated turns, and as the program reports it."""
 
+from dataclasses import replace
+from functools import partial
 import hashlib
 import json
 import math
 import sys
-from dataclasses import replace
-from functools import partial
-
-import numpy as np
-import pytest
 
 from gyro_calibration.calibration import fit_effects
 from gyro_calibration.compensation import compensate
 from gyro_calibration.dwells import Dwells, dwells, take
 from gyro_calibration.effects import (
     BIAS,
+    rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
-    rate_temperature_polynomial,
 )
 from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, DataRefused, Log, read_log, write_log
+from gyro_calibration.log import DataRefused, DEGREE, Log, read_log, write_log
 from gyro_calibration.model import GyroModel, Term
 from gyro_calibration.motion import from_rates
 from gyro_calibration.noise import Noise
 from gyro_calibration.simulation import simulate
 from gyro_calibration.turn import predicted_rates, size, turn_errors
+import numpy as np
+import pytest
 
 TURN = 2.0 * math.pi
 
@@ -78,7 +87,7 @@ def test_every_sweep_has_its_own_rest_and_one_without_takes_that_of_the_nearest_
     assert '1 of 3 sweeps have none' in errors.remarks[0]
 
 
-def test_without_a_rest_the_error_between_the_slowest_turns_both_ways_stands_for_it_and_it_is_said():
+def test_without_a_rest_the_slowest_turns_both_ways_stand_for_it():
     rates = np.array([-30.0, -10.0, 6.0, 30.0])
     errors = turn_errors(table(rates, 0.3 + 0.01 * rates), table(rates, 0.0 * rates).rate)
     assert errors.static == pytest.approx(TURN * 0.01 * np.sign(rates))
@@ -185,7 +194,7 @@ def test_turns_without_a_rate_by_the_model_are_counted_and_do_not_lend_their_res
     assert '1 turns are left out' in errors.remarks[1]
 
 
-def test_the_measured_gyro_errs_by_less_than_2_percent_and_one_order_of_magnitude_less_with_the_published_polynomial(data):
+def test_the_published_polynomial_takes_the_measured_gyro_from_2_percent_to_a_tenth(data):
     found = dwells(read_log(data / 'fog_rate_table' / 'table.csv'))
     fit = fit_effects(found, (rate_temperature_polynomial(3, 2),))
     kept = fit.scatter.kept

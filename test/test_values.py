@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 No value poisons the state: no catalogue model, finite sample, temperature or stamp.
 
@@ -10,21 +20,20 @@ import json
 import math
 import os
 
-import numpy as np
-import pytest
-
 from gyro_calibration.assumptions import Assumptions
 from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.compensation import compensate
 from gyro_calibration.effects import CATALOGUE, Channels, rate_temperature_polynomial
-from gyro_calibration.heading import Threshold, ThresholdFilter, filter_rates
+from gyro_calibration.heading import filter_rates, Threshold, ThresholdFilter
 from gyro_calibration.heading_estimator import HeadingEstimator
 from gyro_calibration.log import DEGREE, Log, write_log
-from gyro_calibration.log_compensation import LogCompensation, compensate_log
+from gyro_calibration.log_compensation import compensate_log, LogCompensation
 from gyro_calibration.model import GyroModel, SelfCalibration, Term
 from gyro_calibration.noise import Noise, simulate_noise
 from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.tracking import HeadingTracker, Settings
+import numpy as np
+import pytest
 
 hypothesis = pytest.importorskip('hypothesis', reason='hypothesis is not installed')
 st = hypothesis.strategies

@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Logs with hidden effects, made independently of the package: nothing of it is imported here.
 
@@ -17,13 +27,13 @@ Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `like
 """
 
 from hidden.effects import FORMS
-from hidden.log import ALL, Cause, Gyro, HiddenLog, Truth, draw_gyro, hide, record
-from hidden.motion import Session, described, session
+from hidden.log import ALL, Cause, draw_gyro, Gyro, HiddenLog, hide, record, Truth
+from hidden.motion import described, Session, session
 from hidden.noise import KINDS, NoiseFigures
-from hidden.oracle import OracleGain, oracle_gain
+from hidden.oracle import oracle_gain, OracleGain
 from hidden.outside import OUTSIDE
 from hidden.size import DETECTABLE
-from hidden.twins import TWINS, part, twin
+from hidden.twins import part, twin, TWINS
 
 __all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog',
            'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'described', 'draw_gyro', 'hide',

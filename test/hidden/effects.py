@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Physics of the hidden effects, as in the catalogue of effects.
 
@@ -11,16 +21,15 @@ unit ('unit'), on the noise ('noise').
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.stats import norm
+import math
 
 from hidden.filters import lag
 from hidden.motion import Session
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.stats import norm
 
 REFERENCE_TEMPERATURE = 25.0
 REFERENCE_SUPPLY = 5.0

@@ -1,16 +1,25 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What else in the catalogue looks like what is hidden, as far as these recordings can tell."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
+import math
 
-import numpy as np
-
-from hidden.effects import FORMS, WITHOUT_COLUMN, Shapes, errors, top_rate
+from hidden.effects import errors, FORMS, Shapes, top_rate, WITHOUT_COLUMN
 from hidden.motion import Session
 from hidden.noise import NoiseFigures
 from hidden.size import Columns, Metric, thinned
+import numpy as np
 
 #: A slip has any time, and a tone any frequency: enough of them explain anything.
 ANYTHING = {'reference_slip', 'interference_tone'}

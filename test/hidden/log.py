@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 Logs with hidden effects, and the truth about them.
 
@@ -9,22 +19,33 @@ reference alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 import gzip
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from hidden.effects import (COUNTED, FORMS, STEPPED, UNIT_DELAYS, UNIT_FACTORS, WITHOUT_COLUMN,
-                            Form, Shapes, errors, seen, slipped, top_rate)
+from hidden.effects import (
+    COUNTED,
+    errors,
+    Form,
+    FORMS,
+    seen,
+    Shapes,
+    slipped,
+    STEPPED,
+    top_rate,
+    UNIT_DELAYS,
+    UNIT_FACTORS,
+    WITHOUT_COLUMN,
+)
 from hidden.likeness import Likeness
 from hidden.motion import Session, session
-from hidden.noise import NoiseFigures, draw_figures, make
+from hidden.noise import draw_figures, make, NoiseFigures
 from hidden.outside import OUTSIDE
 from hidden.size import DETECTABLE, Metric, solve_noise, solve_size
+import numpy as np
 
 #: Recordings -> name of an effect -> what of it is not to be random.
 Given = Callable[[list[Session]], Mapping[str, Shapes]]
@@ -68,7 +89,7 @@ class Cause:
 
     @property
     def left(self) -> float:
-        """The remaining multiple of an outside effect beside the best three of the catalogue."""
+        """Return what is left of an outside effect beside the best three of the catalogue."""
         return self.multiple * math.sqrt(1.0 - self.likeness_of_three)
 
     @property
@@ -78,7 +99,7 @@ class Cause:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The size under the effect's name, and the shapes."""
+        """Return the size under the effect's name, and the shapes."""
         return {self.name: self.size, **self.shapes}
 
 
@@ -312,6 +333,7 @@ def _draw_saturation(multiple: float, sizing: _Sizing) -> Cause:
     """Solve for the distance of the limit below the largest output; a higher limit shows less."""
     top = (1.0 + sizing.gyro.scale_factor_error) * top_rate(sizing.sessions) + max(
         map(abs, sizing.gyro.biases))
+
     def norm(below: float) -> float:
         return sizing.norm('saturation', top - below, {})
     below = solve_size(norm, DETECTABLE, 1e-3 * top, 0.9 * top)

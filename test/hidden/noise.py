@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 The noise of a hidden gyro, its generation, and the information on an effect in it.
 
@@ -11,13 +21,12 @@ their states over all samples is banded, and so ``x' S^-1 y`` takes one banded C
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-
-import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+import math
 
 from hidden.filters import autoregression
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 #: Between the time constants of the ladder that makes flicker.
 STEP_OF_LADDER = 4.0

@@ -1,12 +1,21 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """What is won by who knows the truth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from hidden.log import HiddenLog
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -20,12 +29,12 @@ class OracleGain:
 
     @property
     def rate(self) -> float:
-        """The share of the rate error that is won, 0 to 1."""
+        """Return the share of the rate error that is won, 0 to 1."""
         return 1.0 - self.rate_after / self.rate_before
 
     @property
     def heading(self) -> float:
-        """The share of the heading error that is won, 0 to 1."""
+        """Return the share of the heading error that is won, 0 to 1."""
         return 1.0 - self.heading_after / self.heading_before
 
 

@@ -1,14 +1,23 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Effects outside the catalogue: a diagnosis must report a remainder, without a name."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+import math
 
-import numpy as np
-
-from hidden.effects import Form, Shapes, _column, _phase, top_rate
+from hidden.effects import _column, _phase, Form, Shapes, top_rate
 from hidden.motion import Session
+import numpy as np
 
 
 def _middle(values: list[np.ndarray]) -> float:

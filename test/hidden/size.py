@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """
 The minimum detectable effect, and the size at a multiple of it.
 
@@ -10,14 +20,13 @@ norm `DETECTABLE`: sqrt(x' S^-1 x - ...).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-
-import numpy as np
-from scipy.optimize import brentq
+import math
 
 from hidden.motion import Session
-from hidden.noise import NoiseFigures, Whitening, divergence
+from hidden.noise import divergence, NoiseFigures, Whitening
+import numpy as np
+from scipy.optimize import brentq
 
 #: Standard deviations: the level corrected for some 31 columns, and the power.
 DETECTABLE = 4.8

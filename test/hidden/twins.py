@@ -1,3 +1,13 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
 """Twins: conditions under which two causes are confounded, and those that distinguish them."""
 
 from __future__ import annotations
@@ -5,12 +15,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from hidden.effects import Shapes
 from hidden.log import Given, HiddenLog, hide, record
 from hidden.motion import Session, session
 from hidden.noise import NoiseFigures
+import numpy as np
 
 
 @dataclass(frozen=True)
