@@ -120,6 +120,7 @@ def test_what_the_catalogue_does_not_have_is_said_to_be_unexplained(name):
     assert found.verdict == 'unexplained' and judged_diagnosis(log, found).right, told(log, found)
 
 
+@pytest.mark.evidence
 def test_random_effects_are_found():
     seed = secrets.randbits(32)
     print(f'seed {seed}')

@@ -71,6 +71,10 @@ def shown(finding):
     return str(quantity(Estimate(size['estimate'], tuple(size['ci95']), size['unit']), name))
 
 
+#: Recordings of 25 min, which take most of a minute each.
+LONG = 'yaw_slow', 'pitch_slow'
+
+
 @pytest.fixture
 def diagnosed(data, run, tmp_path, monkeypatch):
     """Return a function that runs the commands of a recording, and gives what was found."""
@@ -94,7 +98,8 @@ def test_the_tables_are_of_the_recordings_that_are_diagnosed():
     assert RECORDINGS and set(CAUSES) | set(LEFT) | set(GAINS) <= set(RECORDINGS)
 
 
-@pytest.mark.parametrize('recording', RECORDINGS)
+@pytest.mark.parametrize('recording', [
+    pytest.param(name, marks=[pytest.mark.evidence] if name in LONG else []) for name in RECORDINGS])
 def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     found = diagnosed(recording)
     # several of a kind stay in their order
