@@ -99,7 +99,8 @@ def test_the_tables_are_of_the_recordings_that_are_diagnosed():
 
 
 @pytest.mark.parametrize('recording', [
-    pytest.param(name, marks=[pytest.mark.evidence] if name in LONG else []) for name in RECORDINGS])
+    pytest.param(name, marks=[pytest.mark.evidence] if name in LONG else [])
+    for name in RECORDINGS])
 def test_what_is_written_of_a_recording_is_found_in_it(diagnosed, recording):
     found = diagnosed(recording)
     # several of a kind stay in their order
