@@ -23,7 +23,10 @@ from gyro_calibration.model_file import read_model
 from gyro_calibration.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import REST
+from gyro_calibration.ros.wheels import Velocity
 from gyro_calibration.simulation import respond
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from rig import INTERVAL, rested, Rig, Robot
@@ -619,3 +622,41 @@ def test_every_value_has_a_key_in_snake_case_that_the_documents_name(tmp_path, r
     page = (Path(__file__).parents[1] / 'docs' / 'on_a_robot.md').read_text()
     assert [key for key in values if not re.fullmatch('[a-z0-9_]+', key)] == []
     assert [key for key in values if f'`{key}`' not in page] == []
+
+
+# Any values
+
+
+finite = st.floats(allow_nan=True, allow_infinity=True)
+event = st.one_of(
+    st.tuples(st.just('sample'), st.integers(-2 ** 62, 2 ** 62), finite, finite),
+    st.tuples(st.just('temperature'), st.integers(-2 ** 62, 2 ** 62), finite, st.just(0.0)),
+    st.tuples(st.just('odometry'), st.integers(-2 ** 62, 2 ** 62), finite, finite),
+    st.tuples(st.just('command'), st.just(0), finite, finite))
+
+
+@settings(max_examples=60, derandomize=True, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(events=st.lists(event, max_size=20), cubic=st.sampled_from([0.0, 1e-3, -1e-3]))
+def test_no_value_leaves_the_heading_anything_but_a_number(tmp_path, events, cubic):
+    effect = f', cubic_nonlinearity: {{cubic_nonlinearity: {cubic:f}}}}}'
+    rig = Rig(tmp_path, model=KNOWN.replace('}}', '}' + effect, 1))
+    assert not rig.pipeline.store.problem
+    rig.feed(noisy(4.0), SLOW)
+    pipeline, published = rig.pipeline, []
+    for kind, stamp, first, second in events:
+        velocity = Velocity((first, 0.0, 0.0), (0.0, 0.0, second))
+        if kind == 'sample':
+            published.append(pipeline.sample(stamp, first, second))
+        elif kind == 'temperature':
+            pipeline.temperature(stamp, first)
+        elif kind == 'odometry':
+            pipeline.odometry(stamp, first, velocity)
+        else:
+            pipeline.command(velocity)
+        rig.guards()
+    rig.clock.now += 2.0
+    rig.guards()
+    published += rig.feed(noisy(20.0), SLOW)
+    assert published[-1] is not None and math.isfinite(published[-1].heading)
+    assert all(math.isfinite(value) for found in published if found for value in found)
