@@ -101,7 +101,7 @@ def test_equation_8_as_printed_returns_its_unknowns_swapped():
 
 
 STEP = 0.088 * DEGREE
-RUNS = 300
+RUNS = 150
 
 
 @cache
