@@ -12,6 +12,7 @@
 
 import contextlib
 import fcntl
+from importlib import metadata
 import os
 from pathlib import Path
 import random
@@ -58,12 +59,22 @@ _PATIENT = (
 _BY_PATIENT = '<userTransports><transport_id>patient</transport_id></userTransports>'
 
 
+def _is_old():
+    """Tell whether ROS 2 is Jazzy or older: Kilted warns of their variable on standard error."""
+    try:
+        return metadata.version('ros-rclpy').startswith('7.')
+    except metadata.PackageNotFoundError:
+        return os.environ.get('ROS_DISTRO', 'jazzy') in ('humble', 'iron', 'jazzy')
+
+
+_PROFILES_FILE = f'{"FASTRTPS" if _is_old() else "FASTDDS"}_DEFAULT_PROFILES_FILE'
+
+
 def _profile(name, choice='', transport=''):
     """Write a profile of Fast DDS and return the environment that has it used."""
     path = _FOLDER / name
     path.write_text(_PROFILE.format(choice=choice, transport=transport))
-    return {'FASTRTPS_DEFAULT_PROFILES_FILE': str(path),
-            'FASTDDS_DEFAULT_PROFILES_FILE': str(path)}
+    return {_PROFILES_FILE: str(path)}
 
 
 def _prepare_environment():

@@ -350,10 +350,11 @@ class CompensationNode(Node):
 
     def destroy_node(self) -> None:
         """Stop the robot if it is being driven, keep what was learned, and close."""
-        if self._pipeline.session.stop_robot():
-            assert self._velocity is not None
-            self._velocity.wait_for_all_acked(Duration(seconds=1.0))
-        self._pipeline.learn(ending=True)
+        if hasattr(self, '_pipeline'):  # not where a parameter was refused
+            if self._pipeline.session.stop_robot():
+                assert self._velocity is not None
+                self._velocity.wait_for_all_acked(Duration(seconds=1.0))
+            self._pipeline.learn(ending=True)
         super().destroy_node()
 
 

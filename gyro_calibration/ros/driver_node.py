@@ -95,6 +95,8 @@ class DriverNode(Node):
 
     def __init__(self) -> None:
         super().__init__('driver_node')
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name='reader')
         values = declare(self, PARAMETERS)
         self._settings = settings(values)
         self._connection = Connection(
@@ -110,8 +112,6 @@ class DriverNode(Node):
         if self._simulated:
             self.get_logger().warning('use_sim_time is set: stamps follow the simulation, but the '
                                       'gyro on the port turns in real time')
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._work, name='reader')
         self._thread.start()
         call_every(self, _REPORT_INTERVAL, self._diagnostics.now)
         call_every(self, _WATCH_INTERVAL, self._watch)
@@ -119,7 +119,8 @@ class DriverNode(Node):
     def destroy_node(self) -> None:
         """Join the thread, which closes the port, and destroy the node."""
         self._stop.set()
-        self._thread.join()
+        if self._thread.is_alive():  # not where a parameter was refused
+            self._thread.join()
         super().destroy_node()
 
     def _watch(self) -> None:
