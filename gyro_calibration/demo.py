@@ -280,6 +280,7 @@ def calibrate(client: Client, bar: tqdm) -> None:
                 raise
             bar.total += CALIBRATION.duration + 4.0
             bar.write(f'{refusal}; once more', file=sys.stderr)
+            _pass(bar, 2.0)  # until the robot stands
 
 
 def _until(condition: Callable[[], object], timeout: float) -> None:
