@@ -44,8 +44,10 @@ lint = ['ruff', 'mypy', 'pydocstyle', 'flake8', 'flake8-blind-except', 'flake8-b
         'flake8-class-newline', 'flake8-comprehensions', 'flake8-deprecated', 'flake8-docstrings',
         'flake8-import-order', 'flake8-quotes']
 build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-information']
-# launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings
-test = ['pytest<8.4', 'pytest-xdist', 'rosbags', 'mcap>=1.6', *plot, *fuzz, *lint, *build]
+# launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings;
+# mujoco reads what export writes
+test = ['pytest<8.4', 'pytest-xdist', 'rosbags', 'mcap>=1.6', 'mujoco', *plot, *fuzz, *lint,
+        *build]
 
 # Executables belong into lib/<package>, where `ros2 run` and launch look; only the command line
 # has to be on the PATH. setup.cfg says so to colcon and to bloom. pip does not read that: it puts

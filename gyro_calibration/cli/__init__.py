@@ -22,6 +22,7 @@ from gyro_calibration.cli import (
     demo,
     diagnose,
     emulate,
+    export,
     fit,
     plan,
     record,
@@ -31,5 +32,5 @@ from gyro_calibration.cli import (
     turn,
 )
 
-VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, simulate, emulate, record,
-         reproduce, demo)
+VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, simulate, export,
+         emulate, record, reproduce, demo)

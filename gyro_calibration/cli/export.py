@@ -1,0 +1,61 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""The verb export: a model as robot simulators read it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from typing import Any
+
+from gyro_calibration.cli.verb import Answer, degrees_celsius, positive, UsageError, verb
+from gyro_calibration.files import write_atomically
+from gyro_calibration.model_file import read_model
+from gyro_calibration.simulator_export import exported, figures, SIMULATORS
+
+
+def add(verbs: Any) -> argparse.ArgumentParser:
+    parser = verb(verbs, 'export', _export, 'write a model as robot simulators read it',
+                  '--to sdf model.yaml --sample-rate 100')
+    parser.add_argument('model', metavar='MODEL.yaml')
+    parser.add_argument('--to', required=True, choices=SIMULATORS,
+                        help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
+                        'of Isaac Lab; mujoco: a <gyro> sensor of MuJoCo')
+    parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ',
+                        help='of the simulated gyro; default: 100')
+    parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
+                        help='default: the reference temperature of the model')
+    parser.add_argument('--span', type=positive, default=3600.0, metavar='S',
+                        help='the bias wanders as modelled up to this time; default: 3600')
+    parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
+    return parser
+
+
+def _export(given: argparse.Namespace) -> Answer:
+    model = read_model(given.model)
+    if given.span * given.sample_rate < 2.0:
+        raise UsageError(f'--span {given.span:g} is shorter than two samples; give a longer one')
+    temperature = (model.reference_temperature if given.temperature is None
+                   else given.temperature)
+    held, error = figures(model, given.sample_rate, temperature, given.span)
+    text, left_out = exported(held, model, given.to)
+    data = {'to': given.to, 'out': given.out, 'text': text, 'left_out': left_out,
+            'figures': asdict(held), 'allan_deviation_error': error}
+    if given.out is None:
+        return Answer(text.rstrip('\n'), data)
+    write_atomically(given.out, text.encode())
+    lines = [f'written to {given.out}.']
+    if held.wander.density and given.to == 'sdf':
+        lines.append('One Gauss-Markov process stands for the wander of the bias: the Allan '
+                     f'deviation is right to {100.0 * error:.0f} % up to {given.span:g} s.')
+    if left_out:
+        lines += [f'{given.to} does not hold:', *(f'  {each}' for each in left_out)]
+    return Answer('\n'.join(lines), data)
