@@ -20,13 +20,13 @@ Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise p
 Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist
 only in files, wires and the command line, where the name says so: ``gyro_dps``.
 
-Reading order: `log`, `messages`, `storage`, `recording`, `stamps`, `effects`, `history`, `noise`,
-`noise_grid`, `model`, `settings_file`, `model_file`, `motion`, `simulation`, `simulator_export`,
-`compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`, `assumptions`,
-`heading_estimator`, `log_compensation`, `likelihood`, `doubt`, `mishap`, `self_calibration`,
-`whole_turns`, `plan`; then, for the laboratory, `allan`, `dwells`, `scatter`, `calibration`,
-`selection`, `course_over_ground`, `encoder`, `turn`, `diagnosis`, `reproduction`; then the folders
-`driver`, on the robot `ros`, and `cli`.
+Reading order: `columns`, `log`, `messages`, `storage`, `recording`, `stamps`, `effects`,
+`history`, `noise`, `noise_grid`, `model`, `settings_file`, `model_file`, `motion`, `simulation`,
+`simulator_export`, `compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`,
+`assumptions`, `heading_estimator`, `log_compensation`, `likelihood`, `doubt`, `mishap`,
+`self_calibration`, `whole_turns`, `plan`; then, for the laboratory, `allan`, `dwells`, `scatter`,
+`calibration`, `selection`, `course_over_ground`, `encoder`, `turn`, `diagnosis`, `reproduction`;
+then the folders `driver`, on the robot `ros`, and `cli`.
 
 """
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 import gzip
 import io
@@ -32,6 +32,14 @@ import reprlib
 from typing import Any, BinaryIO
 import zlib
 
+from gyro_calibration.columns import (
+    Column,
+    COLUMNS,
+    found_in,
+    is_header,
+    QUANTITIES,
+    suggestion,
+)
 from gyro_calibration.files import (
     GROWN,
     GROWTH,
@@ -68,29 +76,11 @@ _LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
 #: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
 _WHOLE, _TEXT = 1 << 29, 10
 
-#: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
-COLUMNS: Mapping[str, tuple[str, float]] = {
-    'time_s': ('time', 1.0),
-    'gyro_rad_s': ('output', 1.0),
-    'gyro_dps': ('output', DEGREE),
-    'gyro_counts': ('counts', 1.0),
-    'temperature_degc': ('temperature', 1.0),
-    'reference_rate_rad_s': ('reference_rate', 1.0),
-    'reference_rate_dps': ('reference_rate', DEGREE),
-    'reference_heading_rad': ('reference_heading', 1.0),
-    'reference_heading_deg': ('reference_heading', DEGREE),
-    'acceleration_mps2': ('specific_force', 1.0),
-    'supply_v': ('supply', 1.0),
-    'moving': ('moving', 1.0),
-}
-QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
 #: Of a temperature, degC; a value of any other quantity is at most `LARGEST`, in its unit.
 _HOTTEST = 1e5
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
 
 
-#: Quantity -> (place of its column in the file, factor to SI).
-Named = dict[str, tuple[int, float]]
 #: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
 #: that are not ours as text.
 Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
@@ -143,22 +133,29 @@ class Log:
         return 0 if first is None else len(first)
 
 
-def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None) -> Log:
+def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
+             columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
     """
     Read a log file (.csv or .csv.gz).
+
+    Values are parted by commas, or by semicolons or tabs; then the decimal mark may be a comma.
 
     Parameters
     ----------
     path : the file
     sensitivity : rad/s a count; used where the file has raw counts alone
     rate : Hz; the samples came at this rate, whatever the file says of time
+    columns : names of columns that are not those of the log format: time, gyro, counts,
+        temperature, rate, heading, acceleration, supply or moving -> name, or name:unit
+    axis : x, y or z, of columns such as gyro_x_dps
 
     Raises
     ------
     LogError : the file cannot be read, or is not a log; names file, row and column
 
     """
-    blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate)))
+    blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate, columns=columns,
+                                                       axis=axis)))
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
     arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
@@ -180,14 +177,14 @@ def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    rows: int = ROWS,
-                    heard: Callable[[int], object] | None = None) -> Iterator[Log]:
+                    rows: int = ROWS, heard: Callable[[int], object] | None = None,
+                    columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
     """
     Read a log file row by row, and give blocks of it, so that any length needs little memory.
 
     Parameters
     ----------
-    path, sensitivity, rate : as for `read_log`
+    path, sensitivity, rate, columns, axis : as for `read_log`
     rows : of a block, at least 2; the last block has less, and so have those with texts that go
         over several lines
     heard : is told after each block how many bytes of the file are read, if it is not a pipe
@@ -200,17 +197,17 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
     with _refusing(path), opened(path, pipes=True) as file, _reading(file, compressed) as text:
         lines = _lines(text)
-        notes, header, first_line = _head(path, _bounded(lines, _HEAD))
-        named, unfolded = _named_columns(path, header), 0
+        table, first_line = _head(path, _bounded(lines, _HEAD), columns, axis)
+        unfolded = 0
         if rate is not None:
-            named.pop('time', None)
+            table.columns.pop('time', None)
         while block := _block(lines, rows):
             unfolded += sum(map(len, block))
             if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
                 raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log '
                                'does; unpack it if that is what was recorded')
-            places, arrays, others = (_quickly(block, first_line, header, named)
-                                      or _carefully(path, block, lines, first_line, header, named))
+            places, arrays, others = (_quickly(block, first_line, table)
+                                      or _carefully(path, block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
             if rate is not None:
                 arrays['time'] = np.arange(before, count) / rate
@@ -220,7 +217,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if heard is not None and file.seekable():
                 heard(file.tell())
             if count > 1:
-                yield Log(**arrays, notes=notes, others=others)
+                yield Log(**arrays, notes=table.notes, others=others)
     if count < 2:
         raise LogError(f'{path}: {count} rows of data; a log has at least two: record more')
 
@@ -273,34 +270,51 @@ def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
         yield line
 
 
-def _head(path: str | Path, lines: Iterator[str]) -> tuple[tuple[str, ...], list[str], int]:
+@dataclass(frozen=True)
+class _Table:
+    """
+    What the head of a file says of its rows.
+
+    Attributes
+    ----------
+    notes : lines before the header
+    header : names of the columns
+    columns : quantity -> its column
+    delimiter : between values
+
+    """
+
+    notes: tuple[str, ...]
+    header: list[str]
+    columns: dict[str, Column]
+    delimiter: str
+
+    @property
+    def others(self) -> dict[str, int]:
+        """Return the names of columns that are no quantity, each once, with their places."""
+        taken = {column.place for column in self.columns.values()}
+        return {name: index for index, name in enumerate(_distinct(self.header))
+                if index not in taken and self.header[index] not in COLUMNS}
+
+
+def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
+          axis: str) -> tuple[_Table, int]:
     """Take notes and header off the lines, and return them with the number of the next line."""
     notes, line = [], next(lines, '')
     while line.startswith('#'):
         notes.append(line[1:].strip())
         line = next(lines, '')
-    rows = csv.reader(itertools.chain([line], lines))
+    delimiter = max((',', ';', '\t'), key=line.count)
+    rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_unix(name.strip()) for name in next(rows, [])]
-    if not any(name in COLUMNS for name in header):
+    if not is_header(header, columns, axis):
         raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, '
-                       'such as time_s,gyro_dps,temperature_degc')
-    return tuple(notes), header, len(notes) + rows.line_num + 1
-
-
-def _named_columns(path: str | Path, header: list[str]) -> Named:
-    named: Named = {}
-    for index, name in enumerate(header):
-        if name not in COLUMNS:
-            continue
-        quantity, factor = COLUMNS[name]
-        if quantity in named:
-            raise LogError(f'{path}: columns {header[named[quantity][0]]} and {name} both give '
-                           f'the {quantity}; keep one of them')
-        named[quantity] = (index, factor)
-    if not {'output', 'counts'} & set(named):
-        raise LogError(f'{path}: no gyro column among {shown(",".join(header))}; '
-                       'wanted gyro_dps, gyro_rad_s or gyro_counts')
-    return named
+                       f'such as time_s,gyro_dps,temperature_degc{suggestion(header)}')
+    try:
+        found = found_in(header, columns, axis)
+    except InputError as error:
+        raise LogError(f'{path}: {error}') from None
+    return _Table(tuple(notes), header, found, delimiter), len(notes) + rows.line_num + 1
 
 
 def _distinct(header: list[str]) -> list[str]:
@@ -317,32 +331,38 @@ def _distinct(header: list[str]) -> list[str]:
     return names
 
 
-def _quickly(lines: list[str], first_line: int, header: list[str], named: Named) -> Parsed | None:
+def _quickly(lines: list[str], first_line: int, table: _Table) -> Parsed | None:
     """Parse rows of numbers by numpy; None where they hold anything else."""
-    if not all(name in COLUMNS for name in header):
+    if table.others:
         return None
+    if table.delimiter != ',':
+        lines = [line.replace(',', '.') for line in lines]
     try:
-        table = np.loadtxt(lines, delimiter=',', comments=None, ndmin=2)
+        values = np.loadtxt(lines, delimiter=table.delimiter, comments=None, ndmin=2)
     except ValueError:
         return None
-    if table.shape != (len(lines), len(header)) or any(
-            _wrong(table[:, index], quantity).any() for quantity, (index, _) in named.items()):
+    if values.shape != (len(lines), len(table.header)):
         return None
-    arrays: dict[str, Array] = {quantity: table[:, index] * factor
-                                for quantity, (index, factor) in named.items()}
+    arrays: dict[str, Array] = {}
+    for quantity, (index, factor, offset) in table.columns.items():
+        arrays[quantity] = values[:, index] * factor
+        if offset:
+            arrays[quantity] += offset
+        if _wrong(values[:, index], quantity).any():
+            return None
     return range(first_line, first_line + len(lines) + 1), arrays, {}
 
 
 def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
-               header: list[str], named: Named) -> Parsed:
+               table: _Table) -> Parsed:
     """
     Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
 
     A text in quotes may go on in the next line, and so take lines of the rest.
 
     """
-    reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)))
-    places, rows = [first_line], []
+    reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)), delimiter=table.delimiter)
+    places, rows, header = [first_line], [], table.header
     for row in reader:
         if len(row) != len(header):
             raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
@@ -351,11 +371,13 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
         places.append(first_line + reader.line_num)
         if reader.line_num >= len(lines) and len(rows) > 1:
             break
-    columns = list(zip(*rows))
-    arrays = {quantity: _numbers(path, places, header[index], columns[index], quantity) * factor
-              for quantity, (index, factor) in named.items()}
-    return places, arrays, {name: columns[index] for index, name in enumerate(_distinct(header))
-                            if header[index] not in COLUMNS}
+    texts = list(zip(*rows))
+    if table.delimiter != ',':
+        for index, _, _ in table.columns.values():
+            texts[index] = tuple(text.replace(',', '.') for text in texts[index])
+    arrays = {quantity: _numbers(path, places, header[index], texts[index], quantity) * factor
+              + offset for quantity, (index, factor, offset) in table.columns.items()}
+    return places, arrays, {name: texts[index] for name, index in table.others.items()}
 
 
 def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
@@ -412,6 +434,84 @@ def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
     return float(time[-1])
 
 
+def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
+    """
+    Return a log from a pandas DataFrame, or from a mapping of names to arrays.
+
+    Parameters
+    ----------
+    table : its names, when iterated, and under each name an array of shape (n,)
+    columns, axis : as for `read_log`
+
+    Raises
+    ------
+    LogError : no output, arrays of different lengths, values that are no numbers, or a time that
+        does not increase
+
+    """
+    header = [str(name) for name in table]
+    try:
+        found = found_in(header, columns, axis)
+        arrays: dict[str, Any] = {
+            quantity: np.asarray(table[list(table)[index]], float) * factor + offset
+            for quantity, (index, factor, offset) in found.items()}
+    except (TypeError, ValueError) as error:
+        raise LogError(f'the table is no log: {reason(error)}') from None
+    shapes = {values.shape for values in arrays.values()}
+    if len(shapes) > 1 or any(len(shape) != 1 or shape[0] < 2 for shape in shapes):
+        raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
+                       'least two rows')
+    for quantity, values in arrays.items():
+        if (wrong := _wrong(values, quantity)).any():
+            raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].place]} is '
+                           f'{values[np.argmax(wrong)]:g}; remove the row')
+    _refuse_time('the table', range(len(next(iter(arrays.values())))), arrays.get('time'),
+                 -math.inf)
+    return Log(**arrays)
+
+
+def part(log: Log, rows: slice | Mask) -> Log:
+    """Return some rows of a log."""
+    which = np.arange(len(log))[rows]
+    arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES
+                              if getattr(log, name) is not None}
+    others = {name: tuple(texts[place] for place in which) for name, texts in log.others.items()}
+    return replace(log, **arrays, others=others)
+
+
+def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Array, bool]:
+    """
+    Return a heading without its jumps by whole turns.
+
+    Where the reference was lost or is slow, it may turn by more than half a turn from one value to
+    the next. The integral of the gyro gives the number of turns, with its sign and bias against
+    the reference, which are found where the values lie close together.
+
+    Parameters
+    ----------
+    at, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
+    time, output : of the gyro, s and rad/s, shape (n,)
+
+    Returns
+    -------
+    the heading, rad, and whether the gyro had to say by how many turns it went on
+
+    """
+    known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
+    if known.sum() < 2:
+        return heading, False
+    plainly, rates = np.unwrap(wrapped[known]), np.nan_to_num(output)
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
+    turned, steps = np.interp(at[known], time, angle), np.diff(at[known])
+    # as rates, since over a gap the plain change may be anything
+    plain_rate, gyro_rate = np.diff(plainly) / steps, np.diff(turned) / steps
+    sign = -1.0 if np.dot(plain_rate, gyro_rate) < 0.0 else 1.0
+    bias = float(np.median(plain_rate - sign * gyro_rate))
+    expected = sign * turned + bias * at[known]
+    heading[known] = expected + np.unwrap(wrapped[known] - expected)
+    return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
+
+
 def refuse_wrapped(log: Log) -> None:
     """
     Refuse a reference heading that jumps by full turns, as one that is wrapped does.
@@ -430,8 +530,7 @@ def refuse_wrapped(log: Log) -> None:
     if len(jumps):
         raise DataRefused(
             f'the reference heading jumps by a full turn from one sample to the next, the first '
-            f'time at {time[jumps[0] + 1]:.3f} s; it must be continuous: add or take off 360 deg '
-            'from each jump on, as numpy.unwrap does with rad')
+            f'time at {time[jumps[0] + 1]:.3f} s; it must be continuous: use --unwrap')
 
 
 def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:

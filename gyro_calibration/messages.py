@@ -20,7 +20,7 @@ then only numbers of eight bytes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import struct
 
 from gyro_calibration.log import Number
@@ -63,7 +63,7 @@ class Layout:
 
 _QUATERNION_OF_POSE = (3, 4, 5, 6)
 
-#: Kind -> layout. A heading comes of four numbers, the quaternion x, y, z, w.
+#: Kind -> layout, of an Imu for z. A heading comes of four numbers, the quaternion x, y, z, w.
 LAYOUTS: Mapping[str, Layout] = {
     IMU: Layout(0, 37, (0, 1, 2, 3, ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z,
                         FORCE_COVARIANCE)),
@@ -72,6 +72,16 @@ LAYOUTS: Mapping[str, Layout] = {
     POSE: Layout(0, 7, _QUATERNION_OF_POSE),
     TWIST: Layout(0, 6, (5,)),
 }
+
+
+def layout(kind: str, axis: str) -> Layout:
+    """Return the layout of a kind; of an Imu, rate and force about and along an axis are kept."""
+    found = LAYOUTS[kind]
+    if kind != IMU:
+        return found
+    back = 'zyx'.index(axis)
+    kept = tuple(place - back if place in (RATE_Z, FORCE_Z) else place for place in found.kept)
+    return replace(found, kept=kept)
 
 
 def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:

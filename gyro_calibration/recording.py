@@ -26,11 +26,11 @@ import os.path
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.log import Array, Log, LogError, Mask, ROWS
+from gyro_calibration.log import Array, Log, LogError, Mask, ROWS, unwrapped
 from gyro_calibration.messages import (
     heading_of,
     IMU,
-    LAYOUTS,
+    layout,
     MessageError,
     NOT_REPORTED,
     NSEC_PER_SEC,
@@ -72,11 +72,17 @@ _ORIENTATION_VARIANCE, _RATE, _RATE_VARIANCE, _FORCE, _FORCE_VARIANCE = 4, 5, 6,
 
 @dataclass(frozen=True)
 class Topics:
-    """Which topics of a recording are meant; None is the only one, or for the reference none."""
+    """
+    Which topics of a recording are meant; None is the only one, or for the reference none.
+
+    The axis is that of the gyro: x, y or z.
+
+    """
 
     gyro: str | None = None
     reference: str | None = None
     temperature: str | None = None
+    axis: str = 'z'
 
 
 def wrong_kind(role: str, topic: str, kind: str) -> str:
@@ -85,12 +91,16 @@ def wrong_kind(role: str, topic: str, kind: str) -> str:
     return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_listed(kinds, "or")}'
 
 
+def _same(topic: str, other: str | None) -> bool:
+    return topic.strip('/') == (other or '').strip('/')
+
+
 class _Series:
     """Messages of one topic as they come: stamps and times of receiving, ns, and numbers kept."""
 
-    def __init__(self, topic: str, kind: str):
+    def __init__(self, topic: str, kind: str, axis: str):
         self.topic, self.kind, self.damaged = topic, kind, 0
-        self._layout = LAYOUTS[kind]
+        self._layout = layout(kind, axis)
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
     def __len__(self) -> int:
@@ -169,7 +179,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     contents, series = Contents(), dict[str, _Series]()
     for message in read_messages(path, contents, heard):
         if message.topic not in series:
-            series[message.topic] = _Series(message.topic, message.kind)
+            axis = 'z' if _same(message.topic, topics.reference) else topics.axis
+            series[message.topic] = _Series(message.topic, message.kind, axis)
         series[message.topic].add(message)
     log = _Reader(path, topics, contents, series).log(rate)
     for note in log.notes:
@@ -228,7 +239,7 @@ class _Reader:
 
     def _only_imu(self) -> str:
         found = [topic for topic in self._of_kind((IMU,))
-                 if topic.strip('/') != (self._topics.reference or '').strip('/')]
+                 if not _same(topic, self._topics.reference)]
         if len(found) == 1:
             return found[0]
         if found:
@@ -266,7 +277,7 @@ class _Reader:
 
     def _named(self, wanted: str, role: str) -> str:
         topic = next((topic for topic in self._contents.topics
-                      if topic.strip('/') == wanted.strip('/')), None)
+                      if _same(topic, wanted)), None)
         if topic is None:
             raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
                            f'name one of them by {ROLES[role][0]}')
@@ -404,26 +415,9 @@ class _Reader:
         return found
 
     def _continuous(self, at: Array, wrapped: Array, time: Array, output: Array | None) -> Array:
-        """
-        Return a heading without its jumps by whole turns.
-
-        Where the reference was lost or is slow, it may turn by more than half a turn from one
-        value to the next. The integral of the gyro gives the number of turns, with its sign and
-        bias against the reference, which are found where the values lie close together.
-
-        """
-        known = np.isfinite(wrapped)
-        heading = np.full(len(wrapped), np.nan)
-        if known.sum() < 2:
-            return heading
-        plain, rates = np.unwrap(wrapped[known]), np.nan_to_num(np.asarray(output))
-        angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
-        turned, steps = np.interp(at[known], time, angle), np.diff(at[known])
-        sign = -1.0 if np.dot(np.diff(plain), np.diff(turned)) < 0.0 else 1.0
-        bias = float(np.median((np.diff(plain) - sign * np.diff(turned)) / steps))
-        expected = sign * turned + bias * at[known]
-        heading[known] = expected + np.unwrap(wrapped[known] - expected)
-        if np.abs(np.diff(heading[known]) - np.diff(plain)).max() > np.pi:
+        """Return a heading without its jumps by whole turns, and note where the gyro helped."""
+        heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
+        if by_gyro:
             self._notes.append('the reference turned by more than half a turn between two values; '
                                'the gyro says by how much')
         return heading

@@ -58,11 +58,6 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser)
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
                         help='draw the chart, .png or .svg')
-    parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
-                        help='leave out what comes before, s since the first sample: the warm-up, '
-                        'or hands on the gyro')
-    parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
-                        help='leave out what comes after')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model that the '
                         'figures are put in; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
@@ -75,12 +70,7 @@ def _allan(given: argparse.Namespace) -> Answer:
     model, log = read_model(given.model) if given.model else GyroModel(), read(given)
     try:
         time = time_of(given, log)
-        inside = (time - time[0] >= given.begin) & (time - time[0] <= given.end)
-        if not inside.any():
-            raise DataRefused(f'--from {given.begin:g} --to {given.end:g} leaves no sample of '
-                              f'{time[-1] - time[0]:.5g} s')
-        record = even_record(time[inside], output_of(given, log)[inside],
-                             None if log.moving is None else log.moving[inside])
+        record = even_record(time, output_of(given, log), log.moving)
         chart = allan_deviation(record.rate, record.interval,
                                 progress=partial(bar, what='Allan deviation'))
         fit = fit_noise(record.rate, record.interval)

@@ -24,6 +24,7 @@ from typing import Any
 from gyro_calibration.cli.simulate import add_motion, simulated
 from gyro_calibration.cli.verb import (
     add_topics,
+    AS_IT_IS,
     output_of,
     positive,
     read,
@@ -63,7 +64,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--repeat', action='store_true', help='begin again at the end')
     add_topics(parser)
     _add_line(parser)
-    parser.set_defaults(invert=False)
+    parser.set_defaults(**AS_IT_IS)
     return parser
 
 

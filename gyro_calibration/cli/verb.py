@@ -19,14 +19,25 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 import hashlib
 import importlib.util
+import math
 import os
 from pathlib import Path
 import sys
 from typing import Any
 
 from gyro_calibration import __version__
+from gyro_calibration.columns import AXES
 from gyro_calibration.files import InputError, LARGEST, opened, plain
-from gyro_calibration.log import Array, DEGREE, Log, read_log, read_log_blocks
+from gyro_calibration.log import (
+    Array,
+    DataRefused,
+    DEGREE,
+    Log,
+    part,
+    read_log,
+    read_log_blocks,
+    unwrapped,
+)
 from gyro_calibration.model import GyroModel
 from gyro_calibration.recording import blocks_of, read_recording, Topics
 from gyro_calibration.storage import files_of, is_recording
@@ -63,7 +74,24 @@ def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
                         help='deg/s a count, for logs that hold gyro_counts alone')
     parser.add_argument('--invert', action='store_true',
                         help='the gyro counts clockwise turns positive')
+    parser.add_argument('--columns', dest='names', type=columns, default={},
+                        metavar='QUANTITY=NAME:UNIT,...',
+                        help='columns with names of other programs, such as '
+                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; without a unit that of SI')
+    parser.add_argument('--axis', choices=AXES, default='z', help='of the gyro, for columns such '
+                        'as gyro_x_dps and for recordings; default: z')
+    parser.add_argument('--unwrap', action='store_true', help='the reference heading jumps by '
+                        'whole turns; make it continuous')
+    parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
+                        help='leave out what comes before, s since the first sample')
+    parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
+                        help='leave out what comes after')
     add_topics(parser)
+
+
+#: What `read` goes by where a verb has no such options.
+AS_IT_IS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
+                            'begin': 0.0, 'end': math.inf}
 
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
@@ -74,6 +102,15 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
                         'geometry_msgs/PoseStamped or TwistStamped; default: none')
     parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; '
                         'default: the one named most like that of the gyro')
+
+
+def columns(text: str) -> dict[str, str]:
+    """Return quantity -> column, or column:unit, of an argument."""
+    pairs = [each.partition('=')[::2] for each in text.split(',')]
+    if any(not name or not column for name, column in pairs):
+        raise argparse.ArgumentTypeError(f'{text}: wanted QUANTITY=NAME, such as '
+                                         'time=t,gyro=wz:deg/s')
+    return {name.strip(): column.strip() for name, column in pairs}
 
 
 def positive(text: str) -> float:
@@ -115,8 +152,30 @@ def picture_file(text: str) -> str:
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
     log = (_recorded(given) if is_recording(given.log)
-           else read_log(given.log, _sensitivity(given), given.rate))
-    return _turned(given, log)
+           else read_log(given.log, _sensitivity(given), given.rate, given.names, given.axis))
+    if given.unwrap and log.reference_heading is not None:
+        time = time_of(given, log)
+        log = replace(log, reference_heading=unwrapped(
+            time, log.reference_heading, time, output_of(given, log))[0])
+    return _turned(given, next(_inside(given, [log])))
+
+
+def _inside(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
+    """Give logs without what lies outside of --from and --to; at least one has samples."""
+    if given.begin <= 0.0 and given.end == math.inf:
+        yield from logs
+        return
+    begin = found = None
+    for log in logs:
+        time = time_of(given, log)
+        begin = time[0] if begin is None else begin
+        rows = (time - begin >= given.begin) & (time - begin <= given.end)
+        if rows.any():
+            found = log
+            yield part(log, rows)
+    if found is None:
+        raise DataRefused(f'{given.log}: --from {given.begin:g} --to {given.end:g} leaves no '
+                          'sample; look at its times')
 
 
 def say(text: object) -> None:
@@ -154,11 +213,13 @@ def digest(path: Path) -> str:
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     """Read the log that a verb was given block by block, with a bar that shows how far it is."""
-    if is_recording(given.log):
+    if is_recording(given.log) or given.unwrap:
         yield from blocks_of(read(given))
         return
     with _bytes_of(given.log) as heard:
-        for log in read_log_blocks(given.log, _sensitivity(given), given.rate, heard=heard):
+        blocks = read_log_blocks(given.log, _sensitivity(given), given.rate, heard=heard,
+                                 columns=given.names, axis=given.axis)
+        for log in _inside(given, blocks):
             yield _turned(given, log)
 
 
@@ -177,7 +238,7 @@ def _show_place(shown: Any, place: int) -> None:
 
 def _recorded(given: argparse.Namespace) -> Log:
     """Read a recording, and print on standard error what was taken and mended."""
-    topics = Topics(given.topic, given.reference_topic, given.temperature_topic)
+    topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
     with _bytes_of(given.log) as heard:
         return read_recording(given.log, topics, given.rate, heard, say)
 

@@ -113,7 +113,7 @@ def _wrapped(log: Log) -> Gate:
             'wrapped_heading',
             False,
             str(refusal).partition(';')[0],
-            'unwrap the reference heading, as numpy.unwrap does with rad, and diagnose again',
+            'unwrap the reference heading (--unwrap), and diagnose again',
         )
     return Gate('wrapped_heading', True, 'the reference heading is continuous')
 

@@ -1,0 +1,191 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Names and units of the columns of a log.
+
+A name of the log format says quantity and unit. Other names are given by the user, with a unit,
+as `gyro=wz:deg/s`; without one the unit is that of SI.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import difflib
+import math
+import re
+from typing import NamedTuple
+
+from gyro_calibration.files import InputError, plain
+
+_DEGREE = math.radians(1.0)
+
+#: Column name -> (quantity, factor to SI). The order of the quantities is the order of writing.
+COLUMNS: Mapping[str, tuple[str, float]] = {
+    'time_s': ('time', 1.0),
+    'gyro_rad_s': ('output', 1.0),
+    'gyro_dps': ('output', _DEGREE),
+    'gyro_counts': ('counts', 1.0),
+    'temperature_degc': ('temperature', 1.0),
+    'reference_rate_rad_s': ('reference_rate', 1.0),
+    'reference_rate_dps': ('reference_rate', _DEGREE),
+    'reference_heading_rad': ('reference_heading', 1.0),
+    'reference_heading_deg': ('reference_heading', _DEGREE),
+    'acceleration_mps2': ('specific_force', 1.0),
+    'supply_v': ('supply', 1.0),
+    'moving': ('moving', 1.0),
+}
+QUANTITIES = tuple(dict.fromkeys(quantity for quantity, _ in COLUMNS.values()))
+#: Axes of a gyro; the names of columns may say one, such as gyro_x_dps.
+AXES = ('x', 'y', 'z')
+
+_RATES = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
+          'deg/h': _DEGREE / 3600.0}
+_ANGLES = {'rad': 1.0, 'deg': _DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
+#: What a user calls a quantity -> the quantity, and its units: factor to SI, that of SI first.
+_QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
+    'gyro': ('output', _RATES),
+    'counts': ('counts', {'1': 1.0}),
+    'temperature': ('temperature', {'degC': 1.0, 'K': 1.0, 'degF': 5.0 / 9.0}),
+    'rate': ('reference_rate', _RATES),
+    'heading': ('reference_heading', _ANGLES),
+    'acceleration': ('specific_force', {'m/s2': 1.0, 'g': 9.80665, 'mg': 9.80665e-3}),
+    'supply': ('supply', {'V': 1.0, 'mV': 1e-3}),
+    'moving': ('moving', {'1': 1.0}),
+}
+#: Unit -> what is added after its factor, in SI.
+_OFFSETS = {'K': -273.15, 'degF': -160.0 / 9.0}
+#: Quantity as a user calls it -> names that other programs give its column, without case, marks
+#: and the unit.
+_USUAL = {
+    'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',
+    'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|omega|omegaz|angularvelocityz|angvelz|yawrate|gyrorate',
+    'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
+    'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
+    'heading': r'yaw|heading|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
+    'supply': r'vdd|vcc|supply|voltage|volts',
+}
+#: Ends of names that say a unit.
+_ENDS = {'dps': 'deg/s', 'degs': 'deg/s', 'deg': 'deg', 'rads': 'rad/s', 'rad': 'rad',
+         'ms': 'ms', 'us': 'us', 'ns': 'ns'}
+
+
+class Column(NamedTuple):
+    """Where a quantity stands in a file, and how it becomes SI: ``factor * value + offset``."""
+
+    place: int
+    factor: float
+    offset: float = 0.0
+
+
+def found_in(header: Sequence[str], given: Mapping[str, str] = {},
+             axis: str = 'z') -> dict[str, Column]:
+    """
+    Return where each quantity of a log stands.
+
+    Parameters
+    ----------
+    header : names of the columns
+    given : what a user calls a quantity -> name of its column, or name:unit
+    axis : x, y or z; the one that is meant where names say one
+
+    Returns
+    -------
+    quantity -> column
+
+    Raises
+    ------
+    InputError : a quantity, column or unit that there is not, a quantity that stands twice, or no
+        output
+
+    """
+    found = {}
+    for name, text in given.items():
+        if name not in _QUANTITIES:
+            raise InputError(f'{name} is no quantity of a log; wanted one of '
+                             f'{", ".join(_QUANTITIES)}{_nearest(name, _QUANTITIES)}')
+        quantity, units = _QUANTITIES[name]
+        found[quantity] = _column(header, name, text, units)
+    asked = {column.place for column in found.values()}
+    names: dict[str, str] = {}
+    for index, name in enumerate(header):
+        plain_name = _without_axis(name, axis)
+        if index in asked or plain_name not in COLUMNS:
+            continue
+        quantity, factor = COLUMNS[plain_name]
+        if quantity in found and quantity not in names:
+            continue  # the user named another
+        if quantity in found:
+            raise InputError(f'columns {names[quantity]} and {name} both give the {quantity}; '
+                             'keep one of them')
+        found[quantity], names[quantity] = Column(index, factor), name
+    if not {'output', 'counts'} & set(found):
+        raise InputError(f'no gyro column among {plain(",".join(header)[:100])}; '
+                         f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggestion(header)}')
+    return found
+
+
+def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, float]) -> Column:
+    """Return the column that a user names, with or without a unit."""
+    column, unit = text, next(iter(units))
+    if text not in header and ':' in text:
+        column, _, unit = text.rpartition(':')
+    if unit not in units:
+        raise InputError(f'{name}={text}: {unit} is no unit of it; wanted one of '
+                         f'{", ".join(units)}')
+    if column not in header:
+        raise InputError(f'{name}={text}: there is no column {column} among '
+                         f'{plain(",".join(header)[:100])}{_nearest(column, header)}')
+    return Column(header.index(column), units[unit], _OFFSETS.get(unit, 0.0))
+
+
+def _without_axis(name: str, axis: str) -> str:
+    """Return the name of a column of the axis without it: gyro_dps for gyro_z_dps."""
+    first, _, rest = name.partition(f'_{axis}_')
+    return f'{first}_{rest}' if rest and first in ('gyro', 'acceleration') else name
+
+
+def is_header(header: Sequence[str], given: Mapping[str, str], axis: str) -> bool:
+    """Tell whether a row holds at least one name of a column."""
+    named = {text for name in given.values() for text in (name, name.rpartition(':')[0])}
+    return any(name in named or _without_axis(name, axis) in COLUMNS for name in header)
+
+
+def suggestion(header: Sequence[str]) -> str:
+    """Return how a user would name the columns of a header, or rename one; '' for no idea."""
+    wanted = []
+    for quantity, pattern in _USUAL.items():
+        for name in header:
+            letters, unit = _letters_and_unit(name, _QUANTITIES[quantity][1])
+            if re.fullmatch(pattern, letters):
+                wanted.append(f'{quantity}={name}{unit}')
+                break
+    if any(each.startswith('gyro=') for each in wanted):
+        return f'; perhaps --columns {",".join(wanted)} is meant'
+    for name in header:
+        if close := difflib.get_close_matches(name, COLUMNS, 1, 0.8):
+            return f'; perhaps {close[0]} is meant by {plain(name[:100])}'
+    return ''
+
+
+def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
+    """Return the letters of a name without its unit, and the unit as `:unit`; ''."""
+    letters = re.sub(r'[^a-z]', '', name.lower())
+    for end, unit in _ENDS.items():
+        if unit in units and letters.endswith(end) and len(letters) > len(end):
+            return letters.removesuffix(end), f':{unit}'
+    return letters, ''
+
+
+def _nearest(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
+    close = difflib.get_close_matches(name, names, 1)
+    return f'; perhaps {plain(close[0])} is meant' if close else ''

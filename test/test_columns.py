@@ -1,0 +1,183 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Logs of other programs: their names, units, delimiters, axes and wrapped headings."""
+
+import json
+import math
+
+from gyro_calibration.log import Log, log_from_table, LogError, part, read_log, unwrapped
+import numpy as np
+import pytest
+
+DEGREE = math.pi / 180.0
+
+
+def written(folder, text):
+    path = folder / 'log.csv'
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(('column', 'attribute', 'value'), [
+    ('time=x:ms', 'time', 2e-3), ('time=x:us', 'time', 2e-6), ('time=x:ns', 'time', 2e-9),
+    ('time=x:min', 'time', 120.0), ('time=x', 'time', 2.0), ('rate=x:deg/h', 'reference_rate',
+                                                             2.0 * DEGREE / 3600.0),
+    ('rate=x:dps', 'reference_rate', 2.0 * DEGREE), ('heading=x:deg', 'reference_heading',
+                                                     2.0 * DEGREE),
+    ('heading=x:turn', 'reference_heading', 4.0 * math.pi), ('temperature=x:K', 'temperature',
+                                                             -271.15),
+    ('temperature=x:degF', 'temperature', -150.0 / 9.0), ('acceleration=x:g', 'specific_force',
+                                                          19.6133),
+    ('supply=x:mV', 'supply', 2e-3), ('moving=x', 'moving', 2.0), ('counts=x', 'counts', 2.0)])
+def test_a_column_is_converted_from_the_unit_that_the_user_names(tmp_path, column, attribute,
+                                                                 value):
+    name, _, text = column.partition('=')
+    log = read_log(written(tmp_path, 'wz,x\n1,1\n2,2\n'),
+                   columns={name: text, 'gyro': 'wz:deg/s'})
+    assert getattr(log, attribute)[1] == pytest.approx(value, rel=1e-12)
+    np.testing.assert_allclose(log.output, [DEGREE, 2.0 * DEGREE])
+
+
+def test_a_named_column_goes_before_one_of_the_format_and_the_rest_is_kept(tmp_path):
+    log = read_log(written(tmp_path, 'time_s,gyro_dps,wz,note\n0,5,1,a\n1,5,2,b\n'),
+                   columns={'gyro': 'wz'})
+    assert log.output.tolist() == [1.0, 2.0] and log.others == {'note': ('a', 'b')}
+    assert log.time.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize('text', [
+    'time_s;gyro_dps\n0,0;1,5\n0,5;-2,5\n', 'time_s;gyro_dps;place\n0,0;1,5;a,b\n0,5;-2,5;c\n',
+    'time_s\tgyro_dps\n0.0\t1.5\n0.5\t-2.5\n', 'time_s;gyro_dps\n0.0;1.5\n0.5;-2.5\n'])
+def test_semicolons_tabs_and_decimal_commas_are_understood(tmp_path, text):
+    log = read_log(written(tmp_path, text))
+    assert log.time.tolist() == [0.0, 0.5]
+    np.testing.assert_allclose(log.output, [1.5 * DEGREE, -2.5 * DEGREE])
+    assert log.others in ({}, {'place': ('a,b', 'c')})
+
+
+@pytest.mark.parametrize(('axis', 'rate', 'force'), [('x', 1.0, 7.0), ('y', 2.0, 8.0),
+                                                     ('z', 3.0, 9.0)])
+def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
+    names = [f'{name}_{each}' for name in ('gyro', 'acceleration') for each in 'xyz']
+    names = [f'{name}_{"rad_s" if name.startswith("gyro") else "mps2"}' for name in names]
+    log = read_log(written(tmp_path, f'{",".join(names)}\n' + 2 * '1,2,3,7,8,9\n'), axis=axis)
+    assert log.output[0] == rate and log.specific_force[0] == force
+
+
+@pytest.mark.parametrize(('header', 'columns', 'wanted'), [
+    ('t,wz,yaw', {}, '--columns time=t,gyro=wz,heading=yaw'),
+    ('timestamp_ms,gyro_z_degs,yaw_deg,temp', {},
+     '--columns time=timestamp_ms:ms,gyro=gyro_z_degs:deg/s,temperature=temp,heading=yaw_deg:deg'),
+    ('time_s,gyro_dsp', {}, 'gyro_dps is meant by gyro_dsp'),
+    ('time_s,wz', {}, '--columns gyro=wz is meant'),
+    ('time_s,wz', {'gyro': 'wzz'}, 'there is no column wzz among time_s,wz; perhaps wz is meant'),
+    ('time_s,wz', {'gyro': 'wz:deg/min'}, 'deg/min is no unit of it; wanted one of rad/s, deg/s'),
+    ('time_s,wz', {'giro': 'wz'}, 'giro is no quantity of a log; wanted one of time, gyro'),
+    ('a,b', {}, 'is no header')])
+def test_wrong_names_are_answered_with_the_nearest_right_ones(tmp_path, header, columns, wanted):
+    row = ','.join('1' for _ in header.split(','))
+    with pytest.raises(LogError) as found:
+        read_log(written(tmp_path, f'{header}\n{row}\n{row}\n'), columns=columns)
+    assert wanted in str(found.value) and 'log.csv' in str(found.value)
+
+
+def test_the_suggestion_is_one_that_works(run, tmp_path):
+    path = written(tmp_path, 't_ms,wz_dps\n' + ''.join(f'{10 * row},1.5\n' for row in range(99)))
+    code, _, error = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
+                         tmp_path / 'o.csv')
+    assert code == 2
+    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.0}}')
+    code, _, error = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
+                         tmp_path / 'o.csv')
+    names = error.partition('--columns ')[2].split()[0]
+    code, text, _ = run('compensate', path, '--model', tmp_path / 'm.yaml', '--out',
+                        tmp_path / 'o.csv', '--columns', names)
+    assert code == 0
+    assert read_log(tmp_path / 'o.csv').output[0] == pytest.approx(1.5 * DEGREE)
+
+
+@pytest.mark.parametrize('verb', ['compensate', 'allan'])
+def test_a_part_of_a_log_is_taken(run, tmp_path, verb):
+    path = written(tmp_path, 'time_s,gyro_dps\n' + ''.join(
+        f'{100 + 0.01 * row:.2f},{1.0 if row < 500 else 0.001 * (row % 7)}\n'
+        for row in range(3000)))
+    (tmp_path / 'm.yaml').write_text('effects: {bias: {bias: 0.0}}')
+    out = ['--model', tmp_path / 'm.yaml', '--out', tmp_path / 'o.csv']
+    code, _, _ = run(verb, path, '--from', 5, '--to', 20, *(out if verb == 'compensate' else []))
+    assert code == 0
+    if verb == 'compensate':
+        time = read_log(tmp_path / 'o.csv').time
+        assert time[0] == 105.0 and time[-1] == 120.0 and len(time) == 1501
+    code, _, error = run(verb, path, '--from', 50, *(out if verb == 'compensate' else []))
+    assert code == 1 and 'leaves no sample' in error
+
+
+def test_an_unwrapped_heading_is_the_true_one(run, tmp_path):
+    time = np.arange(0.0, 30.0, 0.02)
+    rate = 2.0 * np.sin(0.5 * time) + 1.0
+    heading = time - 4.0 * np.cos(0.5 * time)
+    wrapped = np.angle(np.exp(1j * heading))
+    wrapped[::7] = np.nan
+    found, _ = unwrapped(time, wrapped, time, rate)
+    known = np.isfinite(wrapped)
+    np.testing.assert_allclose(found[known] - found[1], heading[known] - heading[1], atol=1e-9)
+    assert np.isnan(found[~known]).all()
+    noisy = rate + np.random.default_rng(1).normal(0.0, 0.01, len(rate))
+    rows = '\n'.join(f'{a:.2f},{b:.9f},{math.degrees(c):.9f}'
+                     for a, b, c in zip(time, noisy, wrapped))
+    path = written(tmp_path, f't,w,yaw\n{rows}\n')
+    arguments = ('diagnose', path, '--columns', 'time=t,gyro=w,heading=yaw:deg')
+    code, text, _ = run(*arguments)
+    assert code == 0 and '--unwrap' in text
+    code, text, error = run(*arguments, '--unwrap', '--json')
+    assert code == 0, error
+    answer = json.loads(text)
+    assert answer['verdict'] != 'mismatched'
+
+
+def test_over_a_gap_the_gyro_says_by_how_many_turns_the_heading_went_on():
+    time = np.arange(0.0, 20.0, 0.01)
+    heading = 3.0 * time + 4.0 * np.sin(time)
+    wrapped = np.where((time > 5.0) & (time < 8.0), np.nan, np.angle(np.exp(1j * heading)))
+    rate = 3.0 + 4.0 * np.cos(time) + 0.02
+    found, by_gyro = unwrapped(time, wrapped, time, rate)
+    known = np.isfinite(wrapped)
+    assert by_gyro and not unwrapped(time[:500], wrapped[:500], time[:500], rate[:500])[1]
+    np.testing.assert_allclose(found[known] - found[0], heading[known] - heading[0], atol=1e-9)
+
+
+def test_a_table_of_arrays_is_a_log():
+    table = {'t': [0.0, 1.0, 2.0], 'w': np.array([1.0, 2.0, 3.0])}
+    log = log_from_table(table, {'time': 't:ms', 'gyro': 'w:deg/s'})
+    assert isinstance(log, Log) and log.time[1] == 1e-3 and log.output[2] == 3.0 * DEGREE
+
+
+def test_a_data_frame_is_a_log():
+    pandas = pytest.importorskip('pandas')
+    log = log_from_table(pandas.DataFrame({'time_s': [0.0, 1.0], 'gyro_rad_s': [1.0, 2.0]}))
+    assert log.output.tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(('table', 'wanted'), [
+    ({'w': [1.0, 2.0]}, 'no gyro column'), ({'gyro_dps': ['a', 'b']}, 'is no log'),
+    ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 2.0, 3.0]}, 'one shape'),
+    ({'gyro_dps': [1.0]}, 'two rows'), ({'gyro_dps': [[1.0], [2.0]]}, 'one shape'),
+    ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 1.0]}, 'does not come after'),
+    ({'gyro_dps': [1.0, math.inf]}, 'remove the row')])
+def test_a_table_that_is_no_log_is_refused_in_a_sentence(table, wanted):
+    with pytest.raises(LogError, match=wanted):
+        log_from_table(table)
+
+
+def test_a_part_holds_all_columns():
+    log = Log(output=np.arange(4.0), time=np.arange(4.0), others={'a': ('w', 'x', 'y', 'z')})
+    found = part(log, log.time > 1.0)
+    assert found.output.tolist() == [2.0, 3.0] and found.others == {'a': ('y', 'z')}
