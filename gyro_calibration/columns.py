@@ -172,7 +172,8 @@ def suggestion(header: Sequence[str]) -> str:
     if any(each.startswith('gyro=') for each in wanted):
         return f'; perhaps --columns {",".join(wanted)} is meant'
     for name in header:
-        if close := difflib.get_close_matches(name, COLUMNS, 1, 0.8):
+        if name not in COLUMNS and (
+                close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
             return f'; perhaps {close[0]} is meant by {plain(name[:100])}'
     return ''
 
