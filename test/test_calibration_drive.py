@@ -149,6 +149,24 @@ def test_ros_time_that_stops_in_mid_run_stops_the_robot_within_half_a_second(tmp
     assert 'ROS time stands still' in message and rig.stopped_after(begin) < 0.5
 
 
+@pytest.mark.parametrize('back', [0.03, 0.5, 10.0])
+def test_commands_go_on_where_ros_time_jumps_back_and_the_stamps_do_not(tmp_path, back):
+    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
+    rig.drive_to()
+    stamp, begin = rig.stamp, rig.clock.now
+    rig.clock.ros -= back
+    rig.stamp = lambda reading: stamp(reading) + round(1e9 * back)
+    rig.go(60.0, lambda: rig.ended)
+    sent = [begin, *(when for when, _ in rig.commands if when > begin)]
+    assert np.diff(sent).max() < 2.5 * Drive.INTERVAL
+
+
+def test_a_robot_at_rest_is_driven_however_large_a_bias_its_rest_has_shown(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True, stationary_threshold=0.0)
+    rig.go(20.0)
+    assert rig.pipeline.obstacle() == ''
+
+
 @pytest.mark.parametrize('speed', [0.25, 1.0, 4.0])
 def test_a_simulation_at_another_speed_is_calibrated(tmp_path, speed):
     rig = rested(tmp_path, robot=Robot(noise=5e-3), calibration_drive=True, ros=1000.0)

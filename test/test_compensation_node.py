@@ -86,6 +86,15 @@ def test_what_is_published(start, ros, wait_until, tmp_path):
     assert gyro.imu[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
+def test_an_orientation_that_is_none_has_no_yaw_and_raises_nothing(ros):
+    from geometry_msgs.msg import Quaternion
+    from gyro_calibration.ros.compensation_node import heading_of
+    turned = Quaternion(z=math.sin(0.3), w=math.cos(0.3))
+    assert heading_of(turned) == pytest.approx(0.6)
+    for value in (1e200, -1.7e308, math.inf, math.nan):
+        heading_of(Quaternion(x=value, y=value, z=value, w=value))
+
+
 def test_names_types_and_qualities_are_those_of_the_documents(start, ros, wait_until):
     from test_layouts import TOPICS
     _, gyro = start()

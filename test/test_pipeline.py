@@ -231,6 +231,25 @@ def test_two_publishers_are_named_and_when_one_leaves_the_heading_goes_on(tmp_pa
     assert abs(error) < 3.0 * deviation, (error, deviation)
 
 
+@pytest.mark.parametrize('reset', [False, True], ids=['', 'reset meanwhile'])
+def test_a_turn_between_two_rests_while_two_publishers_send_is_in_the_variance(tmp_path, reset):
+    rig = rested(tmp_path)
+    begin = len(rig.outputs) - 1
+    rig.publishers = ['/a/driver_node', '/b/driver_node']
+    for step in range(700):
+        if step == 100 and reset:
+            rig.pipeline.reset()
+        if step in (100, 400):
+            rig.robot.command(0.8 * (step == 100))
+        rig.step()
+        rig.pipeline.sample(max(rig.truth) + 4 * 10 ** 6, 0.0)
+    assert rig.pipeline.conflict
+    rig.publishers = ['/a/driver_node']
+    rig.go(5.0)
+    error, deviation = rig.error(begin)
+    assert not rig.pipeline.conflict and 2.0 < abs(error) < 3.0 * deviation, (error, deviation)
+
+
 def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path):
     """Its dead predecessor is listed for up to 20 s; the stamps show that one alone sends."""
     rig = Rig(tmp_path, model='')

@@ -241,7 +241,8 @@ class Drive:
     def command(self) -> float | None:
         """Return the rate to command now, rad/s; None where the last command is young enough."""
         now = self._now()
-        if now < self._due - 0.5 * self.INTERVAL:
+        left = self._due - now  # more than an interval where ROS time has jumped back
+        if 0.5 * self.INTERVAL < left <= 1.5 * self.INTERVAL:
             return None
         if self._due > -math.inf:
             self.command_lateness = max(self.command_lateness, now - self._due)

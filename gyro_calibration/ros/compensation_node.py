@@ -29,6 +29,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
     PoseWithCovarianceStamped,
+    Quaternion,
     Twist,
     TwistStamped,
     TwistWithCovarianceStamped,
@@ -150,9 +151,7 @@ class CompensationNode(Node):
         self._pipeline.temperature(_stamp(message.header), message.temperature)
 
     def _on_odometry(self, message: Odometry) -> None:
-        turned = message.pose.pose.orientation
-        heading = math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y),
-                             1.0 - 2.0 * (turned.y ** 2 + turned.z ** 2))
+        heading = heading_of(message.pose.pose.orientation)
         self._pipeline.odometry(_stamp(message.header), heading, _velocity(message.twist.twist))
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -361,6 +360,13 @@ class CompensationNode(Node):
 def _stamp(header: Any) -> int:
     """Return a stamp in ns."""
     return header.stamp.sec * NSEC_PER_SEC + header.stamp.nanosec
+
+
+def heading_of(turned: Quaternion) -> float:
+    """Return the yaw of an orientation, rad; nan where it has none."""
+    # A power of a large number would raise OverflowError, where a product is inf.
+    return math.atan2(2.0 * (turned.w * turned.z + turned.x * turned.y),
+                      1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z))
 
 
 def _velocity(twist: Twist) -> Velocity:

@@ -201,7 +201,7 @@ class Pipeline:
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
         self.several, self._switches = '', 0
-        self._good = 0.0, 0.0, 0.0
+        self._good = 0.0, 0.0
         self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
     # Time
@@ -377,16 +377,12 @@ class Pipeline:
     def _refuse_all(self, conflict: str) -> None:
         """Use no more samples, and go back to the heading from before the conflict."""
         if not self.conflict:
-            self.estimator.rewind(*self._before())
+            # Nobody knows what is turned until one gyro sends alone: as much as any direction.
+            heading, variance = self._good
+            self.estimator.rewind(heading, variance + math.tau ** 2)
             self.journal.event = conflict
         self.conflict = conflict
         self.session.watch(self.values, 0, conflict=conflict)
-
-    def _before(self) -> tuple[float, float]:
-        """Return the last heading that is known to be good, and its variance of now."""
-        heading, variance, time = self._good
-        fastest = max((abs(rate) for _, rate in self._recent if math.isfinite(rate)), default=0.0)
-        return heading, variance + (fastest * max(self._last - time, 0.0)) ** 2
 
     def publishers(self, names: Sequence[str]) -> None:
         """Take the nodes that publish the samples, a few times a second."""
@@ -401,7 +397,7 @@ class Pipeline:
             self.conflict = ''
         if not self.conflict and not self._switches:
             tracker = self.estimator.tracker
-            self._good = tracker.heading, tracker.variance, self._last
+            self._good = tracker.heading, tracker.variance
 
     def _look_for_switch(self, stamp: int) -> None:
         """
@@ -429,10 +425,10 @@ class Pipeline:
             return 'no sample comes on imu/data_raw: look at the gyro and its driver'
         if self.wheels.moving(now):
             return ('odom or cmd_vel shows that the robot moves: let it stand, and run again')
-        rate = sum(each for _, each in self._recent) / max(len(self._recent), 1)
-        deviation = math.sqrt(self.estimator.tracker.bias[1] ** 2
-                              + self._tracking.threshold.rate ** 2)
-        if abs(rate) > _SIGMAS * deviation:
+        bias, deviation = self.estimator.tracker.bias
+        rate = sum(each for _, each in self._recent) / max(len(self._recent), 1) - bias
+        noise = self.store.model.noise.angle_random_walk / math.sqrt(_LOOKED_BACK)
+        if abs(rate) > _SIGMAS * math.hypot(deviation, noise, self._tracking.threshold.rate):
             return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: let the robot stand, or '
                     'call calibrate_bias first where it does')
         return ''
@@ -468,7 +464,9 @@ class Pipeline:
     def reset(self) -> str:
         """Call this direction zero; return what was done."""
         self.estimator.reset()
-        self._good = 0.0, 0.0, self._last
+        self._good = 0.0, 0.0
+        if self.conflict:  # it goes on turning unseen
+            self.estimator.rewind(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
 
 
