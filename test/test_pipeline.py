@@ -261,11 +261,22 @@ def test_a_driver_that_is_started_again_does_not_stop_the_heading(tmp_path):
     assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
 
 
+@pytest.mark.parametrize('interval', [0.002, 0.005, 0.02, 0.05])
+def test_it_may_go_on_at_another_rate(tmp_path, interval):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(300, 0.5))
+    rig.skip(1.5)
+    rig.publishers = ['/driver_node', '/driver_node']
+    rig.feed(np.full(round(4.0 / interval), 0.5), interval=interval)
+    assert not rig.pipeline.conflict and rig.journal.counts['refused_samples'] == 0
+
+
+@pytest.mark.parametrize('names', [('/a', '/b'), ('/a', '/a')], ids=['two names', 'one name'])
 @pytest.mark.parametrize('offset', [1, 3, 5, 9], ids=lambda offset: f'{offset} ms apart')
-def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offset):
+def test_two_publishers_that_both_send_are_found_by_their_stamps(tmp_path, offset, names):
     rig = Rig(tmp_path, model='')
     rig.feed(np.full(100, 0.5))
-    rig.publishers = ['/a', '/b']
+    rig.publishers = list(names)
     rig.pipeline.publishers(rig.publishers)
     for _ in range(3):
         rig.pipeline.sample(rig.fed + offset * 10 ** 6, 0.0)
@@ -281,7 +292,25 @@ def test_one_jump_back_is_no_conflict(tmp_path):
     assert not rig.pipeline.conflict
 
 
+@pytest.mark.parametrize('stamp', [-1, 2 ** 31 * 10 ** 9, (2 ** 31 - 1) * 10 ** 9 + 2 ** 32])
+def test_a_stamp_that_is_none_of_ros_time_is_refused(tmp_path, stamp):
+    rig = Rig(tmp_path, model='')
+    rig.feed(np.full(10, 0.5))
+    assert rig.pipeline.sample(stamp, 0.5) is None
+    assert 'none of ROS time' in rig.journal.event
+    assert rig.feed([0.5])[0].heading == pytest.approx(0.05, abs=1e-9)
+
+
 # Temperature
+
+
+def test_a_temperature_of_the_future_is_one_of_now(tmp_path):
+    rig = Rig(tmp_path, model=TEMPERATURE_MODEL)
+    rig.feed(np.full(10, 0.5))
+    rig.pipeline.temperature(2_145_916_800 * 10 ** 9, 25.0)
+    assert not rig.pipeline.estimator.temperature_is_lost
+    rig.feed(np.full(1100, 0.5))
+    assert rig.pipeline.estimator.temperature_is_lost
 
 
 TEMPERATURE_MODEL = yaml.safe_dump({

@@ -64,6 +64,8 @@ from std_srvs.srv import Trigger
 #: Between two looks at who is there and whether time goes on, s.
 _WATCH_INTERVAL = 0.2
 _NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
+_UNMEASURED = (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0,
+               UNMEASURED_VARIANCE)
 
 
 class NodeClock:
@@ -183,14 +185,19 @@ class CompensationNode(Node):
         if not math.isfinite(imu.angular_velocity.x + imu.angular_velocity.y + xx + xy + yx + yy):
             imu.angular_velocity.x = imu.angular_velocity.y = xy = yx = 0.0
             xx = yy = UNMEASURED_VARIANCE
+        elif xx < 0.0 or yy < 0.0:
+            xx = yy = UNMEASURED_VARIANCE
+            xy = yx = 0.0
         elif not (xx or yy):  # all zeros: not known
             xx = yy = self._assumed_variance
         imu.angular_velocity_covariance[:] = (xx, xy, 0.0, yx, yy, 0.0, 0.0, 0.0,
                                               found.rate_variance)
-        if not math.isfinite(acceleration.x + acceleration.y + acceleration.z
-                             + sum(imu.linear_acceleration_covariance.tolist())):
+        covariance = imu.linear_acceleration_covariance.tolist()
+        if not math.isfinite(acceleration.x + acceleration.y + acceleration.z + sum(covariance)):
             acceleration.x = acceleration.y = acceleration.z = 0.0
             imu.linear_acceleration_covariance[:] = _NOT_REPORTED
+        elif covariance[0] != NOT_REPORTED and min(covariance[::4]) < 0.0:
+            imu.linear_acceleration_covariance[:] = _UNMEASURED
         half = 0.5 * found.heading
         turned = imu.orientation
         turned.x = turned.y = 0.0

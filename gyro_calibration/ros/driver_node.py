@@ -108,8 +108,7 @@ class DriverNode(Node):
         self._time, self._looked, self._problem = NodeTime(), 0.0, ''
         self._report = DriverReport(self._connection, values.port, self._settings, steady)
         self._diagnostics = Diagnostics(self, 'gyro', self._report.make, values.port)
-        self._simulated = self.get_parameter('use_sim_time').value
-        if self._simulated:
+        if self.get_parameter('use_sim_time').value:
             self.get_logger().warning('use_sim_time is set: stamps follow the simulation, but the '
                                       'gyro on the port turns in real time')
         self._thread.start()
@@ -159,7 +158,7 @@ class DriverNode(Node):
             return
         self._looked = arrival
         step = self._time.watch(*(read or (arrival, self._now())))
-        if step and not self._simulated:
+        if step and not self.get_parameter('use_sim_time').value:
             self._report.add_clock_step(step)
 
     def _now(self) -> float:

@@ -97,6 +97,8 @@ POWER_OFF = 10.0
 _LOOKED_BACK = 0.5
 #: A mean rate is a turn from this number of standard deviations of the bias on.
 _SIGMAS = 4.0
+#: Stamps of ROS time are below it, ns: `builtin_interfaces/Time` has 31 bits for seconds.
+_END_OF_TIME = NSEC_PER_SEC << 31
 #: Stamps that jump back twice within this time, s, are those of several publishers.
 _INTERLEAVED = 1.0
 
@@ -201,6 +203,9 @@ class Pipeline:
         self._last, self._interval = -math.inf, math.inf
         self._newest, self._jumps = 0, deque[float](maxlen=2)
         self.several, self._switches = '', 0
+        # Of a driver that was started again, which may send faster than before: when the last
+        # sample arrived, s, and the longest interval since a silence, ns.
+        self._same_name, self._arrived, self._longest = False, clock.steady(), 0
         self._good = 0.0, 0.0
         self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
@@ -248,8 +253,11 @@ class Pipeline:
     # What comes in
 
     def temperature(self, stamp: int, value: float) -> None:
-        """Take a temperature, degC."""
-        self.estimator.hear_temperature(self._time(stamp), value)
+        """Take a temperature, degC; with a stamp far ahead of the samples it is one of now."""
+        time = self._time(stamp)
+        if time - self._last > TEMPERATURE_TIMEOUT and self._last > -math.inf:
+            time = self._last
+        self.estimator.hear_temperature(time, value)
         refused = self.estimator.refused_temperatures
         if refused > self.journal.counts['refused_temperatures']:
             self.journal.counts['refused_temperatures'] = refused
@@ -287,11 +295,18 @@ class Pipeline:
         """
         counts, journal, now = self.journal.counts, self.journal, self._clock.steady()
         counts['samples'] += 1
+        if not 0 <= stamp < _END_OF_TIME:
+            counts['refused_samples'] += 1
+            journal.event = f'a stamp of {stamp / NSEC_PER_SEC:g} s is none of ROS time; the ' \
+                            'sample is not used'
+            return None
         if stamp < self._newest:
             self._see_jump(now)
         if self.several:
             self._look_for_switch(stamp)
-        self._newest = stamp
+        self._longest = (0 if now - self._arrived > BLIND
+                         else max(self._longest, stamp - self._newest))
+        self._newest, self._arrived = stamp, now
         if self.conflict:
             counts['refused_samples'] += 1
             return None
@@ -389,6 +404,7 @@ class Pipeline:
         self.several = '' if len(names) < 2 else (
             f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), whose '
             'samples cannot be told apart: give each gyro a topic of its own')
+        self._same_name = len(names) > len(set(names)) == 1
         if not self.several:
             self._switches = 0
         if self._switches > 1:
@@ -405,11 +421,13 @@ class Pipeline:
 
         A sample of another one divides an interval, so that one part is at most half of it. A
         driver that was started again sends alone, although the middleware lists its dead
-        predecessor for up to 20 s.
+        predecessor for up to 20 s; it may send at another rate.
 
         """
-        if not (2.0 * (stamp - self._newest)
-                > NSEC_PER_SEC * self.estimator.tracker.intervals.usual):
+        usual = NSEC_PER_SEC * self.estimator.tracker.intervals.usual
+        if self._same_name:
+            usual = min(usual, self._longest)
+        if not 2.0 * (stamp - self._newest) > usual:
             self._switches += 1
         if self._switches > 1:
             self._refuse_all(self.several)
