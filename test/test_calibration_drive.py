@@ -392,6 +392,8 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     success, message = rig.calibrate()
     assert not success and 'this computer was busy: commands were up to 0.' in message
     assert '(the run shows: ' in message
+    commands, samples = rig.session.lateness
+    assert 0.1 < commands < 0.7 and 0.1 < samples < 0.7
 
 
 def test_a_slip_without_load_is_named_as_one(tmp_path):

@@ -285,6 +285,7 @@ class CalibrationSession:
     ----------
     run : the one in progress, or None
     warning : after a run that drove the robot: that it kept turning; ''
+    lateness : of commands and of samples in the last run that drove the robot, at most, s
 
     """
 
@@ -301,7 +302,7 @@ class CalibrationSession:
 
         """
         self.run: Run | None = None
-        self.warning = ''
+        self.warning, self.lateness = '', (0.0, 0.0)
         self._estimator, self._store, self._monitor = estimator, store, monitor
         self._send, self._clock = send, clock
         self._rules = Rules()
@@ -514,6 +515,8 @@ class CalibrationSession:
         except Exception as error:  # the robot stands, the caller hears of it, the node goes on
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:
+            if drive:
+                self.lateness = drive.command_lateness, drive.sample_lateness
             self.run = self._drive = None
 
     def _use(self, run: Run) -> str:

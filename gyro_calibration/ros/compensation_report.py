@@ -104,12 +104,14 @@ class CompensationReport:
         calibration = estimator.model.self_calibration
         age = f'{estimator.age(date) / 3600.0:.2f}' if calibration else ''
         written = '' if store.written is None else f'{(date - store.written) / 60.0:.1f}'
+        commands, samples = pipeline.session.lateness
         return {
             **journal.counts, 'rate_hz': f'{rate:.1f}',
             'longest_gap_s': f'{estimator.tracker.intervals.longest:.3f}',
             'clock_steps': journal.clock_steps, **_heading(estimator), **self._rest(),
             **(calibration.figures() if calibration else {}), 'calibration_age_h': age,
             'calibration_now': estimator.sentence, **_temperatures(estimator),
+            'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
             'refused_calibrations': journal.refused, 'refusals': ' | '.join(journal.reasons),
             'bias_table_entries': len(estimator.table.entries),
             'bias_table_held_back': estimator.table.held_back,
