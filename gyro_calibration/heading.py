@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gyro_calibration.compensation import quadratic_form
-from gyro_calibration.files import LARGEST
-from gyro_calibration.gaps import Gaps
+from gyro_calibration.gaps import FASTEST, Gaps
 from gyro_calibration.log import Array, CACHED, DEGREE
 from gyro_calibration.noise import Noise
 import numpy as np
@@ -74,7 +73,7 @@ class ThresholdFilter:
         return 0.0 if self._stands(time, rate) else rate
 
     def _stands(self, time: float, rate: float) -> bool:
-        rate, begin = min(max(rate, -LARGEST), LARGEST), time - self.settings.window
+        rate, begin = min(max(rate, -FASTEST), FASTEST), time - self.settings.window
         self._newer.append((time, rate))
         self._sum += rate
         self._squares += rate * rate
@@ -129,7 +128,7 @@ def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
     end = np.arange(1, len(rate) + 1)
     begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
     # each window is summed by itself: one large value would ruin a running sum from there on
-    bounded, count, windows = (np.clip(rate, -LARGEST, LARGEST), end - begin,
+    bounded, count, windows = (np.clip(rate, -FASTEST, FASTEST), end - begin,
                                np.stack([begin, end], axis=1).ravel())
     sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
                      for values in (bounded, bounded * bounded))

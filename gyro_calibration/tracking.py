@@ -249,7 +249,8 @@ class HeadingTracker:
         time : stamp, s
         rate : compensated, rad/s
         sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
-        wheels : whether wheels or commands move the robot; None where nobody says so
+        wheels : whether wheels or commands move the robot, or moved it since the last sample; None
+            where that is not known
         still : the sensitivity if the true rate is zero; without it that of the samples serves at
             rest too: their noise then counts as a scale factor error, which is harmless only where
             the scale factor is well known
@@ -270,7 +271,7 @@ class HeadingTracker:
             return ''
         interval = time - last[0]
         if interval < 0.0 or interval > self._settings.maximum_gap:
-            said = self._restart(interval, max(abs(rate), abs(last[1])))
+            said = self._restart(interval, max(abs(rate), abs(last[1])), wheels is not False)
             self.rate = rate - self._off(sensitivity)
             return said
         self._interval, self._reached = interval, time
@@ -480,13 +481,12 @@ class HeadingTracker:
         return (_Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
                 else None)
 
-    def _restart(self, interval: float, fastest: float) -> str:
+    def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
         """
-        Begin anew after a gap or a jump back.
+        Begin anew after a gap or a jump back, over which nothing is integrated.
 
-        Over a gap nothing is integrated, and what may have been turned meanwhile goes into the
-        variance. The stamps do not tell how much time a jump back hides, so nothing is known of a
-        turn in it.
+        Where nothing saw that the robot stood, it may have turned to any direction meanwhile, also
+        from one rest to another. The stamps do not tell how much time a jump back hides.
 
         """
         self._settle()
@@ -497,13 +497,15 @@ class HeadingTracker:
         self._filter.clear()
         self._gaps.clear()
         self._recognize()
-        if interval < 0.0:
-            return f'the stamp jumps back by {-interval:.3f} s'
-        self.intervals.count(interval)
-        self._go_on(replace(self._nothing, duration=interval, lost=(fastest * interval) ** 2,
-                            unseen=True), self._reached)
+        duration = max(interval, 0.0)
+        if interval > 0.0:
+            self.intervals.count(interval)
+        lost = (fastest * duration) ** 2 + unseen * math.tau ** 2
+        self._go_on(replace(self._nothing, duration=duration, lost=lost, unseen=True),
+                    self._reached)
         self._take()
-        return f'no samples for {interval:.3f} s'
+        return (f'no samples for {interval:.3f} s' if interval > 0.0
+                else f'the stamp jumps back by {-interval:.3f} s')
 
     def _settle(self) -> None:
         """Take the state on to the last sample."""

@@ -147,6 +147,23 @@ def test_over_a_gap_that_is_not_integrated_the_variance_holds_what_may_have_been
     assert after.heading_variance > before.heading_variance + (0.2 * 3600.0) ** 2
 
 
+@pytest.mark.parametrize(('wheels', 'odometry', 'known'), [
+    ('none', 0.0, False), ('odom', 0.0, True), ('odom', 0.8, False), ('odom', None, False)],
+    ids=['without wheels', 'wheels that stand', 'wheels that turn', 'without odometry'])
+def test_a_turn_while_the_gyro_is_unplugged_is_in_the_variance(tmp_path, wheels, odometry, known):
+    """It rests before and after, so that the rates beside the gap say nothing of the turn."""
+    rig = Rig(tmp_path, model=KNOWN, wheels=wheels)
+    before = rig.feed(noisy(5.0), SLOW, moving=0.0)[-1]
+    for _ in range(60):
+        rig.skip(0.1)
+        if odometry is not None:
+            rig.pipeline.odometry(rig.fed, 0.0, Velocity(angular=(0.0, 0.0, odometry)))
+    after = rig.feed(noisy(5.0), SLOW, moving=0.0)[-1]
+    assert after.heading == pytest.approx(before.heading, abs=0.01)
+    assert (math.sqrt(after.heading_variance) < 0.05) == known
+    assert known or after.heading_variance > math.tau ** 2
+
+
 # Rest
 
 

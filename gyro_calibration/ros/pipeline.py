@@ -315,13 +315,14 @@ class Pipeline:
             counts['repeated_stamps'] += 1
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
-        if 0.0 < time - self._last <= self.values.maximum_gap:
+        gap = not 0.0 < time - self._last <= self.values.maximum_gap
+        if not gap:
             self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
         if self._was_silent(time, now):
             self.estimator.begin_run(self._clock.date())
         self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
-        return self._use(stamp, time, output, specific_force, now, receivers)
+        return self._use(stamp, time, gap, output, specific_force, now, receivers)
 
     def _see_jump(self, now: float) -> None:
         """Take the second jump back of the stamps within 1 s for those of several publishers."""
@@ -336,10 +337,12 @@ class Pipeline:
         silent = now - self.journal.received > POWER_OFF
         return silent and since < math.inf and not 0.0 < since < POWER_OFF
 
-    def _use(self, stamp: int, time: float, output: float, force: float | None, now: float,
-             receivers: int) -> Output | None:
+    def _use(self, stamp: int, time: float, gap: bool, output: float, force: float | None,
+             now: float, receivers: int) -> Output | None:
         estimator, counts, refused = self.estimator, self.journal.counts, self.estimator.refused
         moving = self.wheels.moving(now, self._sources) if self._sources else None
+        if gap and not moving and not self.wheels.stood(self.journal.received, now, self._sources):
+            moving = None
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:
             counts['refused_samples'] += 1

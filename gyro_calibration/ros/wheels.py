@@ -50,12 +50,17 @@ class Wheels:
     def __init__(self) -> None:
         """Begin with nothing received."""
         self._last: dict[str, tuple[float, Velocity]] = {}
+        # since when a source has shown without a break that the robot stands, s
+        self._standing: dict[str, float] = {}
         self._commanded = -math.inf
 
     def add(self, source: str, velocity: Velocity, now: float) -> None:
         """Take a velocity that came at a time, s; one that is not finite shows nothing."""
         if not velocity.is_finite:
             return
+        then, _ = self._last.get(source, (-math.inf, None))
+        if velocity.moves or now - then > FRESH:
+            self._standing[source] = now
         self._last[source] = now, velocity
         if velocity.moves and source == COMMAND:
             self._commanded = now
@@ -67,6 +72,11 @@ class Wheels:
         if not fresh:
             return None
         return any(fresh) or COMMAND in sources and now - self._commanded < COASTING
+
+    def stood(self, since: float, now: float, sources: Collection[str]) -> bool:
+        """Tell whether one of these sources saw from a time on, s, that the robot stood."""
+        return self.moving(now, sources) is False and any(
+            self._standing[source] <= since for source in sources if source in self._standing)
 
     def turning(self, now: float) -> float:
         """Return the rate about z that odometry shows, rad/s; 0 where none came in time."""
