@@ -11,6 +11,7 @@
 """Layers: imports go one way, ROS 2 stays in the nodes, the core has no I/O and reads no clock."""
 
 import ast
+from functools import cache
 import importlib
 from pathlib import Path
 import re
@@ -28,6 +29,7 @@ ROS = re.compile(r'rclpy|ament_\w+|launch\w*|tf2\w*|rosbag2\w*|rcl_interfaces|\w
 OUTSIDE_WORLD = {'socket', 'serial', 'subprocess', 'time', 'threading', 'random', 'argparse'}
 
 
+@cache
 def imports(path):
     """Return the modules that a file imports, anywhere in it."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
@@ -56,13 +58,11 @@ def calls(path):
     return {function.id for function in functions if isinstance(function, ast.Name)}
 
 
-@pytest.mark.parametrize('module', ORDER)
-def test_a_module_imports_only_what_is_read_before_it(module):
-    known = set(ORDER[:ORDER.index(module)]) | {'files', module}
-    known |= {'demo', 'picture'} if module == 'cli' else set()
-    paths = files(module)
-    assert paths and all(own(imports(path)) <= known for path in paths), [
-        (path.name, own(imports(path)) - known) for path in paths]
+def test_a_module_imports_only_what_is_read_before_it():
+    for place, module in enumerate(ORDER):
+        known = {*ORDER[:place + 1], 'files'} | ({'demo', 'picture'} if module == 'cli' else set())
+        unknown = {path.name: own(imports(path)) - known for path in files(module)}
+        assert unknown and not any(unknown.values()), (module, unknown)
 
 
 @pytest.mark.parametrize('folder', ['effects', 'allan', 'dwells', 'diagnosis', 'driver', 'ros'])
@@ -85,15 +85,14 @@ def test_files_stands_on_nothing():
     assert not own(imports(PACKAGE / 'files.py'))
 
 
-@pytest.mark.parametrize('path', FILES, ids=[str(path.relative_to(PACKAGE)) for path in FILES])
-def test_only_the_nodes_know_ros(path):
-    used = {name for name in imports(path) if ROS.fullmatch(name.split('.')[0])}
-    assert path.name in MAY_USE_ROS or not used
+def test_only_the_nodes_know_ros():
+    users = {path.name for path in FILES for name in imports(path)
+             if ROS.fullmatch(name.split('.')[0])}
+    assert users and users <= MAY_USE_ROS
 
 
-@pytest.mark.parametrize('module', [*CORE, 'files'])
-def test_the_core_only_computes(module):
-    for path in files(module):
+def test_the_core_only_computes():
+    for path in (path for module in [*CORE, 'files'] for path in files(module)):
         roots = {name.split('.')[0] for name in imports(path)}
         assert not re.search(r'\b(now|utcnow|today)\(\)', path.read_text()), path
         assert (not roots & OUTSIDE_WORLD
