@@ -197,13 +197,16 @@ def test_supply_and_source_current_are_reported_and_judged():
     assert float(values['temperature_degc']) == pytest.approx(24.0, abs=0.1)
 
 
-def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of():
+@pytest.mark.parametrize(('given', 'is_warned'), [
+    (Settings(), True), (Settings(sample_rate=250.0), False), (Settings(increments=False), False)])
+def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of(given, is_warned):
     """The unit is set to 250 Hz, and the driver is not: its rates are 4 times too high."""
     world = World(6.0)
     world.gyro('kvh_1750', rate=250.0)
-    level, message, _ = reported(world, 'kvh_1750')[-1]
-    assert (level == WARN and '250 samples a second are not the 1000 by which angles are made '
-            'rates: set sample_rate' in message)
+    level, message, _ = reported(world, 'kvh_1750', given)[-1]
+    assert (level == WARN) == is_warned
+    assert ('250 samples a second are not the 1000 by which angles are made '
+            'rates: set sample_rate' in message) == is_warned
 
 
 def test_steps_of_the_clock_are_counted():

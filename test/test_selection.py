@@ -47,21 +47,23 @@ def measured(table, terms, seed=1):
     return table.measure(GyroModel(terms), np.random.default_rng(seed))
 
 
+@pytest.mark.parametrize('runs', [5, pytest.param(15, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize(
     'table', [Table(), WANDERING, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)])
-def test_effects_that_are_not_there_are_hardly_ever_taken(table):
-    generator, runs = np.random.default_rng(2), 15
+def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
+    generator = np.random.default_rng(2)
     wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator)))
                 != {'bias', 'scale_factor_error'} for _ in range(runs))
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
 
 
+@pytest.mark.parametrize('runs', [4, pytest.param(8, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('terms, technology', [(CUBIC, 'mems'), (SINE, 'open_loop_fog')])
-def test_effects_of_clear_size_are_found(terms, technology):
+def test_effects_of_clear_size_are_found(terms, technology, runs):
     thermal = {'bias_temperature': Term(BIAS_TEMPERATURE, (36.0, 1e-4)),
                'bias_temperature_quadratic': Term(BIAS_TEMPERATURE_QUADRATIC, (36.0, 1e-5))}
     terms = [thermal.get(term.effect.name, term) for term in terms]
-    generator, runs = np.random.default_rng(3), 8
+    generator = np.random.default_rng(3)
     found = [names(select_effects(Table().measure(GyroModel(terms), generator), technology))
              for _ in range(runs)]
     right = sum(each == {term.effect.name for term in terms} for each in found)
@@ -90,10 +92,11 @@ def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
     assert wide or technology in selection.twins[0].reason
 
 
-def test_the_rate_that_is_said_to_part_look_alikes_parts_them():
+@pytest.mark.parametrize('runs', [4, pytest.param(12, marks=pytest.mark.evidence)])
+def test_the_rate_that_is_said_to_part_look_alikes_parts_them(runs):
     generator, sigmas = np.random.default_rng(4), []
     truth = GyroModel((*LINEAR, TRUTH['sine_response']))
-    for _ in range(12):
+    for _ in range(runs):
         table = Table().measure(truth, generator)
         rate = select_effects(table).twins[0].rate
         more, fast = (Table(sweeps=1, rates=4).measure(truth, generator),
@@ -103,7 +106,7 @@ def test_the_rate_that_is_said_to_part_look_alikes_parts_them():
         pair = select_effects(join([table, more])).twins[0]
         sigmas.append(pair.sigmas if pair.taken == 'sine_response' else -pair.sigmas)
     # The aim is one sigma more than needed; a single pair of fits varies by one sigma.
-    assert np.mean(sigmas) > PARTED - 3.7 / np.sqrt(12), sigmas
+    assert np.mean(sigmas) > PARTED - 3.7 / np.sqrt(runs), sigmas
 
 
 def test_every_effect_has_its_reason():

@@ -101,14 +101,17 @@ def test_equation_8_as_printed_returns_its_unknowns_swapped():
 
 
 STEP = 0.088 * DEGREE
-RUNS = 150
+FEW, MANY = 50, 300
+each_reference = pytest.mark.parametrize('reference, runs', [
+    pytest.param(reference, runs, marks=[pytest.mark.evidence] if runs == MANY else [])
+    for runs in (FEW, MANY) for reference in ('profile', 'encoder')])
 
 
 @cache
-def honest(reference):
+def honest(reference, runs):
     """Return errors of (s, b), their claimed deviations, and the number refused, of noisy runs."""
     errors, deviations, refused = [], [], 0
-    for seed in range(RUNS):
+    for seed in range(runs):
         generator = np.random.default_rng([seed, len(reference)])
         rate = (1 + XV3500_S) * RATE + XV3500_B + simulate_noise(
             XV3500, len(TIME), 0.01, generator)
@@ -136,33 +139,39 @@ def bound(reference):
     return np.sqrt(np.diag(np.linalg.inv(columns.T @ np.linalg.solve(noise, columns))))[:2]
 
 
-@pytest.mark.parametrize('reference', ['profile', 'encoder'])
-def test_the_likelihood_is_unbiased(reference):
-    errors, _, _ = honest(reference)
+@each_reference
+def test_the_likelihood_is_unbiased(reference, runs):
+    errors, _, _ = honest(reference, runs)
     assert (np.abs(errors.mean(axis=0))
             < 4.0 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))).all()
 
 
-@pytest.mark.parametrize('reference', ['profile', 'encoder'])
-def test_the_95_percent_intervals_cover_the_truth(reference):
-    """600 runs gave 93 to 95 %: the blocks leave Student's t about 34 degrees of freedom."""
-    errors, deviations, _ = honest(reference)
+@each_reference
+def test_the_95_percent_intervals_cover_the_truth(reference, runs):
+    """
+    600 runs gave 93 to 95 %: the blocks leave Student's t about 34 degrees of freedom.
+
+    Of few runs, 8 % hold the truth in all intervals: only many show intervals that are too wide.
+
+    """
+    errors, deviations, _ = honest(reference, runs)
     covered = (np.abs(errors) < 1.96 * deviations).mean(axis=0)
-    assert ((covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / RUNS)).all()
-            and (covered <= 0.995).all()), covered
+    assert (covered > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / runs)).all(), covered
+    assert runs == FEW or (covered <= 0.995).all(), covered
 
 
-@pytest.mark.parametrize('reference', ['profile', 'encoder'])
-def test_the_likelihood_comes_near_the_cramer_rao_bound(reference):
+@each_reference
+def test_the_likelihood_comes_near_the_cramer_rao_bound(reference, runs):
     """Measured: 1.0 to 1.1 times the bound, in standard deviations; 300 runs tell it to 4 %."""
-    errors, _, _ = honest(reference)
-    assert (errors.std(axis=0, ddof=1) < 1.2 * bound(reference)).all(), (
+    errors, _, _ = honest(reference, runs)
+    largest = 1.1 * (1.0 + 3.0 / math.sqrt(2.0 * FEW)) if runs == FEW else 1.2
+    assert (errors.std(axis=0, ddof=1) < largest * bound(reference)).all(), (
         errors.std(axis=0, ddof=1) / bound(reference))
 
 
-@pytest.mark.parametrize('reference', ['profile', 'encoder'])
-def test_honest_runs_are_not_refused(reference):
-    assert honest(reference)[2] <= 1
+@each_reference
+def test_honest_runs_are_not_refused(reference, runs):
+    assert honest(reference, runs)[2] <= 1
 
 
 def lagging(constant, every=10):
@@ -214,16 +223,17 @@ def bumped(seed, degrees):
     return RATE + np.where((start <= TIME) & (start + 0.3 > TIME), degrees * DEGREE / 0.3, 0.0)
 
 
+@pytest.mark.parametrize('runs', [7, pytest.param(20, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('degrees', [5.0, 3.0, 2.0])
-def test_a_slip_or_bump_is_refused(degrees):
+def test_a_slip_or_bump_is_refused(degrees, runs):
     """Measured: all of 40 runs for 5, 3 and 2 deg; 1 deg is let through, as the limit says."""
     refused = 0
-    for seed in range(20):
+    for seed in range(runs):
         try:
             self_calibrate(TIME, run(seed, bumped(seed, degrees)), CALIBRATION)
         except DataRefused as error:
             refused += 'slip or a bump' in str(error)
-    assert refused >= 19
+    assert refused >= runs - 1
 
 
 def test_a_bump_below_the_limit_does_little_harm():
