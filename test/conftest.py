@@ -330,6 +330,24 @@ def _close_all(nodes):
     assert not problems, '\n'.join(problems)
 
 
+@pytest.fixture
+def hold_node(ros_domain, monkeypatch):
+    """
+    Return a function that makes a node here, which nobody spins; the one before ends.
+
+    ``hold_node(DriverNode, {'port': '/dev/x'}, {'__ns': '/robot'})`` gives a `held_node.HeldNode`.
+
+    """
+    from held_node import HeldNode
+    with contextlib.ExitStack() as stack:
+        def hold(node_class, parameters=None, remappings=None):
+            stack.close()
+            held = HeldNode(node_class, monkeypatch, parameters or {}, remappings or {})
+            stack.callback(held.close)
+            return held
+        yield hold
+
+
 class Ros:
     """A node in the process of the test, with an executor that spins in a thread."""
 

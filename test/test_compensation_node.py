@@ -8,14 +8,20 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The compensation node as a robot has it: its own process, messages, parameters, services."""
+"""
+The compensation node: its messages, parameters and services.
+
+What it computes is tested in test_pipeline.py. Here are its messages, by a node that nobody spins,
+and what needs a process of its own.
+
+"""
 
 import math
 import os
 import signal
 import time
 
-from fake_gyro import FakeGyro, INTERVAL, PACE
+from fake_gyro import FakeGyro, PACE
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model_file import read_model
 from gyro_calibration.ros import UNMEASURED_VARIANCE
@@ -23,9 +29,9 @@ import numpy as np
 import pytest
 
 try:
-    from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
-    from rclpy.parameter import Parameter
+    from gyro_calibration.ros.compensation_node import CompensationNode
     from rclpy.qos import ReliabilityPolicy
+    from sensor_msgs.msg import Imu
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
 
@@ -54,15 +60,40 @@ def with_other_axes(message):
     acceleration = message.linear_acceleration
     acceleration.x, acceleration.y, acceleration.z = 0.3, 0.4, 9.8
     message.linear_acceleration_covariance = [0.5, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.7]
+    return message
 
 
-def test_what_is_published(start, ros, wait_until, tmp_path):
+@pytest.fixture
+def hold(hold_node, tmp_path):
+    """Return a function of parameters that makes the node in this process."""
+    (tmp_path / 'model.yaml').write_text(MODEL)
+
+    def hold(**parameters):
+        given = {'calibration_file': tmp_path / 'calibration.yaml', **parameters}
+        return hold_node(CompensationNode,
+                         {name.replace('__', '.'): value for name, value in given.items()})
+    return hold
+
+
+def sample(number, rate):
+    """Return a message of a gyro of 100 Hz."""
+    message = Imu()
+    message.header.frame_id, message.angular_velocity.z = 'gyro', rate
+    message.header.stamp.sec, message.header.stamp.nanosec = (
+        1_700_000_000 + number // 100, number % 100 * 10 ** 7)
+    return message
+
+
+def test_what_is_published(hold, tmp_path):
     """Only z and the orientation of the incoming message change; no variance is zero."""
-    _, gyro = start(model_file=tmp_path / 'model.yaml', stationary__method='none')
-    gyro.play(np.full(100, 0.5))
-    gyro.send(0.5, change=with_other_axes)
-    wait_until(lambda: len(gyro.imu) == len(gyro.heading) == len(gyro.rate) == 101)
-    imu, heading, rate = gyro.imu[-1], gyro.heading[-1], gyro.rate[-1]
+    held = hold(model_file=tmp_path / 'model.yaml', stationary__method='none')
+    held.tick()  # now it knows who subscribes
+    for number in range(100):
+        held.send('/imu/data_raw', sample(number, 0.5))
+    held.send('/imu/data_raw', with_other_axes(sample(100, 0.5)))
+    imus, headings, rates = (held.sent[topic] for topic in ('/imu/data', '/heading', '/yaw_rate'))
+    assert len(imus) == len(headings) == len(rates) == 101
+    imu, heading, rate = imus[-1], headings[-1], rates[-1]
     assert (imu.angular_velocity.x, imu.angular_velocity.y) == (0.1, -0.2)
     assert imu.angular_velocity.z == pytest.approx(0.49)
     assert imu.angular_velocity_covariance[:8].tolist() == [1e-4, 1e-6, 0, 1e-6, 2e-4, 0, 0, 0]
@@ -73,8 +104,7 @@ def test_what_is_published(start, ros, wait_until, tmp_path):
     assert imu.header.frame_id == 'gyro'
     covariance = imu.orientation_covariance
     assert covariance[0] == covariance[4] == UNMEASURED_VARIANCE and 0.0 < covariance[8] < 1.0
-    assert 2.0 * math.atan2(imu.orientation.z, imu.orientation.w) == pytest.approx(
-        0.49 * 101 * INTERVAL, abs=0.01)
+    assert 2.0 * math.atan2(imu.orientation.z, imu.orientation.w) == pytest.approx(0.49, abs=1e-6)
     assert heading.header.frame_id == 'odom' and heading.header.stamp == imu.header.stamp
     assert heading.pose.pose.orientation == imu.orientation
     assert heading.pose.covariance[35] == covariance[8]
@@ -82,8 +112,8 @@ def test_what_is_published(start, ros, wait_until, tmp_path):
     assert rate.header == imu.header and rate.twist.twist.angular.z == imu.angular_velocity.z
     assert rate.twist.covariance[35] == imu.angular_velocity_covariance[8]
     assert rate.twist.covariance[[0, 7, 14, 21, 28]].tolist() == 5 * [UNMEASURED_VARIANCE]
-    assert not gyro.imu[0].angular_velocity_covariance[[1, 2, 3, 5, 6, 7]].any()
-    assert gyro.imu[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
+    assert not imus[0].angular_velocity_covariance[[1, 2, 3, 5, 6, 7]].any()
+    assert imus[0].angular_velocity_covariance[0] > 0.0, 'all zeros came: not known'
 
 
 def test_an_orientation_that_is_none_has_no_yaw_and_raises_nothing(ros):
@@ -95,19 +125,17 @@ def test_an_orientation_that_is_none_has_no_yaw_and_raises_nothing(ros):
         heading_of(Quaternion(x=value, y=value, z=value, w=value))
 
 
-def test_names_types_and_qualities_are_those_of_the_documents(start, ros, wait_until):
+def test_names_types_and_qualities_are_those_of_the_documents(hold):
     from test_layouts import TOPICS
-    _, gyro = start()
-    types = dict(ros.node.get_topic_names_and_types())
-    for topic, kind in TOPICS.items():
-        assert types[topic] == [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}']
-    for topic in ('imu/data', 'heading', 'yaw_rate'):
-        offer, = ros.node.get_publishers_info_by_topic(topic)
-        assert offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-    wait_until(lambda: gyro.diagnostics, what='diagnostics')
-    assert gyro.diagnostics[-1].status[0].name == '/compensation_node: heading'
-    assert gyro.diagnostics[-1].status[0].hardware_id == 'none'
-    status = gyro.status[-1].status[0]
+    held = hold()
+    made = {each.topic_name: each for each in (*held.node.subscriptions, *held.node.publishers)}
+    assert {topic: made[topic].msg_type for topic in TOPICS} == TOPICS
+    for topic in ('/imu/data', '/heading', '/yaw_rate'):
+        assert made[topic].qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    held.tick(5)  # it reports each second
+    report, = held.sent['/diagnostics'][-1].status
+    assert (report.name, report.hardware_id) == ('/compensation_node: heading', 'none')
+    status, = held.sent['/compensation_node/calibration_status'][-1].status
     assert status.name == '/compensation_node: calibration' and 'call calibrate' in status.message
     assert {'calibrated', 'running'} <= {pair.key for pair in status.values}
 
@@ -123,35 +151,29 @@ def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(start):
     assert gyro.yaws()[-1] == pytest.approx(0.5 * 10.0, abs=0.01)
 
 
-def test_parameters_are_checked_described_and_taken_on_at_once(start, ros):
-    _, gyro = start(stationary__threshold=0)
-
-    def put(name, value):
-        request = SetParameters.Request(
-            parameters=[Parameter(name, value=value).to_parameter_msg()])
-        return ros.call(SetParameters, '/compensation_node/set_parameters', request).results[0]
-    names = ros.call(ListParameters, '/compensation_node/list_parameters').result.names
+def test_parameters_are_checked_described_and_taken_on_at_once(hold):
+    held = hold(stationary__threshold=0)
+    names = held.node.list_parameters([], 0).names
     own = [name for name in names if not name.startswith('qos_overrides') and name not in (
         'use_sim_time', 'start_type_description_service')]
     assert len(own) == 18, own
-    described = ros.call(DescribeParameters, '/compensation_node/describe_parameters',
-                         DescribeParameters.Request(names=own)).descriptors
+    described = held.node.describe_parameters(own)
     assert all(each.description.endswith('.') for each in described)
     ranged = [each for each in described if each.floating_point_range or each.integer_range]
     assert len(ranged) == 9 and sum('Unit: rad/s.' in each.description for each in ranged) == 3
-    refused = put('stationary.method', 'off and on')
+    refused = held.put('stationary.method', 'off and on')
     assert not refused.successful and 'rest, threshold or none' in refused.reason
-    assert not put('stationary.threshold', -1.0).successful
-    assert not put('model_file', '/tmp/other').successful, 'read-only'
-    assert put('stationary.threshold', 0.005).successful
-    gyro.play([0.1 * DEGREE] * 100)
-    assert gyro.imu[-1].angular_velocity.z == 0.0
-    assert put('stationary.threshold', 0).successful, 'a whole number for a float'
-    gyro.play([0.1 * DEGREE] * 10)
-    assert gyro.imu[-1].angular_velocity.z > 0.0
-    got = ros.call(GetParameters, '/compensation_node/get_parameters',
-                   GetParameters.Request(names=['heading_frame'])).values[0]
-    assert got.string_value == 'odom'
+    assert not held.put('stationary.threshold', -1.0).successful
+    assert not held.put('model_file', '/tmp/other').successful, 'read-only'
+    assert held.put('stationary.threshold', 0.005).successful
+    for number in range(100):
+        held.send('/imu/data_raw', sample(number, 0.1 * DEGREE))
+    assert held.sent['/imu/data'][-1].angular_velocity.z == 0.0
+    assert held.put('stationary.threshold', 0).successful, 'a whole number for a float'
+    for number in range(100, 110):
+        held.send('/imu/data_raw', sample(number, 0.1 * DEGREE))
+    assert held.sent['/imu/data'][-1].angular_velocity.z > 0.0
+    assert held.node.get_parameter('heading_frame').value == 'odom'
 
 
 def test_services_answer_when_they_are_done_and_the_result_outlives_the_node(

@@ -15,7 +15,10 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from gyro_calibration.ros.compensation_node import CompensationNode
 from gyro_calibration.ros.diagnostics import Diagnostics
+from gyro_calibration.ros.driver_node import DriverNode
+from rclpy.clock import ClockType
 
 OK, ERROR = DiagnosticStatus.OK, DiagnosticStatus.ERROR
 
@@ -47,18 +50,20 @@ def test_each_report_is_made_anew(ros, heard, wait_until):
     assert made.level == ERROR and heard[-1].status[0].message == 'second'
 
 
-def test_both_nodes_report_in_their_namespace_also_without_gyro_samples_and_clock(
-        start_node, heard, wait_until, tmp_path):
-    start_node('driver_node', {'port': tmp_path / 'gyro'}, {'__ns': '/robot'})
-    start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml',
-                                     'use_sim_time': 'true'}, {'__ns': '/robot'})
+@pytest.mark.parametrize('node_class, name, parameters, words', [
+    (DriverNode, 'driver_node: gyro', {'port': '/nonexistent/gyro'}, 'does not exist'),
+    (CompensationNode, 'compensation_node: heading', {'use_sim_time': 'true'},
+     'ROS time stands still')], ids=['driver', 'compensation'])
+def test_a_node_reports_in_its_namespace_also_without_gyro_samples_and_clock(
+        hold_node, wait_until, tmp_path, node_class, name, parameters, words):
+    if node_class is CompensationNode:
+        parameters = {**parameters, 'calibration_file': tmp_path / 'calibration.yaml'}
+    held = hold_node(node_class, parameters, {'__ns': '/robot'})
 
-    def found():
-        return {status.name: status for array in list(heard) for status in array.status}
-    names = {'/robot/driver_node: gyro', '/robot/compensation_node: heading'}
-    wait_until(lambda: names <= set(found()), 60.0, f'{names}')
-    wait_until(lambda: all(found()[name].level == ERROR for name in names), what='errors')
-    count = len(heard)
-    wait_until(lambda: len(heard) > count + 4, what='reports, once a second')
-    assert 'does not exist' in found()['/robot/driver_node: gyro'].message
-    assert 'ROS time stands still' in found()['/robot/compensation_node: heading'].message
+    def reported():
+        held.tick()
+        return [status for array in held.sent['/diagnostics'] for status in array.status
+                if status.level == ERROR and words in status.message]
+    wait_until(reported, what=words)
+    assert {status.name for status in reported()} == {f'/robot/{name}'}
+    assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in held.node.timers)

@@ -66,6 +66,18 @@ def seconds(message):
     return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
 
 
+def interrupt_often(node):
+    """
+    End a node as under a launch file, where Ctrl-C comes twice: from the terminal and from launch.
+
+    It ends with code 0 all the same, or the fixture fails.
+
+    """
+    for _ in range(40):
+        node.interrupt()
+    assert node.stop() == 0
+
+
 def test_a_gyro_is_published_end_to_end(robot, ros):
     """A replay at 1 kHz waits for a driver that a busy machine holds up: no sample is lost."""
     with Emulator(find('csv'), counting(500.0), speed=2.0, wait_for_reader=True) as gyro:
@@ -75,7 +87,7 @@ def test_a_gyro_is_published_end_to_end(robot, ros):
         status = driver.reports('samples come', DiagnosticStatus.OK)
         offered = [ros.node.get_publishers_info_by_topic(topic)[0].qos_profile
                    for topic in ('/imu/data_raw', '/imu/temperature')]
-        assert driver.node.stop() == 0
+        interrupt_often(driver.node)
     rates, temperatures = list(driver.rates), list(driver.temperatures)
     numbers = [round(1e4 * message.angular_velocity.z) for message in rates]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
@@ -102,19 +114,9 @@ def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
                       for pair in driver.reports('samples come', DiagnosticStatus.OK).values}
             assert int(values['reopened']) >= number and int(values['samples']) > 20
         driver.reports('the device is gone', DiagnosticStatus.ERROR)
+    interrupt_often(driver.node)
     assert driver.node.output.count('the device is gone') == 2, (
         'it is logged once, not at each attempt')
-
-
-@pytest.mark.parametrize('is_there', [True, False])
-def test_signals_end_it_with_code_0_whether_the_port_is_there_or_not(robot, tmp_path, is_there):
-    """Under a launch file Ctrl-C comes twice, or more often: from the terminal and from launch."""
-    with Emulator(find('csv'), counting(), link=tmp_path / 'gyro'):
-        driver = robot(tmp_path / ('gyro' if is_there else 'missing'))
-        driver.reports('', DiagnosticStatus.OK if is_there else DiagnosticStatus.ERROR)
-        for _ in range(40):
-            driver.node.interrupt()
-        assert driver.node.stop() == 0
 
 
 def test_an_impossible_parameter_ends_it_with_one_sentence(start_node):

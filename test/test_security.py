@@ -13,9 +13,6 @@
 import ast
 from functools import cache
 from pathlib import Path
-import signal
-import subprocess
-import sys
 from xml.etree import ElementTree
 
 import gyro_calibration
@@ -25,8 +22,7 @@ import yaml
 
 try:
     from nav_msgs.msg import Odometry
-    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-    from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+    from rclpy.parameter import Parameter
     from sensor_msgs.msg import Imu, Temperature
     from std_srvs.srv import Trigger
 except ImportError:
@@ -181,67 +177,55 @@ SETTINGS = {
 ONLY_THEN = {('subscriber', '/clock')}
 
 
-def begun(start_node, tmp_path, enclave):
-    """Start an enclave's node once for each setting; return name, namespaces and processes."""
+def node_of(enclave):
+    """Return the class of an enclave's node."""
+    from gyro_calibration.ros.compensation_node import CompensationNode
+    from gyro_calibration.ros.driver_node import DriverNode
     name = next(ENCLAVES[enclave].iter('profile')).get('node')
-    namespaces = [f'/{enclave}_{number}' for number in range(len(SETTINGS[enclave]))]
-    processes = []
-    for namespace, settings in zip(namespaces, SETTINGS[enclave], strict=True):
-        files = ({'calibration_file': tmp_path / f'{namespace[1:]}.yaml'}
-                 if name == 'compensation_node' else {})
-        processes.append(start_node(name, {**files, **settings}, {'__ns': namespace}))
-    return name, namespaces, processes
+    return {'driver_node': DriverNode, 'compensation_node': CompensationNode}[name]
 
 
-def settled(node, wait_until, name, namespaces):
-    """Return the end points of the nodes of one name, once the graph shows all and is settled."""
-    seen = []
+@pytest.mark.parametrize('enclave', SETTINGS)
+def test_the_policy_allows_a_node_exactly_what_it_has(hold_node, wait_until, tmp_path, enclave):
+    used, namespace = set(), f'/{enclave}'
+    for settings in SETTINGS[enclave]:
+        files = ({} if enclave == 'driver_node'
+                 else {'calibration_file': tmp_path / 'calibration.yaml'})
+        node = hold_node(node_of(enclave), {**files, **settings}, {'__ns': namespace}).node
+        made = {each.topic_name for each in (*node.publishers, *node.subscriptions)}
+        made |= {each.service_name for each in node.services}
 
-    def stands():
-        if {(name, namespace) for namespace in namespaces} <= set(
-                node.get_node_names_and_namespaces()):
-            seen.append([really(node, name, namespace) for namespace in namespaces])
-        return len(seen) > 100 and seen[-1] == seen[-100]
-    wait_until(stands, 60.0, f'{name} in {namespaces}')
-    return seen[-1]
-
-
-def test_the_policy_allows_each_node_exactly_what_it_has(start_node, ros, wait_until, tmp_path):
-    nodes = {enclave: begun(start_node, tmp_path, enclave) for enclave in SETTINGS}
-    for enclave, (name, namespaces, processes) in nodes.items():
-        have = settled(ros.node, wait_until, name, namespaces)
-        rights = [allowed(enclave, namespace) for namespace in namespaces]
-        assert not [ends - right for ends, right in zip(have, rights, strict=True)
-                    if not ends <= right], f'{enclave} has more than it may'
-        used = {(kind, topic.replace(namespace, '', 1))
-                for ends, namespace in zip(have, namespaces, strict=True) for kind, topic in ends}
-        assert used == allowed(enclave), (
-            f'{enclave} may more than it has: {allowed(enclave) - used}')
-        if not SETTINGS[enclave][0]:
-            special = {(kind, resolved(topic, namespaces[0], name)) for kind, topic in ONLY_THEN}
-            assert have[0] == rights[0] - special
-        for process in processes:
-            process.interrupt()
+        def have():
+            return really(node, node.get_name(), namespace)  # noqa: B023
+        wait_until(lambda: made <= {name for _, name in have()}, what=f'{made}')  # noqa: B023
+        assert have() <= allowed(enclave, namespace), f'{enclave} has more than it may'
+        if not settings:
+            special = {(kind, resolved(topic, namespace, node.get_name()))
+                       for kind, topic in ONLY_THEN}
+            assert have() == allowed(enclave, namespace) - special
+        used |= {(kind, topic.replace(namespace, '', 1)) for kind, topic in have()}
+    assert used == allowed(enclave), f'{enclave} may more than it has: {allowed(enclave) - used}'
 
 
-def test_the_policy_allows_a_recording_exactly_what_it_takes(
-        start_node, ros, wait_until, tmp_path):
-    kinds = {'imu/data_raw': Imu, 'imu/temperature': Temperature, 'odom': Odometry}
-    publishers = [ros.publisher(kind, topic) for topic, kind in kinds.items()]
-    out = tmp_path / 'log.mcap'
-    command = [sys.executable, '-m', 'gyro_calibration', 'record',
-               '--reference-topic', 'odom', '--out', out]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL,
-                          stdout=subprocess.DEVNULL) as process:
-        try:
-            wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers),
-                       20.0, 'the recorder')
-            name = 'gyro_calibration_recorder'
-            wait_until(lambda: name in ros.node.get_node_names()
-                       and really(ros.node, name, '/') == allowed('record'), 20.0, 'all of it')
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(20.0)
+def test_the_policy_allows_a_recording_exactly_what_it_takes(ros, wait_until):
+    from gyro_calibration.cli.record import _TOPICS
+    from gyro_calibration.ros.recorder_node import RecorderNode
+    import rclpy
+    for topic, kind in {'imu/data_raw': Imu, 'imu/temperature': Temperature,
+                        'odom': Odometry}.items():
+        ros.publisher(kind, topic)
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    node = RecorderNode([*_TOPICS.values(), 'odom'], False, print, context)
+
+    def has_all():
+        node.look()
+        return not node.missing and really(ros.node, node.get_name(), '/') == allowed('record')
+    try:
+        wait_until(has_all, what='all of it')
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
 
 
 def called_with_names(path):
@@ -299,43 +283,29 @@ def test_only_a_session_that_may_drive_sends_commands(tmp_path):
     assert not rig.commands and not rig.session.drives
 
 
-def drivers(ros):
-    """Return the nodes that can command the robot."""
-    return {info.node_name for info in ros.node.get_publishers_info_by_topic('/cmd_vel')}
+def test_the_node_is_no_publisher_of_commands_before_it_may_drive(hold_node, tmp_path):
+    held = hold_node(node_of('compensation_node'), {'calibration_file': tmp_path / 'known.yaml'})
+
+    def drives():
+        return '/cmd_vel' in {each.topic_name for each in held.node.publishers}
+    answer = held.call('/compensation_node/cancel_calibration', Trigger)
+    assert answer.success is False and not drives()
+    assert held.put('calibration.drive', True).successful
+    assert 'no sample comes on imu/data_raw' in held.call('/compensation_node/calibrate',
+                                                          Trigger).message
+    assert drives()
 
 
-def test_the_node_is_no_publisher_of_commands_before_it_may_drive(
-        start_node, ros, wait_until, tmp_path):
-    start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml'})
-    put = ros.node.create_client(SetParameters, '/compensation_node/set_parameters')
-    assert put.wait_for_service(30.0) and not drivers(ros)
-    request = Trigger.Request()
-    assert ros.call(Trigger, '/compensation_node/cancel_calibration', request).success is False
-    assert not drivers(ros)
-    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
-    allowing = SetParameters.Request(parameters=[Parameter(name='calibration.drive', value=value)])
-    assert ros.call(SetParameters, '/compensation_node/set_parameters',
-                    allowing).results[0].successful
-    answer = ros.call(Trigger, '/compensation_node/calibrate')
-    assert 'no sample comes on imu/data_raw' in answer.message
-    wait_until(lambda: drivers(ros) == {'compensation_node'}, what='a publisher of commands')
-
-
-@pytest.mark.parametrize('node', ['driver_node', 'compensation_node'])
-def test_no_client_changes_which_files_and_ports_a_running_node_uses(
-        node, start_node, ros, tmp_path):
-    start_node(node, {'calibration_file': tmp_path / 'calibration.yaml'}
-               if node == 'compensation_node' else {})
-    names = ros.call(ListParameters, f'/{node}/list_parameters').result.names
+@pytest.mark.parametrize('enclave', ['driver_node', 'compensation_node'])
+def test_no_client_changes_which_files_and_ports_a_running_node_uses(hold_node, tmp_path, enclave):
+    held = hold_node(node_of(enclave), {'calibration_file': tmp_path / 'calibration.yaml'}
+                     if enclave == 'compensation_node' else {})
+    names = held.node.list_parameters([], 0).names
     chosen = sorted(name for name in names if name == 'port' or name.endswith('_file'))
-    assert chosen == (['port'] if node == 'driver_node'
+    assert chosen == (['port'] if enclave == 'driver_node'
                       else ['calibration.profile_file', 'calibration_file', 'model_file'])
     for name in chosen:
-        given = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_STRING,
-                                                          string_value='/tmp/other'))
-        answers = [ros.call(SetParameters, f'/{node}/set_parameters',
-                            SetParameters.Request(parameters=[given])).results[0],
-                   ros.call(SetParametersAtomically, f'/{node}/set_parameters_atomically',
-                            SetParametersAtomically.Request(parameters=[given])).result]
+        given = [Parameter(name, value='/tmp/other')]
+        answers = [held.put(name, '/tmp/other'), held.node.set_parameters_atomically(given)]
         assert [answer.successful for answer in answers] == [False, False], name
         assert all('read' in answer.reason for answer in answers)
