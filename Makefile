@@ -38,7 +38,8 @@ timed:
 
 # all other tests, which give way to those
 computing:
-	@nice -n 19 $(PYTEST) -m 'not timed' -n 2 --dist loadfile > $(VENV)/computing.txt 2>&1; code=$$?; \
+	@nice -n 19 $(PYTEST) -m 'not timed' -n 2 --dist loadfile --no-loadscope-reorder \
+		> $(VENV)/computing.txt 2>&1; code=$$?; \
 	cat $(VENV)/computing.txt; exit $$code
 
 # what takes long: coverage by hundreds of simulated drives, fuzzing, soak

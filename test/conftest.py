@@ -94,10 +94,16 @@ _prepare_environment()  # before any test module imports rclpy
 
 _TIMED = 'test_connection', 'test_emulator', 'test_fuzz', 'test_launch', 'test_serial_port'
 
+# Of those that only compute, what takes longest comes first: the last files, which one of several
+# processes may have to itself, are then short ones.
+_LONG = ('test_diagnosis', 'test_record_verb', 'test_selection', 'test_self_calibration',
+         'test_plan', 'test_findings', 'test_experiment', 'test_extension', 'test_reproduction',
+         'test_fooled', 'test_encoder', 'test_package', 'test_search', 'test_hidden')
+
 
 def pytest_collection_modifyitems(config, items):
     """
-    Mark the tests with ROS nodes and all that have to keep time; leave out what takes long.
+    Mark the tests with ROS nodes and all that have to keep time; leave out what takes minutes.
 
     Long evidence runs where it is asked for, ``-m evidence``.
 
@@ -113,6 +119,8 @@ def pytest_collection_modifyitems(config, items):
         long = [item for item in items if item.get_closest_marker('evidence')]
         config.hook.pytest_deselected(items=long)
         items[:] = [item for item in items if item not in long]
+    order = dict(zip(_LONG, range(len(_LONG))))
+    items.sort(key=lambda item: order.get(Path(item.location[0]).stem, len(_LONG)))
 
 
 def pytest_unconfigure(config):

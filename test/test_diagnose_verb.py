@@ -10,10 +10,13 @@
 
 """The verb diagnose: what it prints and writes, and its messages where data do not suffice."""
 
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+import io
 import json
 import os
 
+from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.log import COLUMNS, DEGREE, Log, read_log, write_log
 from gyro_calibration.model_file import read_model
@@ -31,10 +34,20 @@ def log_of(hidden):
                   for name, values in hidden.columns.items()})
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def hidden():
     """Return a log in which a warm-up is hidden, with the truth."""
     return hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white', **SHORT)[0]
+
+
+@pytest.fixture(scope='module')
+def diagnosed(hidden, tmp_path_factory):
+    """Return the folder with that log, what was found in it, and what the program printed."""
+    folder = tmp_path_factory.mktemp('diagnosed')
+    write_log(folder / 'drive.csv', log_of(hidden))
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as errors:
+        code = main(['diagnose', str(folder / 'drive.csv'), '--out', str(folder / 'found')])
+    return folder, (code, out.getvalue(), errors.getvalue())
 
 
 @pytest.fixture
@@ -77,11 +90,11 @@ def check_finding(finding):
         assert low <= value['estimate'] <= high and value['unit']
 
 
-def test_the_files_hold_what_they_say(log, run, tmp_path):
-    code, text, errors = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
+def test_the_files_hold_what_they_say(diagnosed):
+    folder, (code, text, errors) = diagnosed
     assert code == 0 and 'warm up' in text and not errors
-    assert set(os.listdir(tmp_path / 'found')) == FILES
-    told = json.loads((tmp_path / 'found/diagnosis.json').read_text())
+    assert set(os.listdir(folder / 'found')) == FILES
+    told = json.loads((folder / 'found/diagnosis.json').read_text())
     assert told['schema'] == 'gyro_calibration/diagnosis/2' and told[
         'verdict'] == 'extended' and told['false_alarm_rate'] == 0.01
     assert [finding['effect']
@@ -92,37 +105,32 @@ def test_the_files_hold_what_they_say(log, run, tmp_path):
     assert gain['held_out'] and gain['heading_rms']['window_s'] == 60
     assert all(gain[name]['after'] < gain[name]['before'] and is_interval(gain[name]['ci95'])
                for name in ('rate_rms', 'heading_rms'))
-    model = read_model(tmp_path / 'found/model.yaml')
+    model = read_model(folder / 'found/model.yaml')
     assert 'warm_up' in {term.effect.name for term in model.terms}
     assert model.origin['files'][0]['name'] == 'drive.csv'
-    assert '<html' in (tmp_path / 'found/report.html').read_text()
+    assert '<html' in (folder / 'found/report.html').read_text()
 
 
-def test_json_is_the_same_as_in_the_file_and_all_there_is(log, run, tmp_path):
-    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found', '--json')
-    assert (code == 0
-            and json.loads(text) == json.loads((tmp_path / 'found/diagnosis.json').read_text()))
-
-
-def test_a_seed_gives_the_same_answer_again_and_nothing_is_written_without_a_folder(
+def test_a_seed_gives_the_same_answer_again_and_a_file_is_written_into_a_folder_alone(
         log, run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    answers = [run('diagnose', 'drive.csv', '--seed', '7', '--json') for _ in range(2)]
-    assert answers[0] == answers[1] and answers[0][0] == 0
-    assert os.listdir() == ['drive.csv']
+    words = ['diagnose', 'drive.csv', '--seed', '7', '--json']
+    code, text, _ = run(*words)
+    assert code == 0 and os.listdir() == ['drive.csv']
+    assert run(*words, '--out', 'found')[1] == text
+    assert json.loads(text) == json.loads((tmp_path / 'found/diagnosis.json').read_text())
 
 
-def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(log, run, tmp_path):
-    run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
-    code, text, _ = run('diagnose', tmp_path / 'drive.csv', '--model',
-                        tmp_path / 'found/model.yaml', '--json')
+def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(diagnosed, run):
+    folder, _ = diagnosed
+    code, text, _ = run('diagnose', folder / 'drive.csv', '--model', folder / 'found/model.yaml',
+                        '--json')
     told = json.loads(text)
     assert code == 0 and told['verdict'] == 'adequate' and told['gain'] is None, told['findings']
 
 
-def test_the_extended_model_simulates_and_compensates(log, run, tmp_path):
-    run('diagnose', tmp_path / 'drive.csv', '--out', tmp_path / 'found')
-    model = tmp_path / 'found/model.yaml'
+def test_the_extended_model_simulates_and_compensates(diagnosed, log, run, tmp_path):
+    model = diagnosed[0] / 'found/model.yaml'
     assert run('compensate', tmp_path / 'drive.csv', '--model', model, '--out',
                tmp_path / 'rates.csv')[0] == 0
     rate = np.array(read_log(tmp_path / 'rates.csv').others['rate_rad_s'], float)

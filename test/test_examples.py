@@ -8,8 +8,9 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The examples of the documents run as they stand, each in an empty folder."""
+"""The examples of the documents run as they stand, each once and in an empty folder."""
 
+from functools import cache
 import os
 from pathlib import Path
 import subprocess
@@ -24,64 +25,67 @@ FOLDER = Path(__file__).parents[1] / 'docs/examples'
 QUICK = {'three_methods.py': ['2']}  # runs instead of 200
 
 
-@pytest.fixture
-def run(tmp_path):
-    """Return a function that runs an example and gives what it prints."""
-    def run(name):
+@pytest.fixture(scope='module')
+def ran(tmp_path_factory):
+    """Return a function that runs an example, and gives its folder and what it prints."""
+    @cache
+    def ran(name):
         paths = [str(FOLDER.parents[1]), *filter(None, [os.environ.get('PYTHONPATH')])]
         environment = os.environ | {'PYTHONPATH': os.pathsep.join(paths)}
         command = [sys.executable, FOLDER / name, *QUICK.get(name, [])]
-        result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True,
-                                text=True, timeout=60)
+        folder = tmp_path_factory.mktemp('example')
+        result = subprocess.run(command, cwd=folder, env=environment, capture_output=True,
+                                text=True, timeout=300)
         assert result.returncode == 0 and not result.stderr, result.stderr
-        return result.stdout
-    return run
+        return folder, result.stdout
+    return ran
 
 
 @pytest.mark.parametrize('name', sorted(path.name for path in FOLDER.glob('*.py')))
-def test_an_example_runs_and_says_something(run, name):
-    assert run(name).strip()
+def test_an_example_runs_and_says_something(ran, name):
+    assert ran(name)[1].strip()
 
 
-def test_the_written_model_can_be_read(run, tmp_path):
-    run('write_a_model.py')
-    model = read_model(tmp_path / 'model.yaml')
+def test_the_written_model_can_be_read(ran):
+    folder, _ = ran('write_a_model.py')
+    model = read_model(folder / 'model.yaml')
     assert model.temperature_range == (25.0, 45.0) and model.looks_at('temperature')
 
 
-def test_the_self_calibration_is_in_the_written_model(run, tmp_path):
-    run('self_calibrate_a_log.py')
-    calibration = read_model(tmp_path / 'model.yaml').self_calibration
+def test_the_self_calibration_is_in_the_written_model(ran):
+    folder, _ = ran('self_calibrate_a_log.py')
+    calibration = read_model(folder / 'model.yaml').self_calibration
     assert abs(calibration.scale_factor_error + 0.1) < 4 * calibration.standard_deviations[0]
 
 
-def test_the_rate_table_gives_a_model_that_knows_the_true_rate(run, tmp_path):
-    text = run('rate_table.py')
+def test_the_rate_table_gives_a_model_that_knows_the_true_rate(ran):
+    folder, text = ran('rate_table.py')
     taken = {line.split()[0] for line in text.splitlines() if line.split()[1] == 'taken'}
     assert {'bias', 'sine_response', 'scale_factor_temperature'} <= taken
-    model = read_model(tmp_path / 'model.yaml')
+    model = read_model(folder / 'model.yaml')
     rate = float(text.split()[-2])
     output = 1.5 + 0.01 * DEGREE + np.sin(0.25 * 1.5) / 0.25 - 1.5 + 4e-4 * 5.0 * 1.5
     assert abs(rate - 1.5) < 1e-3 and abs(model.rate(output, 30.0) - rate) < 1e-5
 
 
-def test_record_player_and_encoder_find_the_gyro(run):
-    found = [line.split() for line in run('turntable.py').splitlines() if '+-' in line]
+def test_record_player_and_encoder_find_the_gyro(ran):
+    found = [line.split() for line in ran('turntable.py')[1].splitlines() if '+-' in line]
     wrong = [line for line in found
              if abs(float(line[-4]) - (1.3 if line[-1] == '%' else 0.2)) > 4.0 * float(line[-2])]
     assert len(found) == 4 and not wrong
 
 
-def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(run, tmp_path):
-    off = [float(line.split()[-6]) for line in run('diagnose_a_log.py').splitlines()
-           if line.startswith('Another drive')]
-    lag, = (term.values for term in read_model(tmp_path / 'model.yaml').terms
+def test_the_diagnosed_gyro_lags_behind_its_thermometer_and_another_drive_gains(ran):
+    folder, text = ran('diagnose_a_log.py')
+    off = [float(line.split()[-6])
+           for line in text.splitlines() if line.startswith('Another drive')]
+    lag, = (term.values for term in read_model(folder / 'model.yaml').terms
             if term.effect.name == 'thermal_lag')
     assert abs(lag[0] / 120.0 - 1.0) < 0.2 and abs(lag[1] / 2e-4 - 1.0) < 0.2
-    assert off[1] < 0.3 * off[0] and (tmp_path / 'report.html').exists()
+    assert off[1] < 0.3 * off[0] and (folder / 'report.html').exists()
 
 
-def test_the_compensated_log_has_a_heading(run, tmp_path):
-    run('compensate_a_log.py')
+def test_the_compensated_log_has_a_heading(ran):
+    folder, _ = ran('compensate_a_log.py')
     assert {'rate_rad_s', 'heading_rad', 'heading_std_rad'} <= set(
-        read_log(tmp_path / 'compensated.csv').others)
+        read_log(folder / 'compensated.csv').others)

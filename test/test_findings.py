@@ -71,8 +71,8 @@ def shown(finding):
     return str(quantity(Estimate(size['estimate'], tuple(size['ci95']), size['unit']), name))
 
 
-#: Recordings of 25 min, which take most of a minute each.
-LONG = 'yaw_slow', 'pitch_slow'
+#: Recordings of 25 min, which take most of a minute each, and the slower of two by hand.
+LONG = 'yaw_slow', 'pitch_slow', 'hand_slow'
 
 
 @pytest.fixture
