@@ -167,6 +167,14 @@ def test_a_gyro_that_died_is_said_once_its_codes_are_known():
     assert 'look whether the gyro is alive' in check.noise_alarm
 
 
+@pytest.mark.filterwarnings('error')
+def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_judged():
+    """As where a busy computer gave a gyro the stamps of one second."""
+    time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH, 10))
+    output = 7e-4 * np.random.default_rng(21).standard_normal(len(time))
+    assert examine(time, output, output, MEMS, 1e-3) is None
+
+
 def test_without_noise_figures_there_is_nothing_to_check():
     assert (not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works
             and HealthMonitor(MEMS, 0.001).works)

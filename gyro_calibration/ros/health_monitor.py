@@ -275,12 +275,12 @@ def _differences(output: Array, size: int) -> Array:
 
 
 def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
-    """Return whether parts of the stretch differ by no more than noise explains."""
+    """Return whether parts of the stretch differ by no more than noise; one part shows nothing."""
     part = ((time - time[0]) / _PART).astype(int)
     count = np.bincount(part)
     means = (np.bincount(part, rate) / np.maximum(count, 1))[count > 0.5 * count.max()]
     explained = spectrum / _PART + noise.wander(STRETCH, _PART)
-    return bool(means.var(ddof=1) <= _STEADY * explained)
+    return len(means) > 1 and bool(means.var(ddof=1) <= _STEADY * explained)
 
 
 def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: float,
