@@ -149,33 +149,37 @@ def benchmark(name):
     return runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / f'{name}.py'))
 
 
-def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders():
+@pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
+def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
     """
-    Four standard errors of 40 runs.
+    Four standard errors.
 
     Benchmarks/encoder_intervals.py does this for more noises and 400 runs.
     """
     run = benchmark('encoder_intervals')['run']
     found = np.array([run(('white, flicker, rate '
-                           'random walk', seed, 300.0)) for seed in range(40)])
+                           'random walk', seed, 300.0)) for seed in range(runs)])
     within = (np.abs(found[:, 0]) < 1.96 * found[:, 1]).mean(axis=0)
-    assert (within > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / 40)).all(), within
+    assert (within > 0.95 - 4.0 * math.sqrt(0.95 * 0.05 / runs)).all(), within
     assert (found[:, 1].mean(axis=0) < 3.0 * np.sqrt(
         (found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
+@pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('step, noise', [(0.088, 0.02), (5.0, 0.5)])
-def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(step, noise):
+def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(
+        step, noise, runs):
     """
-    Within three standard errors of 40 runs of a ratio of 1.1.
+    Within three standard errors of a ratio of 1.1.
 
     Benchmarks/efficiency.py does this for more cases and runs.
     """
     of = benchmark('efficiency')
-    found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2] for seed in range(40)])
+    found = np.array([of['errors'](step * DEGREE, noise * DEGREE, seed)[:2]
+                      for seed in range(runs)])
     ratios = (found ** 2).mean(axis=0) / of['bound'](step * DEGREE, noise * DEGREE, False)
     assert (ratios[0] < 1.1 *
-            (1.0 + 3.0 * math.sqrt(2.0 / 40))).all() and (ratios[1] > 3.0).all(), ratios
+            (1.0 + 3.0 * math.sqrt(2.0 / runs))).all() and (ratios[1] > 3.0).all(), ratios
 
 
 def test_the_rate_of_the_encoder_finds_the_truth_where_nothing_is_late():
