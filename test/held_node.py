@@ -74,7 +74,8 @@ class HeldNode:
 
     def call(self, name, kind):
         """Call a service, and return its response, or a future of it."""
-        offered = {each.service_name: each.callback for each in self.node.services}
+        offered = {self.node.resolve_service_name(each.srv_name): each.callback
+                   for each in self.node.services}
         return offered[name](kind.Request(), kind.Response())
 
     def put(self, name, value):

@@ -153,7 +153,7 @@ def test_samples_that_come_while_the_node_is_not_let_run_are_all_used(start):
 
 def test_parameters_are_checked_described_and_taken_on_at_once(hold):
     held = hold(stationary__threshold=0)
-    names = held.node.list_parameters([], 0).names
+    names = held.node.get_parameters_by_prefix('')
     own = [name for name in names if not name.startswith('qos_overrides') and name not in (
         'use_sim_time', 'start_type_description_service')]
     assert len(own) == 18, own

@@ -193,7 +193,7 @@ def test_the_policy_allows_a_node_exactly_what_it_has(hold_node, wait_until, tmp
                  else {'calibration_file': tmp_path / 'calibration.yaml'})
         node = hold_node(node_of(enclave), {**files, **settings}, {'__ns': namespace}).node
         made = {each.topic_name for each in (*node.publishers, *node.subscriptions)}
-        made |= {each.service_name for each in node.services}
+        made |= {node.resolve_service_name(each.srv_name) for each in node.services}
 
         def have():
             return really(node, node.get_name(), namespace)  # noqa: B023
@@ -300,7 +300,7 @@ def test_the_node_is_no_publisher_of_commands_before_it_may_drive(hold_node, tmp
 def test_no_client_changes_which_files_and_ports_a_running_node_uses(hold_node, tmp_path, enclave):
     held = hold_node(node_of(enclave), {'calibration_file': tmp_path / 'calibration.yaml'}
                      if enclave == 'compensation_node' else {})
-    names = held.node.list_parameters([], 0).names
+    names = held.node.get_parameters_by_prefix('')
     chosen = sorted(name for name in names if name == 'port' or name.endswith('_file'))
     assert chosen == (['port'] if enclave == 'driver_node'
                       else ['calibration.profile_file', 'calibration_file', 'model_file'])
