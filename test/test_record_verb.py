@@ -82,7 +82,7 @@ class Recording:
             target=_record, args=(list(map(str, words)), *self._files, dict(os.environ), limit))
         self.process.start()
 
-    def end(self, number=None, timeout=20.0):
+    def end(self, number=None, timeout=60.0):
         """Send a signal, if given, and return exit code, standard output and standard error."""
         if number is not None:
             os.kill(self.process.pid, number)
@@ -136,7 +136,7 @@ def is_unbroken(log):
 def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
-        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 15.0,
+        wait_until(lambda: (tmp_path / name).exists() and (tmp_path / name).stat().st_size, 60.0,
                    'a first piece')
         time.sleep(1.0)
         code, out, _ = recording.end(number)
@@ -253,11 +253,11 @@ def test_a_gyro_that_is_unplugged_leaves_a_gap(record, wait_until, tmp_path):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--json'))
         wait_until(lambda: (tmp_path / 'a.csv').exists() and (tmp_path / 'a.csv').stat().st_size,
-                   15.0, 'a first piece')
+                   60.0, 'a first piece')
     time.sleep(1.0)
     size = (tmp_path / 'a.csv').stat().st_size
     with gyro(tmp_path / 'gyro'):
-        wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > size + 1000, 15.0,
+        wait_until(lambda: (tmp_path / 'a.csv').stat().st_size > size + 1000, 60.0,
                    'samples after the gap')
         code, out, error = recording.end(signal.SIGINT)
     steps = np.diff(read_log(tmp_path / 'a.csv').time)
@@ -425,9 +425,9 @@ def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
     both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json')
             for name in ('a.csv', 'a.mcap')]
-    wait_until(lambda: robot.is_heard(2), 20.0, 'both recorders')
+    wait_until(lambda: robot.is_heard(2), 60.0, 'both recorders')
     count = robot.drive()
-    wait_until(robot.is_received, 20.0, 'the last message')
+    wait_until(robot.is_received, 60.0, 'the last message')
     answers = [each.end(signal.SIGINT) for each in both]
     for code, out, error in answers:
         assert (code == 0
@@ -459,7 +459,7 @@ def test_publishers_that_come_late_or_with_another_quality_are_heard(
     recording = record('record', '--reference-topic', 'pose', '--reference-topic', 'note',
                        '--out', tmp_path / 'a.mcap', '--json')
     wait_until(lambda: 'nobody publishes /imu/data_raw, /imu/temperature, /pose, /note so far'
-               in recording.error, 20.0, 'a remark')
+               in recording.error, 60.0, 'a remark')
     note = ros.publisher(String, 'note', reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL))
     note.publish(String(data='said before anybody listened'))
     robot.offer('imu/data_raw')
@@ -496,7 +496,7 @@ def test_everything_is_recorded_with_definitions_that_others_understand(
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom', 'pose')
     recording = record('record', '--all', '--out', tmp_path / 'a.mcap')
-    wait_until(robot.is_heard, 20.0, 'the recorder')
+    wait_until(robot.is_heard, 60.0, 'the recorder')
     robot.drive(0.0, 2.0)
     wait_until(robot.is_received, what='the last message')
     assert recording.end(signal.SIGINT)[0] == 0
@@ -515,7 +515,7 @@ def test_a_log_of_a_topic_of_another_kind_is_refused(ros, record, wait_until, tm
     robot = Robot(ros)
     robot.offer('odom')
     recording = record('record', '--topic', 'odom', '--out', tmp_path / 'a.csv')
-    wait_until(robot.is_heard, 20.0, 'the recorder')
+    wait_until(robot.is_heard, 60.0, 'the recorder')
     robot.drive(0.0, 1.0)
     code, out, error = recording.end()
     assert ((code, out) == (2, '')
