@@ -44,12 +44,13 @@ def examined(outputs, noise, false_alarms, step=0.0):
             for number, output in enumerate(outputs)]
 
 
+@pytest.mark.parametrize('runs', [30, pytest.param(100, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('noise', [MEMS, FOG, Noise(1e-4)], ids=['MEMS', 'FOG', 'white'])
 @pytest.mark.parametrize('step', [0.0, 1e-4, 3e-3], ids=['fine', 'coarse', 'very coarse'])
-def test_single_stretches_alarm_in_vain_no_more_often_than_stated(noise, step):
+def test_single_stretches_alarm_in_vain_no_more_often_than_stated(noise, step, runs):
     """State 40 alarms an hour, so that some occur; they correlate within a run, not beyond it."""
     stated, minutes, generator, alarms, rests = 40.0, 6.0, np.random.default_rng(11), [], []
-    for _ in range(100):
+    for _ in range(runs):
         outputs = stretches(noise, minutes / 60.0, generator)
         if step:
             outputs = (np.round(outputs / step + 0.3) - 0.3) * step
