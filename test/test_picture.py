@@ -88,27 +88,36 @@ PICTURES = {**IN_GREY, 'headings': draw_drive}
 each_picture = pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
 
 
-@pytest.fixture
+@pytest.fixture(scope='module')
 def pyplot():
     pytest.importorskip('matplotlib', reason='matplotlib is not installed').use('Agg')
     from matplotlib import pyplot
     return pyplot
 
 
-@pytest.fixture
-def figure_of(pyplot, monkeypatch, tmp_path):
-    """Return a function from one that draws to the figure that it drew, as it is on paper."""
-    drawn = []
-    close = pyplot.close
-    monkeypatch.setattr(pyplot, 'close', drawn.append)
+@pytest.fixture(scope='module')
+def drawn(pyplot, tmp_path_factory):
+    """Return a function from one that draws to the figure, as it is on paper, and the file."""
+    found, folder, close = {}, tmp_path_factory.mktemp('pictures'), pyplot.close
 
-    def figure_of(draw):
-        draw(tmp_path / 'picture.png')
-        drawn[-1].canvas.draw()  # the boxes below are in its dots, not in those of the file
-        return drawn[-1]
-    yield figure_of
-    for figure in drawn:
+    def drawn(draw):
+        if draw not in found:
+            figures, path = [], folder / f'{len(found)}.png'
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(pyplot, 'close', figures.append)
+                draw(path)
+            figures[-1].canvas.draw()  # the boxes below are in its dots, not in those of the file
+            found[draw] = figures[-1], path
+        return found[draw]
+    yield drawn
+    for figure, _ in found.values():
         close(figure)
+
+
+@pytest.fixture
+def figure_of(drawn):
+    """Return a function from one that draws to the figure."""
+    return lambda draw: drawn(draw)[0]
 
 
 @each_picture
@@ -152,9 +161,8 @@ def test_no_text_covers_another_or_leaves_the_paper(figure_of, draw):
 
 
 @pytest.mark.parametrize('draw', IN_GREY.values(), ids=IN_GREY)
-def test_pictures_of_rate_tables_have_no_colours(pyplot, draw, tmp_path):
-    draw(tmp_path / 'picture.png')
-    image = pyplot.imread(tmp_path / 'picture.png')[..., :3]
+def test_pictures_of_rate_tables_have_no_colours(pyplot, drawn, draw):
+    image = pyplot.imread(drawn(draw)[1])[..., :3]
     assert np.ptp(image, axis=2).max() < 0.01
     assert image.min() < 0.1 and len(np.unique(image)) > 10
 
@@ -162,10 +170,11 @@ def test_pictures_of_rate_tables_have_no_colours(pyplot, draw, tmp_path):
 @each_picture
 def test_a_picture_is_svg_where_its_name_says_so_and_does_not_stay_in_memory(
         pyplot, draw, tmp_path):
+    before = pyplot.get_fignums()
     draw(tmp_path / 'picture.svg')
     text = (tmp_path / 'picture.svg').read_text()
     assert '<svg' in text and 'deg' in text and text.rstrip().endswith('</svg>')
-    assert not pyplot.get_fignums()
+    assert pyplot.get_fignums() == before
 
 
 def test_outlying_dwells_are_marked_and_do_not_set_the_scale(figure_of):
