@@ -40,7 +40,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 _DEPTH = 5000  # as SENSOR_QOS: 5 s at 1 kHz are kept while a recorder is busy
-_LAST = 2.0  # s; longest time for taking what had come before a recorder is stopped
+_LAST = 10.0  # s; longest time for taking what had come before a busy recorder is stopped
 _LOOK_INTERVAL = 0.3  # s; between two queries of the graph
 _LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process
 _LINE = '=' * 80
