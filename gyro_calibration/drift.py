@@ -49,6 +49,7 @@ class Turn:
     sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
     lost : variance of what was turned unseen, rad²
     noise : what the variance of the noise is beyond that of as long a time with all samples, rad²
+    wander : variance of what the robot turns at a rest that may be none, and its rates show, rad²
     unseen : there were no rates: the heading stays, and the errors of rates do not affect it; not
         to be added to others
 
@@ -59,6 +60,7 @@ class Turn:
     sensitivity: Array
     lost: float = 0.0
     noise: float = 0.0
+    wander: float = 0.0
     unseen: bool = False
 
     def __add__(self, other: Turn) -> Turn:
@@ -144,11 +146,22 @@ class Drift:
         return self.measured(turn).carried(turn)
 
     def measured(self, turn: Turn) -> Drift:
-        """Return the state at the begin of a time of rest, with what it shows."""
+        """
+        Return the state at the begin of a time of rest, with what it shows.
+
+        Where the robot may turn by a `wander`, that is part of what the rates show and of the
+        heading, which is then that of the end.
+
+        """
         seen, (expected, variance) = self.step(turn).seen, self.expected(turn)
-        gain = self.covariance @ seen / variance
-        return replace(self, mean=self.mean + gain * (turn.turned - expected),
-                       covariance=self.covariance - variance * np.outer(gain, gain))
+        along, variance = self.covariance @ seen, variance + turn.wander
+        covariance = self.covariance
+        if turn.wander:
+            along[HEADING] += turn.wander
+            covariance = covariance.copy()
+            covariance[HEADING, HEADING] += turn.wander
+        return replace(self, mean=self.mean + along / variance * (turn.turned - expected),
+                       covariance=covariance - np.outer(along, along) / variance)
 
     def carried(self, turn: Turn) -> Drift:
         """Return the state after a time in which the heading stood and nothing was measured."""
@@ -277,12 +290,20 @@ def smoothed(states: list[Drift], turns: list[Turn], resting: list[bool]) -> lis
 
 def _with_hindsight(state: Drift, turn: Turn, rest: bool, later: Drift) -> Drift:
     """Return a state with what the one after it has come to."""
-    step, start = state.step(turn), state.measured(turn) if rest else state
-    after = start.carried(turn) if rest else start.moved(turn)
-    transition = np.diag(step.kept)
-    if not rest:
+    step, start = state.step(turn), state
+    if rest:
+        after = state.measured(turn).carried(turn)
+        expected, variance = state.expected(turn)
+        along, variance = state.covariance @ step.seen, variance + turn.wander
+        start = replace(state, mean=state.mean + along / variance * (turn.turned - expected),
+                        covariance=state.covariance - np.outer(along, along) / variance)
+        shared = start.covariance * step.kept
+        shared[:, HEADING] -= along * turn.wander / variance
+    else:
+        after, transition = state.moved(turn), np.diag(step.kept)
         transition[HEADING] -= step.seen
-    back = start.covariance @ transition.T @ _inverse(after.covariance)
+        shared = state.covariance @ transition.T
+    back = shared @ _inverse(after.covariance)
     return replace(
         start, mean=start.mean + back @ (later.mean - after.mean),
         covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)

@@ -29,6 +29,8 @@ from scipy.special import chdtri, ndtri
 BLOCK, WINDOW = 0.1, 0.5
 #: Times, s, over which the mean of the rate is compared with the bias that was known before them.
 LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+#: Times, s, over which the scatter of means over 1 s is compared with the noise.
+SCATTERED = (4.0, 8.0, 16.0, 32.0, 64.0)
 #: A window has at least so many samples.
 _SAMPLES = 8
 #: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
@@ -69,6 +71,12 @@ def sigmas(lag: float, false_alarms: float) -> float:
     """Return the sigmas of a mean over `lag` s that give `false_alarms` per hour at rest."""
     chances = 3600.0 / lag * _OVERLAPPING
     return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
+
+
+def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
+    """Return the sum of squares of means over `lag` s that gives `false_alarms` an hour."""
+    chances = 3600.0 / lag * _OVERLAPPING
+    return float(chdtri(freedom, min(false_alarms / (_TESTS * chances), 0.5)))
 
 
 #: Tests that share the false alarms, and how many more chances windows have that overlap.

@@ -28,7 +28,16 @@ from gyro_calibration.gaps import FASTEST, Gaps, Intervals, LONGEST
 from gyro_calibration.heading import integrate, Threshold, ThresholdFilter
 from gyro_calibration.log import Array, DEGREE, Mask, SHORTEST
 from gyro_calibration.noise import Noise
-from gyro_calibration.rest import BLOCK, Block, Energy, LAGS, sigmas, WINDOW
+from gyro_calibration.rest import (
+    BLOCK,
+    Block,
+    Energy,
+    LAGS,
+    most_scatter,
+    SCATTERED,
+    sigmas,
+    WINDOW,
+)
 import numpy as np
 
 #: A correction of the heading is taken over with this time constant while the robot moves, s.
@@ -50,6 +59,14 @@ _DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
 #: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
 #: goes on is found again.
 _RECOGNIZED = 1.0
+#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much scatter
+#: of means over 1 s on such ways beyond the noise, over its variance, as if seen for so long, s.
+_RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
+#: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
+#: squared standard deviations.
+_STRETCHES, _SCATTER_MEMORY, _SCATTER_MOST = 20.0, 200.0, 40.0
+#: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
+_BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
 #: The slowest turn that is noticed is missed with a probability of 5 %.
 _POWER = 1.645
 
@@ -75,12 +92,64 @@ class Settings:
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """State at some time of a rest; rotation since it began; heading deleted until then, rad."""
+    """
+    State at some time of a rest.
+
+    Attributes
+    ----------
+    drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
+    turn : what the rates came to since it began
+    squares, means : sum of the squared surprises of the steps since it began, and their number
+    excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
+    odds : logarithm of how much likelier they are on a straight way than at a rest
+
+    """
 
     drift: Drift
     turn: Turn
     deleted: float
     steps: int
+    squares: float = 0.0
+    means: int = 0
+    excess: float = 0.0
+    weight: float = 0.0
+    odds: float = 0.0
+
+
+@dataclass
+class _Ways:
+    """
+    How often a straight way passed for a rest, and how much the rates scatter there.
+
+    Attributes
+    ----------
+    rests, ways : how many there were
+    excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
+
+    """
+
+    rests: float = _RESTS
+    ways: float = _WAYS
+    excess: float = _SCATTER * _SCATTER_SEEN
+    weight: float = _SCATTER_SEEN
+
+    @property
+    def scatter(self) -> float:
+        """Return the scatter on a way, over the variance of the noise."""
+        return max(self.excess / self.weight, 0.0)
+
+    def chance(self, odds: float) -> float:
+        """Return the probability that what passes for a rest is a way."""
+        return 1.0 / (1.0 + self.rests / self.ways * math.exp(min(-odds, 700.0)))
+
+    def learn(self, last: _Snapshot) -> None:
+        """Take in all of what passed for a rest."""
+        way = self.chance(last.odds)
+        kept = _STRETCHES / max(_STRETCHES, self.rests + self.ways)
+        self.rests, self.ways = kept * self.rests + 1.0 - way, kept * self.ways + way
+        kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
+        self.excess, self.weight = (kept * self.excess + way * last.excess,
+                                    kept * self.weight + way * last.weight)
 
 
 @dataclass
@@ -148,6 +217,7 @@ class HeadingTracker:
         self._doubt: _Doubt | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
+        self._ways = _Ways()
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
         self._biased: Array | None = None
@@ -183,6 +253,7 @@ class HeadingTracker:
                                        else settings.threshold)
         self._sigmas = {lag: _ALLOWED * sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW, *LAGS)} if self._seeks else {}
+        self._most_scatter: dict[tuple[float, int], float] = {}
         if rests:
             self._rest()
         else:
@@ -433,6 +504,26 @@ class HeadingTracker:
                 else:
                     self._notice(lag)
                 return
+        if wheels is not False:
+            self._compare_scatter()
+
+    def _compare_scatter(self) -> None:
+        """Compare the scatter of the means over 1 s with the noise, over the longer times."""
+        last = self._snapshots[-1]
+        for lag in SCATTERED:
+            before = self._before(lag)
+            if before is None:
+                return
+            if last.squares - before.squares > self._scatter_limit(lag, last.means - before.means):
+                self._notice(lag, max(self._snapshots, key=lambda each: (
+                    last.squares - each.squares - _BEGINS * (last.means - each.means))))
+                return
+
+    def _scatter_limit(self, lag: float, means: int) -> float:
+        if (lag, means) not in self._most_scatter:
+            self._most_scatter[lag, means] = _ALLOWED ** 2 * most_scatter(
+                lag, means, self._settings.false_alarms)
+        return self._most_scatter[lag, means]
 
     def _before(self, lag: float) -> _Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
@@ -460,14 +551,16 @@ class HeadingTracker:
             self._hesitates = _RECOGNIZED
         self._move(WINDOW)
 
-    def _notice(self, lag: float) -> None:
-        """Take the robot for moving since `lag` s before the last block."""
+    def _notice(self, lag: float, before: _Snapshot | None = None) -> None:
+        """Take the robot for moving since `lag` s before the last block, or some snapshot."""
         self._advance()
-        before = self._before(lag) or self._snapshots[0]
+        scattered, before = before is not None, before or self._before(lag) or self._snapshots[0]
         if self._rested.duration < _BRIEF:
             before = self._snapshots[0]
         turn = self._rested - before.turn
-        self._doubt = self._doubtful(before, turn) if lag >= LAGS[0] else None
+        self._doubt = (self._doubtful(before, turn) if lag >= LAGS[0] and not scattered else None)
+        if self._snapshots[-1].means:
+            self._ways.learn(self._snapshots[-1])
         self._drift, self.deleted, self._open = before.drift, before.deleted, turn
         del self.steps[before.steps:]
         self._move(max(lag, WINDOW))
@@ -518,16 +611,30 @@ class HeadingTracker:
         """Take the state on over what is open, but for what is left open."""
         left = left or self._nothing
         turn, self._open = self._open - left, left
-        if self.resting:
-            turn = self._at_rest(turn)
         if turn.duration > 1e-9:
-            self._go_on(turn, self._reached - self._part.duration - left.duration)
             if self.resting:
-                self._rested += turn
-                deleted = self.deleted - self._corrected(self._part)
-                self._snapshots.append(
-                    _Snapshot(self._drift, self._rested, deleted, len(self.steps)))
+                self._advance_at_rest(self._at_rest(turn), left)
+            else:
+                self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._take()
+
+    def _advance_at_rest(self, turn: Turn, left: Turn) -> None:
+        """Take the state on over a part of a rest, and see how much its rates scatter."""
+        before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
+        white = self._drift.noise.angle_random_walk ** 2 * turn.duration
+        squared, weight = (turn.turned - expected) ** 2 / variance, (white / variance) ** 2
+        scatter = self._ways.scatter * white
+        ratio = 1.0 + scatter / variance
+        odds = before.odds + 0.5 * (squared * (1.0 - 1.0 / ratio) - math.log(ratio))
+        turn.wander = self._ways.chance(odds) * scatter
+        squares, squared = before.squares + squared, min(squared, _SCATTER_MOST)
+        self._go_on(turn, self._reached - self._part.duration - left.duration)
+        self._rested += turn
+        self._snapshots.append(_Snapshot(
+            self._drift, self._rested, self.deleted - self._corrected(self._part),
+            len(self.steps), squares, before.means + 1,
+            before.excess + weight * (squared - 1.0) * variance / white, before.weight + weight,
+            odds))
 
     def _go_on(self, turn: Turn, end: float) -> None:
         """Take the state on over a turn that ends at a time, s."""
@@ -537,7 +644,7 @@ class HeadingTracker:
 
     def _at_rest(self, turn: Turn) -> Turn:
         """Return what the rates of a rest came to, without their noise in the sensitivity."""
-        return (turn if self._still is None
+        return (turn + self._nothing if self._still is None
                 else replace(turn, sensitivity=turn.duration * self._still))
 
     def _take(self) -> None:
