@@ -121,15 +121,13 @@ class Drift:
 
     def step(self, turn: Turn) -> Step:
         """Return how the state changes over a turn."""
-        wander, kept, grown = (_unseen if turn.unseen else _wander)(
-            self.noise, round(turn.duration, 6))
-        values = len(self.mean) - len(kept)
-        whole = np.zeros((len(self.mean), len(self.mean)))
-        whole[:len(kept), :len(kept)] = grown
+        seen, kept, grown = _step(self.noise, round(turn.duration, 6), turn.unseen,
+                                  len(turn.sensitivity))
+        seen, grown = seen.copy(), grown.copy()
+        seen[len(seen) - len(turn.sensitivity):] = -turn.sensitivity
         white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
-        whole[HEADING, HEADING] += white + turn.lost + turn.noise
-        return Step(np.concatenate([wander, -turn.sensitivity]),
-                    np.concatenate([kept, np.ones(values)]), whole)
+        grown[HEADING, HEADING] += white + turn.lost + turn.noise
+        return Step(seen, kept, grown)
 
     def moved(self, turn: Turn) -> Drift:
         """Return the state after a turn."""
@@ -138,14 +136,21 @@ class Drift:
         transition[HEADING] -= step.seen
         mean = step.kept * self.mean
         mean[HEADING] += turn.turned - step.seen @ self.mean
-        return replace(self, mean=mean,
-                       covariance=transition @ self.covariance @ transition.T + step.grown)
+        return Drift(self.noise, mean, transition @ self.covariance @ transition.T + step.grown)
+
+    def heading_variance(self, turn: Turn) -> float:
+        """Return the variance of the heading after a turn, rad²."""
+        step = self.step(turn)
+        row = -step.seen
+        row[HEADING] += 1.0
+        return float(row @ self.covariance @ row) + float(step.grown[HEADING, HEADING])
 
     def rested(self, turn: Turn) -> Drift:
         """Return the state after a time in which the true rate was zero."""
-        return self.measured(turn).carried(turn)
+        step = self.step(turn)
+        return self.measured(turn, step).carried(turn, step)
 
-    def measured(self, turn: Turn) -> Drift:
+    def measured(self, turn: Turn, step: Step | None = None) -> Drift:
         """
         Return the state at the begin of a time of rest, with what it shows.
 
@@ -153,24 +158,26 @@ class Drift:
         heading, which is then that of the end.
 
         """
-        seen, (expected, variance) = self.step(turn).seen, self.expected(turn)
-        along, variance = self.covariance @ seen, variance + turn.wander
+        step = step or self.step(turn)
+        along = self.covariance @ step.seen
+        variance = float(step.seen @ along + step.grown[HEADING, HEADING]) + turn.wander
+        off = turn.turned - float(step.seen @ self.mean)
         covariance = self.covariance
         if turn.wander:
             along[HEADING] += turn.wander
             covariance = covariance.copy()
             covariance[HEADING, HEADING] += turn.wander
-        return replace(self, mean=self.mean + along / variance * (turn.turned - expected),
-                       covariance=covariance - np.outer(along, along) / variance)
+        return Drift(self.noise, self.mean + along * (off / variance),
+                     covariance - along[:, None] * along / variance)
 
-    def carried(self, turn: Turn) -> Drift:
+    def carried(self, turn: Turn, step: Step | None = None) -> Drift:
         """Return the state after a time in which the heading stood and nothing was measured."""
-        step = self.step(turn)
+        step = step or self.step(turn)
         grown = step.grown.copy()
         grown[HEADING] = grown[:, HEADING] = 0.0
         grown[HEADING, HEADING] = turn.lost
-        return replace(self, mean=step.kept * self.mean,
-                       covariance=step.kept[:, None] * self.covariance * step.kept + grown)
+        return Drift(self.noise, step.kept * self.mean,
+                     step.kept[:, None] * self.covariance * step.kept + grown)
 
     def expected(self, turn: Turn) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
@@ -243,6 +250,16 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
 
 
 @lru_cache(maxsize=4096)
+def _step(noise: Noise, duration: float, unseen: bool,
+          values: int) -> tuple[Array, Array, Array]:
+    """Return `_wander` or `_unseen` with room for the values of a calibration."""
+    seen, kept, grown = (_unseen if unseen else _wander)(noise, duration)
+    whole = np.zeros((len(kept) + values, len(kept) + values))
+    whole[:len(kept), :len(kept)] = grown
+    return (np.concatenate([seen, np.zeros(values)]), np.concatenate([kept, np.ones(values)]),
+            whole)
+
+
 def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     """
     Return what heading, walk and flicker add to the integral, what stays, and what comes in new.

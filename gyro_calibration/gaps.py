@@ -24,12 +24,14 @@ them, T² N² / (2 dt) instead of N² T.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.log import SHORTEST
+from gyro_calibration.log import Array, SHORTEST
 from gyro_calibration.noise import Noise
+import numpy as np
 
 #: Length of the shortest blocks whose means are compared, s, and the number of lengths, each twice
 #: the one before.
@@ -104,6 +106,33 @@ class Intervals:
         if not self._until:
             self._look()
         return self.count(interval)
+
+    def add_many(self, intervals: Array) -> tuple[Array, int]:
+        """
+        Take intervals, s, as `add` does one by one, up to the first with a lost sample.
+
+        Returns
+        -------
+        the usual interval behind each that was taken, s, and how many samples the last has lost
+
+        """
+        taken, usual = 0, np.empty(len(intervals))
+        while taken < len(intervals):
+            first, part = taken, intervals[taken:taken + max(self._until - 1, 1)]
+            if self._late or self._until == 1 or part[0] > self._limit:
+                taken, lost = taken + 1, self.add(float(part[0]))
+                usual[first] = self.usual
+                if lost:
+                    return usual[:taken], lost
+                continue
+            even = part <= self._limit
+            if not even.all():
+                part = part[:int(np.argmin(even))]
+            self._seen.extend(part.tolist())
+            self._until -= len(part)
+            taken += len(part)
+            usual[first:taken] = self.usual
+        return usual, 0
 
     def count(self, interval: float) -> int:
         """
@@ -211,7 +240,8 @@ class Gaps:
         self._duration, self._count, self._total, self._steps, self._squares, self._products = (
             0.0, 0, 0.0, 0, 0.0, 0.0)
 
-    def add(self, interval: float, rate: float, before: float) -> Gap | None:
+    def add(self, interval: float, rate: float, before: float,
+            lost: int | None = None) -> Gap | None:
         """
         Take a sample that came `interval` s after the one before.
 
@@ -219,13 +249,15 @@ class Gaps:
         ----------
         interval : s
         rate, before : of this sample and of the one before, rad/s
+        lost : samples between them, where the `intervals` have taken this one already
 
         Returns
         -------
         what is lost between them, if anything is
 
         """
-        lost = self.intervals.add(interval)
+        if lost is None:
+            lost = self.intervals.add(interval)
         if lost:
             gap = self._gap(lost, interval, rate - before)
             self._surplus = gap.duration
@@ -247,6 +279,26 @@ class Gaps:
         if self._duration >= _BLOCK - 1e-9:
             self._learn()
         return gap
+
+    def add_many(self, intervals: Array, rates: Array, before: float) -> None:
+        """Take samples without a gap, which the `intervals` have taken already."""
+        steps = np.diff(rates, prepend=before)
+        squares, products = steps * steps, steps * np.append(self._step, steps[:-1])
+        begin, ends = 0, block_ends(intervals, _BLOCK, self._duration)
+        starts = [0, *ends[:-1]] if ends and ends[-1] == len(rates) else [0, *ends]
+        sums = zip(*(np.add.reduceat(values, starts).tolist()
+                     for values in (rates, squares, products, intervals)))
+        for end, (total, squared, multiplied, duration) in zip([*ends, len(rates)], sums):
+            self._count += end - begin
+            self._steps += end - begin
+            self._total += total
+            self._squares += squared
+            self._products += multiplied
+            self._duration += duration
+            if self._duration >= _BLOCK - 1e-9:
+                self._learn()
+            begin = end
+        self._step, self._surplus = float(steps[-1]), 0.0
 
     def _learn(self) -> None:
         """Take in a block."""
@@ -290,6 +342,26 @@ class Gaps:
         points = [(usual, max(self._stepped - 2.0 * density / usual, 0.0))]
         return points + [(each.length, each.without_noise(density)[1])
                          for each in self._levels if each.length > usual]
+
+
+def block_ends(intervals: Array, length: float, begun: float = 0.0) -> list[int]:
+    """
+    Return behind which samples blocks end that last `length` s or a little longer.
+
+    Parameters
+    ----------
+    intervals : before each sample, s
+    length : s
+    begun : what the first block has lasted already, s
+
+    """
+    until, ends = np.cumsum(intervals).tolist(), list[int]()
+    target, place = length - 1e-9 - begun, 0
+    while (place := bisect_left(until, target, place)) < len(until):
+        target = until[place] + length - 1e-9
+        place += 1
+        ends.append(place)
+    return ends
 
 
 def _between(known: list[tuple[float, float]], length: float, steepest: float) -> float:

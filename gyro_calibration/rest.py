@@ -17,12 +17,12 @@ Each test has its share of the false alarms per hour at rest.
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass
 import math
 
 from gyro_calibration.noise import Noise
-import numpy as np
 from scipy.special import chdtri, ndtri
 
 #: Length of a block of samples, and of the window whose energy is looked at, s.
@@ -38,7 +38,7 @@ _SAMPLES = 8
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
 
 
-@dataclass
+@dataclass(slots=True)
 class Block:
     """
     Samples of a short time, as sums.
@@ -83,6 +83,29 @@ def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
 _TESTS, _OVERLAPPING = len(LAGS) + 2, 3.0
 
 
+class _Quietest:
+    """The lowest tenth of the last values."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    @property
+    def count(self) -> int:
+        return len(self._sorted)
+
+    def add(self, value: float) -> float:
+        """Take the next value; return the quantile of 10 %."""
+        if len(self._seen) == _REMEMBERED:
+            self._sorted.pop(bisect_left(self._sorted, self._seen.popleft()))
+        self._seen.append(value)
+        insort(self._sorted, value)
+        place = 0.1 * (len(self._sorted) - 1)
+        below = int(place)
+        low, high = self._sorted[below], self._sorted[min(below + 1, len(self._sorted) - 1)]
+        return low + (place - below) * (high - low)
+
+
 class Energy:
     """
     The energy of the last `WINDOW` s.
@@ -100,9 +123,10 @@ class Energy:
         self._noise = noise
         self._level = false_alarms / (_TESTS * 3600.0 / WINDOW * _OVERLAPPING)
         self._blocks: deque[Block] = deque()
-        self._seen: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
+        self._energies, self._roughnesses = _Quietest(), _Quietest()
         self._since, self._interval = 0.0, BLOCK
         self._sudden: float | None = None
+        self._most: dict[tuple[int, float], float] = {}
 
     def clear(self) -> None:
         """Forget the window, as where rates of another calibration come."""
@@ -110,27 +134,41 @@ class Energy:
 
     def add(self, block: Block) -> bool | None:
         """Take the next block; tell whether the window is only noise; None until it is full."""
-        self._blocks.append(block)
-        while (sum(each.duration for each in self._blocks) - self._blocks[0].duration
-               >= WINDOW + BLOCK - 1e-9
-               and sum(each.count for each in self._blocks) - self._blocks[0].count >= _SAMPLES):
-            self._blocks.popleft()
-        duration, count, total, squares, differences = (
-            sum(values) for values in zip(*(vars(each).values() for each in self._blocks)))
+        blocks = self._blocks
+        blocks.append(block)
+        duration, count = 0.0, 0
+        for each in blocks:
+            duration += each.duration
+            count += each.count
+        while (duration - blocks[0].duration >= WINDOW + BLOCK - 1e-9
+               and count - blocks[0].count >= _SAMPLES):
+            duration -= blocks[0].duration
+            count -= blocks.popleft().count
+        total = squares = differences = means = 0.0
+        for each in blocks:
+            total += each.total
+            squares += each.squares
+            differences += each.differences
+            means += each.total * each.total / each.count
         if duration < WINDOW + BLOCK - 1e-9 or count < _SAMPLES:
             return None
         self._interval, self._sudden = duration / count, None
         claimed = self._noise.rate_variance(self._interval)
         energy = (squares - total * total / count) / (count - 1)
         self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
-        if (energy >= self.factor ** 2 * claimed * float(chdtri(count - 1, self._level))
-                / (count - 1)):
+        claimed *= self.factor ** 2
+        if energy >= claimed * self._exceeded(count - 1, self._level) / (count - 1):
             return False
         # what a robot does is slower than its samples: means over blocks show it far better
-        means = sum(each.total ** 2 / each.count for each in self._blocks) - total * total / count
-        freedom = len(self._blocks) - 1
-        return (freedom < 2
-                or means < self.factor ** 2 * claimed * float(chdtri(freedom, self._level)))
+        freedom = len(blocks) - 1
+        return (freedom < 2 or means - total * total / count
+                < claimed * self._exceeded(freedom, self._level))
+
+    def _exceeded(self, freedom: int, chance: float) -> float:
+        """Return what chi squared exceeds by such a chance."""
+        if (freedom, chance) not in self._most:
+            self._most[freedom, chance] = float(chdtri(freedom, chance))
+        return self._most[freedom, chance]
 
     def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
         """
@@ -144,11 +182,10 @@ class Energy:
         if self._since < WINDOW:
             return
         self._since = 0.0
-        self._seen.append((energy, differences))
-        if len(self._seen) >= _NEEDED:
-            quietest, rough = np.quantile(self._seen, 0.1, axis=0) / (
-                float(chdtri(count - 1, 0.9)) / (count - 1))
-            self.factor = math.sqrt(min(max(min(quietest, rough), 1.0), _TRUSTED ** 2))
+        quietest, rough = self._energies.add(energy), self._roughnesses.add(differences)
+        if self._energies.count >= _NEEDED:
+            quietest = min(quietest, rough) * (count - 1) / self._exceeded(count - 1, 0.9)
+            self.factor = math.sqrt(min(max(quietest, 1.0), _TRUSTED ** 2))
 
     def sudden(self) -> float:
         """

@@ -40,6 +40,9 @@ from gyro_calibration.rest import (
 )
 import numpy as np
 
+#: A rate that changes from one sample to the next by more than this, rad/s, and this acceleration,
+#: rad/s², and then comes back, is no motion of a robot.
+_JUMP, _ACCELERATION = 0.5, 200.0
 #: A correction of the heading is taken over with this time constant while the robot moves, s.
 SETTLING = 1.0
 #: The state goes on at least so often, s.
@@ -67,6 +70,8 @@ _RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
 _STRETCHES, _SCATTER_MEMORY, _SCATTER_MOST = 20.0, 200.0, 40.0
 #: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
 _BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
+#: States of a rest that are remembered.
+_SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
 #: The slowest turn that is noticed is missed with a probability of 5 %.
 _POWER = 1.645
 
@@ -192,6 +197,7 @@ class HeadingTracker:
     deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
     intervals : of the samples, and how many are lost
     refused : samples that were not used, as no robot turns so fast; they count as lost
+    outliers : samples that were not used, as no robot starts and stops so fast; they count as lost
     rebuilt : how often the state was not finite and was built anew
     steps : the way so far, where it is kept
 
@@ -217,7 +223,8 @@ class HeadingTracker:
         self._doubt: _Doubt | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
-        self._ways = _Ways()
+        self._ways, self.outliers = _Ways(), 0
+        self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
         self._biased: Array | None = None
@@ -303,7 +310,7 @@ class HeadingTracker:
         if self.resting:
             return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
         if self._known is None:
-            self._known = float(self._drift.moved(self._open).covariance[HEADING, HEADING])
+            self._known = self._drift.heading_variance(self._open)
         part = self._part
         return (self._known + self._drift.noise.angle_random_walk ** 2 * part.duration
                 + part.lost + part.noise + self._pending ** 2)
@@ -334,6 +341,29 @@ class HeadingTracker:
         if not -FASTEST < rate < FASTEST:
             self.refused += 1
             return ''
+        spike, self._spike = self._spike, None
+        if self._jumps(time, rate):
+            if spike is None:
+                self._spike = time, rate, sensitivity, wheels, still
+                return ''
+            # the rate stays there: when it began to, the samples do not tell
+            self._part.lost += (0.5 * (spike[1] - self._last[1]) * (spike[0] - self._last[0])) ** 2
+            self._add(*spike)
+        elif spike is not None:
+            self.outliers += 1
+        return self._add(time, rate, sensitivity, wheels, still)
+
+    def _jumps(self, time: float, rate: float) -> bool:
+        """Tell whether no robot turns so much faster or slower since the last sample."""
+        if self._last is None:
+            return False
+        interval, step = time - self._last[0], abs(rate - self._last[1])
+        return (step > _JUMP and step > _JUMP + _ACCELERATION * interval
+                and 0.0 <= interval <= self._settings.maximum_gap)
+
+    def _add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
+             still: Array | None, lost: int | None = None) -> str:
+        """Take a sample; `lost` are samples before it where the intervals are known already."""
         self._still = still
         filtered = self._filter.filter(time, rate)
         last, self._last = self._last, (time, rate, filtered, sensitivity)
@@ -347,7 +377,7 @@ class HeadingTracker:
             return said
         self._interval, self._reached = interval, time
         self._integrate(interval, last)
-        gap = self._gaps.add(interval, rate, last[1])
+        gap = None if lost == 0 else self._gaps.add(interval, rate, last[1], lost)
         if gap is not None and (filtered == rate or last[2] == last[1]):
             self._part.lost += gap.motion
             self._part.noise += gap.noise
@@ -527,18 +557,22 @@ class HeadingTracker:
 
     def _before(self, lag: float) -> _Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
-        until = self._rested.duration - lag + 1e-6
-        return next((each for each in reversed(self._snapshots) if each.turn.duration <= until),
-                    None)
+        snapshots, until = self._snapshots, self._rested.duration - lag + 1e-6
+        if snapshots[0].turn.duration > until:
+            return None
+        place = max(len(snapshots) - 1 - round(lag / _STEP), 0)
+        while place + 1 < len(snapshots) and snapshots[place + 1].turn.duration <= until:
+            place += 1
+        while snapshots[place].turn.duration > until:
+            place -= 1
+        return snapshots[place]
 
     # From rest to motion and back
 
     def _rest(self) -> None:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
-        self._snapshots = deque(
-            [_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))],
-            maxlen=round(LAGS[-1] / _STEP) + 8)
+        self._snapshots = [_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
     def _move(self, wanted: float) -> None:
         """Take the robot for moving, until it is quiet for `wanted` s."""
@@ -635,6 +669,7 @@ class HeadingTracker:
             len(self.steps), squares, before.means + 1,
             before.excess + weight * (squared - 1.0) * variance / white, before.weight + weight,
             odds))
+        del self._snapshots[:-_SNAPSHOTS]
 
     def _go_on(self, turn: Turn, end: float) -> None:
         """Take the state on over a turn that ends at a time, s."""
