@@ -140,10 +140,19 @@ class Drift:
 
     def heading_variance(self, turn: Turn) -> float:
         """Return the variance of the heading after a turn, rad²."""
-        step = self.step(turn)
-        row = -step.seen
-        row[HEADING] += 1.0
-        return float(row @ self.covariance @ row) + float(step.grown[HEADING, HEADING])
+        return float(self.heading_variances([turn])[0])
+
+    def heading_variances(self, turns: list[Turn]) -> Array:
+        """Return the same after each of several turns, shape (k,)."""
+        steps = [_step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
+                 for turn in turns]
+        rows = -np.array([seen for seen, _, _ in steps])
+        rows[:, HEADING] += 1.0
+        rows[:, self.calibrated:] = [turn.sensitivity for turn in turns]
+        white = self.noise.angle_random_walk ** 2
+        grown = [float(each[HEADING, HEADING]) + white * turn.duration * (not turn.unseen)
+                 + turn.lost + turn.noise for (_, _, each), turn in zip(steps, turns)]
+        return np.einsum('ki,ij,kj->k', rows, self.covariance, rows) + grown
 
     def rested(self, turn: Turn) -> Drift:
         """Return the state after a time in which the true rate was zero."""

@@ -164,7 +164,7 @@ class Intervals:
         steps = sorted(self._seen)
         middle = self._even = self.usual = max(steps[len(steps) // 2], SHORTEST)
         if (sum(steps) > _TOGETHER * middle * len(steps)
-                or sum(step < _SHORT * middle for step in steps) > _BURSTS * len(steps)):
+                or bisect_left(steps, _SHORT * middle) > _BURSTS * len(steps)):
             # the longest may be gaps
             self._even = steps[-1 - len(steps) // 100]
             self.usual = max(sum(min(step, self._even) for step in steps) / len(steps), SHORTEST)

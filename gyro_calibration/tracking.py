@@ -20,11 +20,12 @@ was taken for bias meanwhile becomes heading again.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
 from gyro_calibration.drift import begin, Drift, HEADING, smoothed, Turn, WALK
-from gyro_calibration.gaps import FASTEST, Gaps, Intervals, LONGEST
+from gyro_calibration.gaps import block_ends, FASTEST, Gaps, Intervals, LONGEST
 from gyro_calibration.heading import integrate, Threshold, ThresholdFilter
 from gyro_calibration.log import Array, DEGREE, Mask, SHORTEST
 from gyro_calibration.noise import Noise
@@ -70,6 +71,10 @@ _RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
 _STRETCHES, _SCATTER_MEMORY, _SCATTER_MOST = 20.0, 200.0, 40.0
 #: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
 _BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
+#: Samples of a log that are taken at once.
+_AT_ONCE = 1 << 15
+#: Blocks at rest whose samples are compared with the bias at once; it is known anew each second.
+_LOOKED_AHEAD = 12
 #: States of a rest that are remembered.
 _SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
 #: The slowest turn that is noticed is missed with a probability of 5 %.
@@ -176,6 +181,177 @@ class _Doubt:
 
 
 @dataclass(frozen=True)
+class _Samples:
+    """Samples as `HeadingTracker.follow` is given them."""
+
+    time: Array
+    rate: Array
+    moving: Array
+    resting: Array
+    wheels: Sequence[bool | None] | None
+    still: Array | None
+
+    def still_at(self, place: int) -> Array | None:
+        return self.still if self.still is None or self.still.ndim == 1 else self.still[place]
+
+    def sample(self, place: int, resting: bool,
+               ) -> tuple[float, float, Array, bool | None, Array | None]:
+        """Return what `HeadingTracker.add` wants."""
+        return (float(self.time[place]), float(self.rate[place]),
+                (self.resting if resting else self.moving)[place],
+                None if self.wheels is None else self.wheels[place], self.still_at(place))
+
+
+@dataclass
+class _Epoch:
+    """
+    Samples over which nothing is learned; the heading, rad, and what is pending of it, at its begin.
+
+    Attributes
+    ----------
+    place : of the sample behind which it begins
+    taken : counts the epochs
+    opens : behind which samples blocks ended, and what the rates came to since the state
+    end : behind its last sample
+
+    """
+
+    place: int
+    taken: int
+    drift: Drift
+    resting: bool
+    heading: float
+    pending: float
+    opens: list[tuple[int, Turn]]
+    end: int = -1
+
+
+class _Piece:
+    """
+    Samples without jumps and gaps, n of them, and their sums by blocks, k of them.
+
+    Attributes
+    ----------
+    time, rate, intervals, halves, turned : stamps, rates, the intervals before them, half of them,
+        and the integrals of the rates over them, shape (n,)
+    moving, resting : sensitivities, shape (n, m)
+    seen : those that were used, with that of the sample before, shape (n + 1, m)
+    begins, ends, whole : of the blocks, and which of them are whole
+    sums : duration, integral, share of a pending correction that stays, sums of the rates, their
+        squares, and the squares of their steps, of each block
+    weighted, weighted_at_rest : integrals of the sensitivities without the sample before, (k, m)
+    found : what `HeadingTracker.follow` returns
+    epochs : begun so far
+
+    """
+
+    def __init__(self, given: _Samples, where: slice, last: tuple[float, float, float, Array],
+                 begun: float, found: Array):
+        """Begin behind the last sample, with a block that has begun for some time, s."""
+        self._given, self._first, self.found = given, where.start, found
+        self.time, self.rate = given.time[where], given.rate[where]
+        self.moving, self.resting = given.moving[where], given.resting[where]
+        count = len(self.time)
+        self.intervals = np.diff(self.time, prepend=last[0])
+        self.halves, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
+        self.turned = self.halves * (2.0 * self.rate - steps)
+        self.seen = np.empty((count + 1, len(last[3])))
+        self.seen[0] = last[3]
+        self.ends = block_ends(self.intervals, BLOCK, begun)
+        whole = len(self.ends)
+        if not self.ends or self.ends[-1] < count:
+            self.ends.append(count)
+        self.begins = [0, *self.ends[:-1]]
+        self.whole = range(bool(begun), whole)
+        weights = self.halves + np.append(self.halves[1:], 0.0)
+        weights[np.array(self.ends) - 1] = self.halves[np.array(self.ends) - 1]
+        self.weighted = self._by_blocks(weights[:, None] * self.moving)
+        self.weighted_at_rest = (self.weighted if self.resting is self.moving
+                                 else self._by_blocks(weights[:, None] * self.resting))
+        sums = [self._by_blocks(values).tolist() for values in (
+            self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
+        self._kept = 1.0 - self.intervals / SETTLING
+        sums.insert(2, np.multiply.reduceat(self._kept, self.begins).tolist())
+        self.sums = list(zip(*sums))
+        self.epochs = list[_Epoch]()
+        self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
+
+    def _by_blocks(self, values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, self.begins))
+
+    def moved(self, number: int) -> Sequence[bool | None]:
+        """Return what the wheels said in a block."""
+        wheels = self._given.wheels
+        return () if wheels is None else wheels[self._first + self.begins[number]:
+                                                self._first + self.ends[number]]
+
+    def still(self, place: int) -> Array | None:
+        return self._given.still_at(self._first + place)
+
+    def extremes(self, number: int, offset: float, values: Array,
+                 taken: int) -> tuple[float, float]:
+        """Return the highest and the lowest corrected rate at rest of a block, rad/s."""
+        known, first, highest, lowest = self._extremes
+        if known != taken or number >= first + len(highest):
+            first, last = number, min(number + _LOOKED_AHEAD, len(self.ends))
+            rows = slice(self.begins[first], self.ends[last - 1])
+            rate = self.rate[rows] + self.resting[rows] @ values
+            rate -= offset
+            places = np.array(self.begins[first:last]) - self.begins[first]
+            highest, lowest = (which.reduceat(rate, places).tolist()
+                               for which in (np.maximum, np.minimum))
+            self._extremes = taken, first, highest, lowest
+        return highest[number - first], lowest[number - first]
+
+    def close(self, end: int) -> None:
+        """Fill in heading and variance up to a sample where the last epoch ends."""
+        if not self.epochs:
+            return
+        epoch = self.epochs[-1]
+        begin, epoch.end = max(epoch.place, 0), end
+        if end <= begin:
+            return
+        rows = self.found[begin:end]
+        rows[:, 4] = epoch.resting
+        if epoch.resting:
+            rows[:, 0] = epoch.heading
+            rows[:, 1] = float(epoch.drift.covariance[HEADING, HEADING]) + epoch.pending ** 2
+            return
+        inside, offset, values = slice(epoch.place + 1, end), epoch.drift.offset[0], (
+            epoch.drift.values[0])
+        pending, turned = (np.empty(end - epoch.place) for _ in range(2))
+        intervals = self.intervals[inside]
+        pending[0], pending[1:] = epoch.pending, self._kept[inside]
+        np.cumprod(pending, out=pending)
+        turned[0] = epoch.heading + epoch.pending
+        turned[1:] = self.turned[inside] - intervals * offset + self.halves[inside] * (
+            (self.seen[1:][inside] + self.seen[:-1][inside]) @ values)
+        np.cumsum(turned, out=turned)
+        known = epoch.drift.heading_variances([turn for _, turn in epoch.opens])
+        places = [place for place, _ in epoch.opens]
+        since = np.append(0.0, np.cumsum(intervals))
+        block = np.searchsorted(places, np.arange(epoch.place, end), side='right') - 1
+        since -= since[np.array(places) - epoch.place][block]
+        variance = known[block] + epoch.drift.noise.angle_random_walk ** 2 * since + pending ** 2
+        rows[:, 0] = (turned - pending)[begin - epoch.place:]
+        rows[:, 1] = variance[begin - epoch.place:]
+
+    def rates(self, usual: Array) -> None:
+        """Fill in the rates and their variances; `usual` are the intervals behind each sample."""
+        found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
+        for epoch in self.epochs:
+            here = slice(max(epoch.place, 0), epoch.end)
+            (offset, variance), (values, covariance, shared) = (
+                epoch.drift.offset, epoch.drift.values)
+            rows = self.seen[1:][here]
+            found[here, 2] = (0.0 if epoch.resting
+                              else self.rate[here] + rows @ values - offset)
+            found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
+                              + epoch.drift.noise.angle_random_walk ** 2
+                              / (WINDOW if epoch.resting else interval[here]))
+
+
+@dataclass(frozen=True)
 class Step:
     """A part of the way: state before, integral of the rates, robot at rest or not, end in s."""
 
@@ -223,7 +399,7 @@ class HeadingTracker:
         self._doubt: _Doubt | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
-        self._ways, self.outliers = _Ways(), 0
+        self._ways, self.outliers, self._taken = _Ways(), 0, 0
         self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
@@ -391,6 +567,130 @@ class HeadingTracker:
         said, self._mended = self._mended, ''
         return said
 
+    # Many samples at once
+
+    def follow(self, time: Array, rate: Array, sensitivity: Array,
+               wheels: Sequence[bool | None] | None = None, still: Array | None = None,
+               resting: Array | None = None) -> Array:
+        """
+        Take samples as `add` does, whole blocks at once where nothing is decided within them.
+
+        Parameters
+        ----------
+        time, rate : as in `add`, shape (n,)
+        sensitivity : as in `add`, shape (n, m)
+        wheels : as in `add`, n of them, or None
+        still : as in `add`, shape (m,) or (n, m)
+        resting : stands for `sensitivity` where the robot rests before a sample, shape (n, m)
+
+        Returns
+        -------
+        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, shape (n, 5)
+
+        """
+        given = _Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
+                         wheels, still)
+        found, begin = np.empty((len(time), 5)), 0
+        while begin < len(time):
+            count = self._even(time[begin:begin + _AT_ONCE], rate[begin:begin + _AT_ONCE])
+            if count:
+                begin = self._follow_even(given, begin, begin + count, found)
+            else:
+                self.add(*given.sample(begin, self.resting))
+                found[begin] = self._found()
+                begin += 1
+        return found
+
+    def _found(self) -> tuple[float, float, float, float, bool]:
+        return self.heading, self.variance, self.rate, self.rate_variance, self.resting
+
+    def _even(self, time: Array, rate: Array) -> int:
+        """Return how many samples come without a jump of stamps or rates."""
+        if not self._seeks or self._last is None or self._spike is not None:
+            return 0
+        intervals = np.diff(time, prepend=self._last[0])
+        with np.errstate(invalid='ignore'):
+            steps = np.abs(np.diff(rate, prepend=self._last[1]))
+            even = ((np.abs(rate) < FASTEST) & (intervals >= 0.0)
+                    & (intervals <= self._settings.maximum_gap)
+                    & (steps <= _JUMP + _ACCELERATION * intervals))
+        return len(even) if even.all() else int(np.argmin(even))
+
+    def _follow_even(self, given: _Samples, begin: int, end: int, found: Array) -> int:
+        """Take samples without jumps up to the next lost ones; return behind which sample."""
+        assert self._last is not None
+        usual, lost = self.intervals.add_many(
+            np.diff(given.time[begin:end], prepend=self._last[0]))
+        count = len(usual) - bool(lost)
+        if count:
+            piece = _Piece(given, slice(begin, begin + count), self._last, self._block.duration,
+                           found[begin:begin + count])
+            self._gaps.add_many(piece.intervals, piece.rate, self._last[1])
+            if not self._block.duration:
+                piece.epochs.append(self._epoch(-1))
+            for number, until in enumerate(piece.ends):
+                if number in piece.whole and self._take_block(piece, number):
+                    if self._taken != piece.epochs[-1].taken:
+                        piece.close(until - 1)
+                        piece.epochs.append(self._epoch(until - 1))
+                    elif not self.resting:
+                        piece.epochs[-1].opens.append((until - 1, self._open))
+                    continue
+                piece.close(piece.begins[number])
+                for place in range(piece.begins[number], until):
+                    sample = given.sample(begin + place, self.resting)
+                    piece.seen[place + 1] = sample[2]
+                    self._add(*sample, lost=0)
+                    found[begin + place] = self._found()
+                if not self._block.duration:
+                    piece.epochs.append(self._epoch(until - 1))
+            if not self._block.duration:
+                piece.close(count)
+            piece.rates(usual[:count])
+            self.rate = float(piece.found[-1, 2])
+        if lost:
+            self._add(*given.sample(begin + count, self.resting), lost=lost)
+            found[begin + count] = self._found()
+        return begin + len(usual)
+
+    def _epoch(self, place: int) -> _Epoch:
+        return _Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
+                      [(place, self._open)])
+
+    def _take_block(self, piece: _Piece, number: int) -> bool:
+        """Take a whole block; return False, and take nothing, where it ends a rest within."""
+        begin, end, moved = piece.begins[number], piece.ends[number], piece.moved(number)
+        driven = True in moved
+        if self.resting:
+            highest, lowest = piece.extremes(number, self._offset, self._values, self._taken)
+            limit = math.hypot(self._energy.sudden(), self._unsure)
+            if driven or highest > limit or lowest < -limit:
+                return False
+        elif self._hesitates > 0.0:
+            return False
+        part, block, sums = self._part, self._block, piece.sums[number]
+        rows, weighted = (piece.resting, piece.weighted_at_rest) if self.resting else (
+            piece.moving, piece.weighted)
+        piece.seen[begin + 1:end + 1] = rows[begin:end]
+        part.duration, part.turned, decayed = sums[:3]
+        part.sensitivity = weighted[number] + piece.halves[begin] * piece.seen[begin]
+        block.duration, block.count, block.total, block.squares, block.differences = (
+            part.duration, end - begin, *sums[3:])
+        turned = self._corrected(part)
+        if self.resting:
+            self.deleted += turned
+        else:
+            self.heading += turned + self._pending * (1.0 - decayed)
+            self._pending *= decayed
+        time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
+        self._last = time, rate, rate, rows[end - 1]
+        self._interval, self._reached = float(piece.intervals[end - 1]), time
+        self._still = piece.still(end - 1)
+        self._end_block(driven, moved[-1] if moved else None)
+        if not -math.inf < self.heading < math.inf:
+            self._rebuild()
+        return True
+
     def _off(self, sensitivity: Array) -> float:
         """Return what a rate is off by, as seen at rest, rad/s; cached for one sensitivity."""
         if sensitivity is not self._seen:
@@ -435,9 +735,12 @@ class HeadingTracker:
             self._notice(0.0)
         self._driven = self._driven or bool(wheels)
         if self._block.duration >= BLOCK - 1e-9:
-            quiet = self._energy.add(self._block)
-            self._judge(False if self._driven else quiet, self._driven or wheels)
-            self._block, self._driven = Block(), False
+            self._end_block(self._driven, wheels)
+
+    def _end_block(self, driven: bool, wheels: bool | None) -> None:
+        quiet = self._energy.add(self._block)
+        self._judge(False if driven else quiet, driven or wheels)
+        self._block, self._driven = Block(), False
 
     def _judge(self, quiet: bool | None, wheels: bool | None) -> None:
         """Decide at the end of a block; one that cannot yet be told from a rest ends none."""
@@ -686,15 +989,16 @@ class HeadingTracker:
         """Take over the state and the noise of the samples; the heading does not jump."""
         if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
             self._rebuild()
-        loud = self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0
-        if (noise := replace(self._claimed, angle_random_walk=loud
-                             * self._claimed.angle_random_walk)) != self._drift.noise:
-            self._drift = replace(self._drift, noise=noise)
+        walk = self._claimed.angle_random_walk * (
+            self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0)
+        if walk != self._drift.noise.angle_random_walk:
+            self._drift = replace(
+                self._drift, noise=replace(self._claimed, angle_random_walk=walk))
         self._gaps.noise = self._drift.noise
         self._offset, self._values, self._seen, self._biased = (
             self._drift.offset[0], self._drift.values[0], None, None)
         self._unsure = _FAR * self.bias[1]
-        self._known = None
+        self._known, self._taken = None, self._taken + 1
         estimate = float(self._drift.mean[HEADING]) + (
             0.0 if self.resting else self._corrected(self._open + self._part))
         self._pending = estimate - self.heading
@@ -784,7 +1088,7 @@ class Track:
 
 
 def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
-          settings: Settings, wheels: list[bool | None] | None = None, hindsight: bool = False,
+          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
           age: float | None = 0.0, still: Array | None = None) -> Track:
     """
     Return the heading over a whole log.
@@ -804,12 +1108,7 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
 
     """
     tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
-    found = np.empty((len(time), 5))
-    for index, (at, value, seen) in enumerate(zip(time.tolist(), rate.tolist(),
-                                                  np.ascontiguousarray(sensitivity.T))):
-        tracker.add(at, value, seen, None if wheels is None else wheels[index], still)
-        found[index] = (tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance,
-                        tracker.resting)
+    found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)
     heading, variance, shown, rate_variance, resting = found.T
     live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted,
                  tracker.intervals)
