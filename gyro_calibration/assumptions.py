@@ -25,7 +25,7 @@ import math
 
 from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.compensation import covariance
-from gyro_calibration.log import Array, DEGREE
+from gyro_calibration.log import Array, DEGREE, Number
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 import numpy as np
 
@@ -82,18 +82,18 @@ def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
     return whole
 
 
-def sensitive(model: GyroModel, sensitivity: Array, distance: float) -> Array:
+def sensitive(model: GyroModel, sensitivity: Array, distance: Number) -> Array:
     """
-    Return what the rate changes by for each value of `uncertain`, shape (m,).
+    Return what the rate changes by for each value of `uncertain`, shape (m, ...).
 
     Parameters
     ----------
-    sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1,)
-    distance : of the temperature from where the bias is known, K
+    sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1, ...)
+    distance : of the temperature from where the bias is known, K, a number or shape (...)
 
     """
     place = _place(model, len(sensitivity))
-    whole = np.empty(len(sensitivity) + 1)
+    whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
     whole[:place], whole[place], whole[place + 1:] = (
         sensitivity[:place], -distance, sensitivity[place:])
     return whole
@@ -133,6 +133,16 @@ class Way:
         (first, near), (last, far), part = (
             self._computed(below), self._computed(below + 1), steps - below)
         return first + part * (last - first), near + part * (far - near)
+
+    def along(self, temperature: Array) -> tuple[Array, Array]:
+        """Return the same as `at` for several temperatures, shape (n,) each."""
+        steps = (temperature - self.begin) / _STEP
+        below = np.floor(steps).astype(int)
+        known, places = np.unique(below, return_inverse=True)
+        near, far = (np.array([self._computed(int(step) + ahead) for step in known])[places]
+                     for ahead in (0, 1))
+        change, distance = (near + (steps - below)[:, None] * (far - near)).T
+        return change, distance
 
     def _computed(self, step: int) -> tuple[float, float]:
         if step not in self._known:

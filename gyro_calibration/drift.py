@@ -219,6 +219,14 @@ class Drift:
         covariance[place, place] += variance
         return replace(self, covariance=covariance)
 
+    def known_to_head(self, heading: float, variance: float) -> Drift:
+        """Return the state where later times have shown the heading, rad, rad²."""
+        own = self.covariance[HEADING, HEADING]
+        gain = self.covariance[HEADING] / own if own > 0.0 else 0.0 * self.covariance[HEADING]
+        return replace(
+            self, mean=self.mean + gain * (heading - self.mean[HEADING]),
+            covariance=self.covariance + (variance - own) * np.outer(gain, gain))
+
     def turned_to(self, heading: float, variance: float = 0.0) -> Drift:
         """Return the state with another heading, rad, and its variance, rad²."""
         mean, covariance = self.mean.copy(), self.covariance.copy()

@@ -44,6 +44,8 @@ _OF_POINTS, _OF_MEANS = 0.4, 0.5
 #: A step over a gap that is so many times the usual one is new in these seconds: the robot began
 #: to turn, or stopped.
 _UNMET = 5.0
+#: Durations are compared to this, s: stamps in seconds since 1970 are not known better.
+CLOSE = 1e-6
 #: Largest rate, rad/s, and time without samples, s, so that the variance after a gap is finite.
 FASTEST, LONGEST = 1e4, 1e9
 #: Intervals that are remembered; so many must be known to tell a gap.
@@ -276,7 +278,7 @@ class Gaps:
         self._count += 1
         self._total += rate
         self._duration += interval
-        if self._duration >= _BLOCK - 1e-9:
+        if self._duration >= _BLOCK - CLOSE:
             self._learn()
         return gap
 
@@ -295,7 +297,7 @@ class Gaps:
             self._squares += squared
             self._products += multiplied
             self._duration += duration
-            if self._duration >= _BLOCK - 1e-9:
+            if self._duration >= _BLOCK - CLOSE:
                 self._learn()
             begin = end
         self._step, self._surplus = float(steps[-1]), 0.0
@@ -356,9 +358,9 @@ def block_ends(intervals: Array, length: float, begun: float = 0.0) -> list[int]
 
     """
     until, ends = np.cumsum(intervals).tolist(), list[int]()
-    target, place = length - 1e-9 - begun, 0
+    target, place = length - CLOSE - begun, 0
     while (place := bisect_left(until, target, place)) < len(until):
-        target = until[place] + length - 1e-9
+        target = until[place] + length - CLOSE
         place += 1
         ends.append(place)
     return ends

@@ -20,7 +20,7 @@ what rests show of it goes into the table for the next run.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
@@ -29,7 +29,8 @@ from gyro_calibration.assumptions import assumed, Assumptions, sensitive, uncert
 from gyro_calibration.bias_table import BiasTable, carry
 from gyro_calibration.compensation import compensate, Compensated, quadratic_form, rate_sensitivity
 from gyro_calibration.effects import Channels
-from gyro_calibration.log import Array, DEGREE
+from gyro_calibration.gaps import CLOSE
+from gyro_calibration.log import Array, DEGREE, Mask
 from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
 from gyro_calibration.tracking import HeadingTracker, Settings
 import numpy as np
@@ -48,6 +49,10 @@ _STILL = 0.5
 #: In motion it is computed so often, s, and where the rate has changed by more than so much, rad/s
 #: plus a part of it.
 _HELD, _NEAR, _ALIKE = 0.1, 0.5 * DEGREE, 0.02
+#: A temperature that is older is held, and counts as less and less known, s.
+TEMPERATURE_TIMEOUT = 10.0
+#: Samples of a log that are taken at once.
+_AT_ONCE = 1 << 15
 #: A calibration that turns out to be older or younger by so much is carried anew, s; one from
 #: further ahead has no known age.
 _OLDER = 3600.0
@@ -68,6 +73,7 @@ class _Stretch:
     seen : what the rate changes by for each uncertain value, shape (m,), first at the begin, in
         the end on the mean
     count, modelled, temperature : how many, rates after the model, rad/s, and temperatures, degC
+    over : the rest has ended
 
     """
 
@@ -76,6 +82,7 @@ class _Stretch:
     count: int = 0
     modelled: float = 0.0
     temperature: float = 0.0
+    over: bool = False
 
     def mean(self) -> tuple[float, float]:
         """Return the mean rate after the model, and temperature."""
@@ -103,7 +110,7 @@ class HeadingEstimator:
     """
 
     def __init__(self, model: GyroModel, table: BiasTable, assumptions: Assumptions,
-                 settings: Settings, temperature_timeout: float, now: float):
+                 settings: Settings, temperature_timeout: float, now: float, keep: bool = False):
         """
         Begin at heading zero.
 
@@ -114,10 +121,11 @@ class HeadingEstimator:
         settings : of the tracker
         temperature_timeout : an older temperature is held, and counts as less and less known, s
         now : s since 1970
+        keep : the way of the tracker, for `tracking.in_hindsight`
 
         """
-        self._assumptions, self._settings, self._timeout = (
-            assumptions, settings, temperature_timeout)
+        self._assumptions, self._settings, self._timeout, self._keep = (
+            assumptions, settings, temperature_timeout, keep)
         self.temperature: float | None = None
         self._heard_temperature, self._anchored, self._this_run, self._other_age = (
             -math.inf, False, False, False)
@@ -127,6 +135,7 @@ class HeadingEstimator:
         self._refused, self.refused_temperatures = 0, 0
         self._stretch: _Stretch | None = None
         self._pending: deque[_Stretch] = deque(maxlen=8)
+        self._table_said = ''
         self.model, self.table = model, table
         self._tracker: HeadingTracker | None = None
         self._history = model.history()
@@ -190,7 +199,8 @@ class HeadingEstimator:
                           else self._carried(now))
         self.covariance = uncertain(self.used, self._assumptions)
         if self._tracker is None:
-            self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age)
+            self._tracker = HeadingTracker(self.used.noise, self.covariance, self._settings, age,
+                                           self._keep)
         else:
             self._tracker.use(self.used.noise, self.covariance, age)
         self._begun = now
@@ -200,6 +210,7 @@ class HeadingEstimator:
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._still: Array = self._sensitivity
         self._still_at, self._looked = -math.inf, (-math.inf, 0.0)
+        self._held: Array | None = None
         self._stretch = None
         self._pending.clear()
         self.beginnings += 1
@@ -318,7 +329,7 @@ class HeadingEstimator:
         return None if self.temperature_is_lost else self.temperature
 
     def add(self, time: float, output: float, now: float, force: float | None = None,
-            wheels: bool | None = None) -> str:
+            wheels: bool | None = None, supply: float | None = None) -> str:
         """
         Take a sample.
 
@@ -329,6 +340,7 @@ class HeadingEstimator:
         now : s since 1970
         force : specific force, m/s², if it came
         wheels : whether wheels or commands move the robot; None where nobody says so
+        supply : voltage, V, if it came
 
         Returns
         -------
@@ -344,7 +356,8 @@ class HeadingEstimator:
                           self._this_run and last > -math.inf)
         if self._other_age or heard and not goes_on:
             self._begin(now)
-        around = self._look_around(time - last, force) if self.used.looks_around else None
+        around = (self._look_around(time - last, force, supply)
+                  if self.used.looks_around else None)
         if heard and goes_on:
             self._hear_again(now, around)
         self.last = result = compensate(self.used, output, self.temperature, around)
@@ -353,12 +366,13 @@ class HeadingEstimator:
         rate = float(result.rate)
         if gone:
             rate -= gone * (1.0 if calibration is None else calibration.scale)
-        if abs(time - self._still_at) > _STILL:
+        if abs(time - self._still_at) > _STILL + CLOSE:
             self._still, self._still_at = self._sensitive(output, 0.0, around, distance), time
         self._look_at(time, output, float(result.rate), around, distance)
         said = tracker.add(time, rate, self._sensitivity, wheels, self._still)
         self.corrected, self.rate = rate, tracker.rate
         self._gather(time, bool(said))
+        self._learn_at_rest(now)
         return said
 
     def plausible(self, time: float, output: float, force: float | None = None) -> bool:
@@ -370,13 +384,18 @@ class HeadingEstimator:
     def _look_at(self, time: float, output: float, rate: float, around: Channels | None,
                  distance: float) -> None:
         """Keep the costly sensitivity at rest, and for a moment at nearly the same rate."""
-        if self.tracker.resting:
-            self._sensitivity, self._looked = self._still, (time, 0.0)
-            return
         at, looked = self._looked
-        if abs(time - at) > _HELD or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
-            self._sensitivity, self._looked = (
-                self._sensitive(output, rate, around, distance), (time, rate))
+        if abs(time - at) > _HELD + CLOSE or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
+            self._held, self._looked = None, (time, rate)
+            self._held_at = output, rate, self.last.temperature, around, distance
+        if self.tracker.resting:
+            self._sensitivity = self._still
+            return
+        if self._held is None:
+            seen, known, temperature, surroundings, far = self._held_at
+            self._held = sensitive(self.used, rate_sensitivity(
+                self.used, seen, known, temperature, surroundings), far)
+        self._sensitivity = self._held
 
     def _sensitive(self, output: float, rate: float, around: Channels | None,
                    distance: float) -> Array:
@@ -395,7 +414,8 @@ class HeadingEstimator:
         return (self._shift + gone,
                 self._astray + distance + math.copysign(_unheard(late), distance))
 
-    def _look_around(self, interval: float, force: float | None) -> Channels:
+    def _look_around(self, interval: float, force: float | None,
+                     supply: float | None) -> Channels:
         """
         Return what effects look at beside rate, output and temperature.
 
@@ -407,13 +427,178 @@ class HeadingEstimator:
         self._elapsed += interval
         ahead = self.rate * interval if interval <= self._settings.maximum_gap else 0.0
         return self._history.follow(
-            self._elapsed, self.temperature, force,
+            self._elapsed, self.temperature, force, supply,
             heading=self._turned_before + self.tracker.heading + ahead)
+
+    # A whole log
+
+    def follow(self, time: Array, output: Array, begun: float, temperature: Array | None = None,
+               wheels: Sequence[bool | None] | None = None, force: Array | None = None,
+               supply: Array | None = None) -> Array:
+        """
+        Take the samples of a log, with the same result as one by one.
+
+        Parameters
+        ----------
+        time, output : s and rad/s, shape (n,)
+        begun : date of time 0, s since 1970
+        temperature : degC; nan where none came, and None for none at all
+        wheels, force, supply : as in `add`, n of them, or None
+
+        Returns
+        -------
+        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker saw it,
+        and 1 where the temperature was clipped and where the output is beyond the range of the
+        model, shape (n, 8)
+
+        """
+        found, place = np.empty((len(time), 8)), 0
+        while place < len(time):
+            end = self._even(time, output, temperature, place)
+            if end > place:
+                rows = slice(place, end)
+                self._follow_even(time[rows], output[rows],
+                                  None if temperature is None else temperature[rows],
+                                  None if wheels is None else wheels[rows], found[rows])
+            else:
+                end = place + 1
+                if temperature is not None and temperature[place] == temperature[place]:
+                    self.hear_temperature(float(time[place]), float(temperature[place]))
+                self.add(float(time[place]), float(output[place]), begun + float(time[place]),
+                         None if force is None else float(force[place]),
+                         None if wheels is None else wheels[place],
+                         None if supply is None else float(supply[place]))
+                tracker = self.tracker
+                found[place] = (tracker.heading, tracker.variance, self.rate,
+                                tracker.rate_variance, tracker.resting, self.corrected,
+                                self.last.temperature_clipped, self.last.beyond_range)
+            place, beginnings = end, self.beginnings
+            self._learn_at_rest(begun + float(time[place - 1]))
+            if self.beginnings > beginnings:
+                found[place - 1, [1, 3]] = self.tracker.variance, self.tracker.rate_variance
+        return found
+
+    def _even(self, time: Array, output: Array, temperature: Array | None, place: int) -> int:
+        """Return up to which sample model, table and way of the bias stay as they are."""
+        if (self.used.looks_around or self._time == -math.inf or self._other_age
+                or self._anchored == (temperature is None)
+                or temperature is None and self.temperature is not None):
+            return place
+        # a stretch of rest that is complete may let the tracker begin anew
+        begin = self._stretch.begin if self._stretch else float(time[place])
+        end = int(np.searchsorted(time[place:], begin + STRETCH - CLOSE)) + place
+        end = min(end + (self._stretch is not None), len(time), place + _AT_ONCE)
+        rows, limit = slice(place, end), self.used.rate_limit
+        known = (np.abs(output[rows]) <= limit) & (np.abs(time[rows]) <= _LATEST)
+        if temperature is not None:
+            coldest, hottest = self.model.temperature_limits
+            known &= (coldest <= temperature[rows]) & (temperature[rows] <= hottest)
+        return end if known.all() else place + int(np.argmin(known))
+
+    def _follow_even(self, time: Array, output: Array, temperature: Array | None,
+                     wheels: Sequence[bool | None] | None, found: Array) -> None:
+        """Take plausible samples, at most up to the end of a stretch of rest."""
+        used, tracker, last = self.used, self.tracker, self._time
+        self._time = float(time[-1])
+        result = compensate(used, output, temperature)
+        gone, distance = np.zeros(len(time)), np.zeros(len(time))
+        if temperature is not None:
+            self.temperature, self._heard_temperature = float(temperature[-1]), self._time
+            gone += self._shift
+            distance += self._astray
+            if self._way is not None:
+                change, far = self._way.along(temperature)
+                gone, distance = gone + change, distance + far
+            else:
+                gone[:], distance[:] = self._gone(self._time)
+        calibration = used.self_calibration
+        rate = np.asarray(result.rate) - gone * (
+            1.0 if calibration is None else calibration.scale)
+        still = self._stills(time, output, result, distance)
+        found[:, :5] = tracker.follow(
+            time, rate, self._looks(time, output, result, distance), wheels, still, still)
+        found[:, 5], found[:, 6], found[:, 7] = (
+            rate, result.temperature_clipped, result.beyond_range)
+        self.last = Compensated(*(float(np.asarray(values)[-1]) if np.ndim(values) else values
+                                  for values in vars(result).values()))
+        self.corrected, self.rate = float(rate[-1]), float(found[-1, 2])
+        self._sensitivity = tracker.sensitivity
+        interval = np.diff(time, prepend=last)
+        self._gather_all(time, np.asarray(result.modelled), temperature, still,
+                         (found[:, 4] > 0.5) & (interval >= 0.0)
+                         & (interval <= self._settings.maximum_gap))
+
+    def _stills(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
+        """Return the sensitivities at rest, which are computed every `_STILL` s, shape (n, m)."""
+        places = list[int]()
+        for place, at in enumerate(time.tolist()):
+            if abs(at - self._still_at) > _STILL + CLOSE:
+                places.append(place)
+                self._still_at = at
+        rows = self._rows(places, output, np.zeros(len(output)), result, distance)
+        counts = np.diff([0, *places, len(time)])
+        whole = np.repeat(np.vstack([self._still, rows]), counts, axis=0)
+        self._still = whole[-1]
+        return whole
+
+    def _looks(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
+        """Return the sensitivities in motion, which are held for a moment, shape (n, m)."""
+        places, (at, looked) = list[int](), self._looked
+        rates = np.asarray(result.rate)
+        for place, (now, rate) in enumerate(zip(time.tolist(), rates.tolist())):
+            if abs(now - at) > _HELD + CLOSE or abs(rate - looked) > _NEAR + _ALIKE * abs(rate):
+                places.append(place)
+                at, looked = now, rate
+        if self._held is None and (not places or places[0]) and self._looked[0] > -math.inf:
+            seen, known, temperature, surroundings, far = self._held_at
+            self._held = sensitive(self.used, rate_sensitivity(
+                self.used, seen, known, temperature, surroundings), far)
+        held = self._still if self._held is None else self._held
+        rows = self._rows(places, output, rates, result, distance)
+        self._looked = at, looked
+        whole = np.repeat(np.vstack([held, rows]), np.diff([0, *places, len(time)]), axis=0)
+        self._held = whole[-1]
+        return whole
+
+    def _rows(self, places: list[int], output: Array, rate: Array, result: Compensated,
+              distance: Array) -> Array:
+        """Return the sensitivities of some samples, shape (k, m)."""
+        if not places:
+            return np.empty((0, len(self.covariance)))
+        temperature = result.temperature
+        return sensitive(self.used, rate_sensitivity(
+            self.used, output[places], rate[places],
+            temperature[places] if isinstance(temperature, np.ndarray) else temperature),
+            distance[places]).T
+
+    def _gather_all(self, time: Array, modelled: Array, temperature: Array | None, still: Array,
+                    resting: Mask) -> None:
+        """Gather samples at rest to a stretch, as `_gather` does one by one."""
+        moving = np.flatnonzero(~resting)
+        first = int(moving[-1]) + 1 if len(moving) else 0
+        if first:
+            self._end_rest()
+        if first or temperature is None:
+            self._stretch = None
+        if first == len(time) or temperature is None:
+            return
+        if self._stretch is None:
+            self._stretch = _Stretch(float(time[first]), still[first])
+        stretch = self._stretch
+        stretch.count += len(time) - first
+        stretch.modelled += float(modelled[first:].sum())
+        stretch.temperature += float(temperature[first:].sum())
+        if time[-1] - stretch.begin >= STRETCH - CLOSE:
+            stretch.seen = 0.5 * (stretch.seen + still[-1])
+            self._pending.append(stretch)
+            self._stretch = None
 
     # What rests teach the next run
 
     def _gather(self, time: float, restarted: bool) -> None:
         """Gather samples at rest to stretches."""
+        if restarted or not self.tracker.resting:
+            self._end_rest()
         if (restarted or not self.tracker.resting or self.temperature is None
                 or self.temperature_is_lost):
             self._stretch = None
@@ -424,7 +609,7 @@ class HeadingEstimator:
         stretch.count += 1
         stretch.modelled += float(self.last.modelled)
         stretch.temperature += self.temperature
-        if time - stretch.begin >= STRETCH:
+        if time - stretch.begin >= STRETCH - CLOSE:
             stretch.seen = 0.5 * (stretch.seen + self._still)
             self._pending.append(stretch)
             self._stretch = None
@@ -438,13 +623,22 @@ class HeadingEstimator:
 
         Returns
         -------
-        '', or what the table said
+        '', or what the table said since the last call
 
         """
-        said = ''
+        said, self._table_said = self._table_said, ''
         while len(self._pending) > (self.tracker.resting and not ending):
             said = self._teach(self._pending.popleft(), now) or said
         return said
+
+    def _end_rest(self) -> None:
+        for each in self._pending:
+            each.over = True
+
+    def _learn_at_rest(self, now: float) -> None:
+        """Teach the table as soon as the next stretch is complete; `learn` may come later."""
+        while len(self._pending) > 1 and self.tracker.resting:
+            self._table_said = self._teach(self._pending.popleft(), now) or self._table_said
 
     def _teach(self, stretch: _Stretch, now: float) -> str:
         bias, temperature = stretch.mean()
@@ -453,7 +647,7 @@ class HeadingEstimator:
         if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
             return ''
         said = self.table.add(temperature, bias, variance, now)
-        if (self._way is not None and self.tracker.resting
+        if (self._way is not None and self.tracker.resting and not stretch.over
                 and abs(temperature - self._way.begin) > _AWAY):
             self._begin(now)
         return said

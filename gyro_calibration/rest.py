@@ -22,6 +22,7 @@ from collections import deque
 from dataclasses import dataclass
 import math
 
+from gyro_calibration.gaps import CLOSE
 from gyro_calibration.noise import Noise
 from scipy.special import chdtri, ndtri
 
@@ -140,7 +141,7 @@ class Energy:
         for each in blocks:
             duration += each.duration
             count += each.count
-        while (duration - blocks[0].duration >= WINDOW + BLOCK - 1e-9
+        while (duration - blocks[0].duration >= WINDOW + BLOCK - CLOSE
                and count - blocks[0].count >= _SAMPLES):
             duration -= blocks[0].duration
             count -= blocks.popleft().count
@@ -150,7 +151,7 @@ class Energy:
             squares += each.squares
             differences += each.differences
             means += each.total * each.total / each.count
-        if duration < WINDOW + BLOCK - 1e-9 or count < _SAMPLES:
+        if duration < WINDOW + BLOCK - CLOSE or count < _SAMPLES:
             return None
         self._interval, self._sudden = duration / count, None
         claimed = self._noise.rate_variance(self._interval)
@@ -161,8 +162,8 @@ class Energy:
             return False
         # what a robot does is slower than its samples: means over blocks show it far better
         freedom = len(blocks) - 1
-        return (freedom < 2 or means - total * total / count
-                < claimed * self._exceeded(freedom, self._level))
+        return bool(freedom < 2 or means - total * total / count
+                    < claimed * self._exceeded(freedom, self._level))
 
     def _exceeded(self, freedom: int, chance: float) -> float:
         """Return what chi squared exceeds by such a chance."""
@@ -179,7 +180,7 @@ class Energy:
 
         """
         self._since += duration
-        if self._since < WINDOW:
+        if self._since < WINDOW - CLOSE:
             return
         self._since = 0.0
         quietest, rough = self._energies.add(energy), self._roughnesses.add(differences)

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 import math
 
 from gyro_calibration.drift import begin, Drift, HEADING, smoothed, Turn, WALK
-from gyro_calibration.gaps import block_ends, FASTEST, Gaps, Intervals, LONGEST
+from gyro_calibration.gaps import block_ends, CLOSE, FASTEST, Gaps, Intervals, LONGEST
 from gyro_calibration.heading import integrate, Threshold, ThresholdFilter
 from gyro_calibration.log import Array, DEGREE, Mask, SHORTEST
 from gyro_calibration.noise import Noise
@@ -63,8 +63,9 @@ _DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
 #: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
 #: goes on is found again.
 _RECOGNIZED = 1.0
-#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much scatter
-#: of means over 1 s on such ways beyond the noise, over its variance, as if seen for so long, s.
+#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much
+#: scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for so
+#: long, s.
 _RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
 #: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
 #: squared standard deviations.
@@ -205,7 +206,7 @@ class _Samples:
 @dataclass
 class _Epoch:
     """
-    Samples over which nothing is learned; the heading, rad, and what is pending of it, at its begin.
+    Samples over which nothing is learned; heading and what is pending of it at the begin, rad.
 
     Attributes
     ----------
@@ -376,6 +377,7 @@ class HeadingTracker:
     outliers : samples that were not used, as no robot starts and stops so fast; they count as lost
     rebuilt : how often the state was not finite and was built anew
     steps : the way so far, where it is kept
+    renewed : numbers of steps behind which another calibration was used, and the state before it
 
     """
 
@@ -394,6 +396,7 @@ class HeadingTracker:
         """
         self.heading = self.rate = self.deleted = 0.0
         self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
+        self.renewed = list[tuple[int, Drift]]()
         self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
         self._known: float | None = None
         self._doubt: _Doubt | None = None
@@ -452,6 +455,11 @@ class HeadingTracker:
 
         """
         heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
+        if self._keep and self._last is not None:
+            drift, turn = self._drift, self._open + self._part
+            self._go_on(self._at_rest(turn) if self.resting else turn, self._reached)
+            self.renewed.append((len(self.steps), self._drift))
+            self._drift = drift
         self._still = None
         if self._last is not None:
             self._last = (*self._last[:3], np.zeros(len(covariance)))
@@ -518,7 +526,7 @@ class HeadingTracker:
             self.refused += 1
             return ''
         spike, self._spike = self._spike, None
-        if self._jumps(time, rate):
+        if self._last is not None and self._jumps(time, rate):
             if spike is None:
                 self._spike = time, rate, sensitivity, wheels, still
                 return ''
@@ -559,7 +567,7 @@ class HeadingTracker:
             self._part.noise += gap.noise
         if self._seeks:
             self._look(interval if gap is None else interval - gap.duration, last[1], wheels)
-        elif self._part.duration >= _STEP:
+        elif self._part.duration >= _STEP - CLOSE:
             self._settle()
         self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
         if not -math.inf < self.heading + self.rate < math.inf:
@@ -585,7 +593,7 @@ class HeadingTracker:
 
         Returns
         -------
-        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, shape (n, 5)
+        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
 
         """
         given = _Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
@@ -734,7 +742,7 @@ class HeadingTracker:
                              > math.hypot(self._energy.sudden(), self._unsure)):
             self._notice(0.0)
         self._driven = self._driven or bool(wheels)
-        if self._block.duration >= BLOCK - 1e-9:
+        if self._block.duration >= BLOCK - CLOSE:
             self._end_block(self._driven, wheels)
 
     def _end_block(self, driven: bool, wheels: bool | None) -> None:
@@ -749,7 +757,7 @@ class HeadingTracker:
         if self.resting:
             if quiet is False:
                 self._notice(WINDOW)
-            elif self._open.duration >= _STEP:
+            elif self._open.duration >= _STEP - CLOSE:
                 self._advance()
                 self._compare(wheels)
             return
@@ -759,7 +767,7 @@ class HeadingTracker:
             # an even turn has no more energy than a rest: nothing is held back while wheels move
             self._move(WINDOW)
         self._hold(part)
-        if self._open.duration >= self._held.duration + _STEP:
+        if self._open.duration >= self._held.duration + _STEP - CLOSE:
             self._advance(self._held)
         if quiet and self._stands(wheels):
             self._advance(self._settled())
@@ -770,7 +778,7 @@ class HeadingTracker:
         self._recent.append(part)
         self._held += part
         while (len(self._recent) > 2
-               and self._held.duration - self._recent[0].duration >= self._wanted - 1e-9):
+               and self._held.duration - self._recent[0].duration >= self._wanted - CLOSE):
             self._held -= self._recent.popleft()
 
     def _settled(self) -> Turn:
@@ -779,7 +787,7 @@ class HeadingTracker:
 
     def _stands(self, wheels: bool | None) -> bool:
         """Tell whether the mean of a quiet time that is long enough may be that of a rest."""
-        if self._held.duration < self._wanted - 1e-9 or len(self._recent) < 2:
+        if self._held.duration < self._wanted - CLOSE or len(self._recent) < 2:
             return False
         most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
         stands = abs(self._surprise(self._drift, self._at_rest(self._settled()),
@@ -834,6 +842,7 @@ class HeadingTracker:
                     self._drift = self._drift.uncertain(
                         WALK, ((turn.turned - expected) / turn.duration) ** 2)
                     self._rest()
+                    self._take()
                 else:
                     self._notice(lag)
                 return
@@ -860,7 +869,7 @@ class HeadingTracker:
 
     def _before(self, lag: float) -> _Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
-        snapshots, until = self._snapshots, self._rested.duration - lag + 1e-6
+        snapshots, until = self._snapshots, self._rested.duration - lag + CLOSE
         if snapshots[0].turn.duration > until:
             return None
         place = max(len(snapshots) - 1 - round(lag / _STEP), 0)
@@ -892,7 +901,7 @@ class HeadingTracker:
         """Take the robot for moving since `lag` s before the last block, or some snapshot."""
         self._advance()
         scattered, before = before is not None, before or self._before(lag) or self._snapshots[0]
-        if self._rested.duration < _BRIEF:
+        if self._rested.duration < _BRIEF - CLOSE:
             before = self._snapshots[0]
         turn = self._rested - before.turn
         self._doubt = (self._doubtful(before, turn) if lag >= LAGS[0] and not scattered else None)
@@ -948,7 +957,7 @@ class HeadingTracker:
         """Take the state on over what is open, but for what is left open."""
         left = left or self._nothing
         turn, self._open = self._open - left, left
-        if turn.duration > 1e-9:
+        if turn.duration > CLOSE:
             if self.resting:
                 self._advance_at_rest(self._at_rest(turn), left)
             else:
@@ -1039,7 +1048,12 @@ class HeadingTracker:
     @property
     def bias(self) -> tuple[float, float]:
         """Return the bias seen at rest beyond the calibration, and its uncertainty, rad/s."""
-        return self.bias_by(self._nothing.sensitivity if self._last is None else self._last[3])
+        return self.bias_by(self.sensitivity)
+
+    @property
+    def sensitivity(self) -> Array:
+        """Return that of the last sample."""
+        return self._nothing.sensitivity if self._last is None else self._last[3]
 
     def bias_by(self, sensitivity: Array) -> tuple[float, float]:
         """Return the same for another sensitivity, (m,), as of samples at another temperature."""
@@ -1132,9 +1146,18 @@ def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     time, rate : of the samples, s and rad/s, shape (n,)
 
     """
-    last, steps = tracker.finish(), tracker.steps
-    states = smoothed([*(step.before for step in steps), last], [step.turn for step in steps],
-                      [step.resting for step in steps])
+    last, steps, states = tracker.finish(), tracker.steps, list[Drift]()
+    end, later = len(steps), None
+    # a calibration that was used later knows the heading alone of what was before
+    for first, before in [*tracker.renewed[::-1], (0, None)]:
+        part = steps[first:end]
+        states = smoothed(
+            [*(step.before for step in part), last if later is None else later],
+            [step.turn for step in part], [step.resting for step in part]) + states[1:]
+        if before is not None:
+            here, end = states[0], first
+            later = last = before.known_to_head(
+                float(here.mean[HEADING]), float(here.covariance[HEADING, HEADING]))
     ends = np.array([time[0], *(step.end for step in steps)])
     heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
                                   for state in states]).T

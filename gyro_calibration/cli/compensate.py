@@ -15,10 +15,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime, timezone
 import math
 from typing import Any
 
-from gyro_calibration.assumptions import assumed, Assumptions
+from gyro_calibration.assumptions import Assumptions
+from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -29,14 +31,15 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
 )
-from gyro_calibration.compensation import Compensated, covariance, quadratic_form, rate_sensitivity
+from gyro_calibration.compensation import covariance, quadratic_form
 from gyro_calibration.gaps import Intervals
 from gyro_calibration.heading import BlockIntegrator, Threshold
+from gyro_calibration.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.log_compensation import LogCompensation, none_plausible, plausible, rows_of
-from gyro_calibration.model import GyroModel
+from gyro_calibration.model import GyroModel, with_self_calibration
 from gyro_calibration.model_file import read_model
-from gyro_calibration.tracking import Settings, Track, track
+from gyro_calibration.tracking import in_hindsight, Settings
 import numpy as np
 
 
@@ -173,36 +176,61 @@ def _interval(time: Array, known: Mask) -> float:
 
 
 def _followed(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
-    """Give the whole log as one piece, followed from rest to rest."""
+    """Give the whole log as one piece, followed as the node follows its samples."""
     log = read(given)
     log = replace(log, output=output_of(given, log))
-    known, supposed = plausible(model, log), assumed(model, Assumptions())
+    known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
         raise DataRefused(f'{given.log}: rests show in samples over time; '
                           'give a log with time_s, or say --rate')
-    rows, compensation = rows_of(log, known), LogCompensation(supposed)
-    result, sensitivity = compensation.add(rows)
-    tracked = _tracked(given, supposed, rows, compensation.true_time(np.asarray(rows.time)),
-                       result, sensitivity)
+    if log.temperature is not None and not plausible(model, log).any():
+        raise DataRefused(f'{given.log}: {none_plausible(model)}')
+    rows = rows_of(log, known)
+    time, output = LogCompensation(model).true_time(np.asarray(rows.time)), np.asarray(rows.output)
+    estimator, begun = _begun(model, rows, given.hindsight)
+    # the state of the wheels
+    moving = None if rows.moving is None else [bool(each) for each in rows.moving]
+    found = estimator.follow(time, output, begun, rows.temperature, moving, rows.specific_force,
+                             rows.supply)
+    heading, variance, rate, rate_variance, resting, corrected, clipped, beyond = found.T
+    if given.hindsight:
+        if not np.isfinite(found).all():
+            raise DataRefused(f'{given.log}: the variance of the heading is beyond all numbers')
+        heading, variance, resting = in_hindsight(estimator.tracker, time, corrected)
     yield _Piece(log, known, {
-        'rate_rad_s': tracked.rate, 'heading_rad': tracked.heading,
-        'heading_std_rad': np.sqrt(tracked.variance),
-        'rate_std_rad_s': np.sqrt(tracked.rate_variance),
-        'resting': tracked.resting.astype(float),
-        'temperature_clipped': result.temperature_clipped,
-        'beyond_range': result.beyond_range}, tracked.intervals)
+        'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
+        'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
+        'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
 
 
-def _tracked(given: argparse.Namespace, model: GyroModel, log: Log, time: Array,
-             result: Compensated, sensitivity: Array) -> Track:
-    """Return the heading of a log from rest to rest; `moving` is the state of the wheels."""
-    wheels: list[bool | None] | None = (None if log.moving is None
-                                        else [bool(moving) for moving in log.moving])
-    middle = float(np.median(np.asarray(log.output))), 0.0, float(np.median(result.temperature))
-    still = None if model.looks_around else rate_sensitivity(model, *middle)
-    return track(time, np.asarray(result.rate), sensitivity, model.noise, covariance(model),
-                 Settings(), wheels, given.hindsight, 0.0 if model.self_calibration else None,
-                 still)
+#: Stamps beyond this are s since 1970.
+_DATED = 1e9
+
+
+def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, float]:
+    """
+    Return what follows the log, and the date of time 0, s since 1970.
+
+    Stamps that are no dates do not tell how old a calibration is: it is taken for one that was
+    made just before.
+
+    """
+    assert log.time is not None
+    dated, calibration = log.time[0] > _DATED, model.self_calibration
+    begun = 0.0 if dated else _DATED
+    now = begun + float(log.time[0])
+    if not dated and calibration is not None and calibration.temperature is None:
+        known = (np.zeros(0) if log.temperature is None
+                 else log.temperature[np.isfinite(log.temperature)])
+        if len(known):
+            model = with_self_calibration(model, replace(calibration, temperature=float(known[0])))
+    estimator = HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(),
+                                 TEMPERATURE_TIMEOUT, now, keep)
+    if not dated and calibration is not None:
+        when = datetime.fromtimestamp(now, timezone.utc).isoformat()
+        estimator.use(with_self_calibration(model, replace(
+            model.self_calibration or calibration, time=when)), now)
+    return estimator, begun
 
 
 def _columns(model: GyroModel, compensation: LogCompensation, integrator: BlockIntegrator,

@@ -31,7 +31,7 @@ from gyro_calibration.assumptions import Assumptions
 from gyro_calibration.bias_table import Prior
 from gyro_calibration.driver.timestamps import HostClock, read_together
 from gyro_calibration.heading import Threshold
-from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.log import DEGREE
 from gyro_calibration.messages import NSEC_PER_SEC
 from gyro_calibration.noise import Noise
@@ -89,8 +89,6 @@ PARAMETERS = (
 REST_FALSE_ALARMS = 0.1
 #: False alarms of the monitor of noise and bias, in an hour at rest, 1/h.
 HEALTH_FALSE_ALARMS = 0.001
-#: A temperature that is older is held, and counts as less and less known, s.
-TEMPERATURE_TIMEOUT = 10.0
 #: A gyro that was silent for this time, s, may have been without power, with another bias since.
 POWER_OFF = 10.0
 #: The mean rate over this time shows whether a robot turns that is to be driven, s.

@@ -1,0 +1,158 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""A log that is followed at once has the heading of single samples, and that of the node."""
+
+import math
+from time import process_time
+
+from gyro_calibration.assumptions import Assumptions
+from gyro_calibration.bias_table import BiasTable
+from gyro_calibration.cli.main import main
+from gyro_calibration.compensation import covariance, rate_sensitivity
+from gyro_calibration.effects import BIAS
+from gyro_calibration.heading_estimator import HeadingEstimator
+from gyro_calibration.log import DEGREE, Log, read_log, write_log
+from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.tracking import HeadingTracker, Settings
+import numpy as np
+import pytest
+from rig import BEGIN, Rig
+
+NOW, INTERVAL = 1.7e9, 0.01
+NOISE = Noise(0.6 * DEGREE / 60.0, 20.0 * DEGREE / 3600.0)
+CALIBRATED = SelfCalibration(0.0, 0.01, ((1e-6, 0.0), (0.0, 1e-8)))
+MODEL = (f'effects: {{bias: {{bias: 0.005}}}}\nnoise: {{angle_random_walk: '
+         f'{NOISE.angle_random_walk}, bias_instability: {NOISE.bias_instability}}}\n')
+
+
+def drive(seconds, seed, coefficient=0.0, bias=0.005):
+    """Return time, true rate, output and temperature of turns, ways and rests that warm up."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(round(seconds / INTERVAL)) * INTERVAL
+    rate, begin = np.zeros(len(time)), 1500
+    while begin < len(time):
+        length = int(generator.integers(100, 800))
+        kind, part = generator.random(), np.arange(length) * INTERVAL
+        rate[begin:begin + length] = (
+            generator.uniform(-60.0, 60.0) * np.sin(math.pi * part / part[-1]) ** 2 if kind < 0.4
+            else 0.3 * np.sin(6.0 * part) if kind < 0.6
+            else 0.0 * part)[:len(time) - begin] * DEGREE
+        begin += length
+    temperature = 25.0 + 20.0 * np.minimum(time / seconds / 0.7, 1.0)
+    output = rate + bias + coefficient * (temperature - 25.0) + simulate_noise(
+        NOISE, len(time), INTERVAL, generator)
+    return time, rate, output, temperature
+
+
+def lossy(*columns):
+    """Return the columns without some rows: lost samples, and a gap."""
+    kept = np.ones(len(columns[0]), bool)
+    kept[5000:5007] = kept[9000:9400] = False
+    return [column[kept] for column in columns]
+
+
+def by_samples(tracker, time, rate, sensitivity, still, wheels):
+    found = np.empty((len(time), 5))
+    for place in range(len(time)):
+        tracker.add(float(time[place]), float(rate[place]), sensitivity[place],
+                    None if wheels is None else wheels[place], still)
+        found[place] = (tracker.heading, tracker.variance, tracker.rate, tracker.rate_variance,
+                        tracker.resting)
+    return found
+
+
+@pytest.mark.parametrize('with_wheels', [False, True])
+def test_whole_blocks_at_once_give_the_heading_of_single_samples(with_wheels):
+    model = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
+    time, rate, output, _ = drive(150.0, 1)
+    output[8000] += 30.0
+    output[8100:8103] += 10.0
+    output[10000] = math.nan
+    time, rate, output = lossy(time, rate, output)
+    corrected = np.asarray(CALIBRATED.correct(output))
+    sensitivity = rate_sensitivity(model, output, corrected, 25.0).T
+    still = rate_sensitivity(model, 0.0, 0.0, 25.0)
+    wheels = [bool(each) for each in rate != 0.0] if with_wheels else None
+    single, whole = (HeadingTracker(NOISE, covariance(model), Settings(), 0.0) for _ in range(2))
+    expected = by_samples(single, time, corrected, sensitivity, still, wheels)
+    found = whole.follow(time, corrected, sensitivity, wheels, still)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    assert single.intervals.lost == whole.intervals.lost > 0
+    assert single.outliers == whole.outliers == 1 and single.refused == whole.refused == 1
+
+
+@pytest.mark.parametrize('calibration', [None, CALIBRATED], ids=['uncalibrated', 'calibrated'])
+def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibration):
+    time, _, output, temperature = drive(240.0, 2, 0.02 * DEGREE)
+    output[15000:20000] = output[10000] * 0.0 + 0.005 + 0.02 * DEGREE * (
+        temperature[15000:20000] - 25.0)  # a rest in which it gets warm
+    output[8000] += 30.0
+    output[13000] = 1e4
+    temperature[11000:11300] = math.nan
+    temperature[12500] = 1e9
+    time, output, temperature = lossy(time, output, temperature)
+    model = GyroModel((Term(BIAS, (0.005,)),), noise=NOISE, self_calibration=calibration)
+    single, whole = (HeadingEstimator(model, BiasTable(model), Assumptions(), Settings(), 10.0,
+                                      NOW) for _ in range(2))
+    expected = np.empty((len(time), 6))
+    for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
+        if degc == degc:
+            single.hear_temperature(at, degc)
+        single.add(at, float(output[place]), NOW + at)
+        tracker = single.tracker
+        expected[place] = (tracker.heading, tracker.variance, single.rate, tracker.rate_variance,
+                           tracker.resting, single.corrected)
+    found = whole.follow(time, output, NOW, temperature)
+    np.testing.assert_allclose(found[:, :6], expected, rtol=1e-11, atol=1e-12)
+    assert single.beginnings == whole.beginnings > 2, 'the tracker begins anew where it is warm'
+    assert single.refused == whole.refused == 1
+    assert single.refused_temperatures == whole.refused_temperatures == 1
+    assert [entry.bias for entry in whole.table.entries] == pytest.approx(
+        [entry.bias for entry in single.table.entries], rel=1e-9)
+
+
+def test_compensate_and_the_node_give_the_same_heading_while_the_gyro_warms_up(tmp_path):
+    time, rate, output, temperature = drive(300.0, 3, 0.02 * DEGREE)
+    rig = Rig(tmp_path, model=MODEL, stationary_method='rest')
+    node = rig.feed(output, INTERVAL, temperature)
+    write_log(tmp_path / 'log.csv', Log(
+        output=output, time=BEGIN + INTERVAL + time, temperature=temperature))
+    columns = {}
+    for words in ('--rest', '--hindsight'):
+        assert main(['compensate', str(tmp_path / 'log.csv'), '--model',
+                     str(tmp_path / 'model.yaml'), '--out', str(tmp_path / 'out.csv'),
+                     words]) == 0
+        others = read_log(tmp_path / 'out.csv').others
+        columns[words] = {name: np.array(values, float) for name, values in others.items()}
+    np.testing.assert_allclose(columns['--rest']['heading_rad'],
+                               [each.heading for each in node], atol=2e-6)
+    np.testing.assert_allclose(columns['--rest']['heading_std_rad'] ** 2,
+                               [each.heading_variance for each in node], rtol=1e-4)
+    true = np.cumsum(rate) * INTERVAL
+    for words, found in columns.items():
+        error = np.abs(found['heading_rad'] - true)
+        assert error[-1] < 3.0 * found['heading_std_rad'][-1], words
+        assert error.max() < 10.0 * DEGREE, (words, '80 deg where the bias is that of the begin')
+
+
+def test_a_log_is_followed_faster_at_once_than_sample_by_sample():
+    model = GyroModel(noise=NOISE, self_calibration=CALIBRATED)
+    time, _, output, _ = drive(200.0, 4)
+    corrected = np.asarray(CALIBRATED.correct(output))
+    sensitivity = np.ascontiguousarray(rate_sensitivity(model, output, corrected, 25.0).T)
+    spent = []
+    for follow in (by_samples, lambda tracker, *log: tracker.follow(*log[:3], None, log[3])):
+        begin = process_time()
+        follow(HeadingTracker(NOISE, covariance(model), Settings(), 0.0), time, corrected,
+               sensitivity, rate_sensitivity(model, 0.0, 0.0, 25.0), None)
+        spent.append(process_time() - begin)
+    assert spent[1] < 0.6 * spent[0], spent
