@@ -190,9 +190,13 @@ class Drift:
 
     def expected(self, turn: Turn) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
-        step = self.step(turn)
-        return (float(step.seen @ self.mean),
-                float(step.seen @ self.covariance @ step.seen + step.grown[HEADING, HEADING]))
+        values, noise = len(turn.sensitivity), self.noise
+        seen, _, grown = _step(noise, round(turn.duration, 6), turn.unseen, values)
+        seen = seen.copy()
+        seen[len(seen) - values:] = -turn.sensitivity
+        white = 0.0 if turn.unseen else noise.angle_random_walk ** 2 * turn.duration
+        return (float(seen @ self.mean), float(seen @ self.covariance @ seen)
+                + float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise)
 
     @cached_property
     def offset(self) -> tuple[float, float]:

@@ -238,8 +238,8 @@ class _Piece:
     moving, resting : sensitivities, shape (n, m)
     seen : those that were used, with that of the sample before, shape (n + 1, m)
     begins, ends, whole : of the blocks, and which of them are whole
-    sums : duration, integral, share of a pending correction that stays, sums of the rates, their
-        squares, and the squares of their steps, of each block
+    sums : duration, integral, share of a pending correction that stays, half of the first
+        interval, and sums of the rates, their squares, and the squares of their steps, by block
     weighted, weighted_at_rest : integrals of the sensitivities without the sample before, (k, m)
     found : what `HeadingTracker.follow` returns
     epochs : begun so far
@@ -272,7 +272,8 @@ class _Piece:
         sums = [self._by_blocks(values).tolist() for values in (
             self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
         self._kept = 1.0 - self.intervals / SETTLING
-        sums.insert(2, np.multiply.reduceat(self._kept, self.begins).tolist())
+        sums[2:2] = [np.multiply.reduceat(self._kept, self.begins).tolist(),
+                     self.halves[self.begins].tolist()]
         self.sums = list(zip(*sums))
         self.epochs = list[_Epoch]()
         self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
@@ -681,9 +682,9 @@ class HeadingTracker:
             piece.moving, piece.weighted)
         piece.seen[begin + 1:end + 1] = rows[begin:end]
         part.duration, part.turned, decayed = sums[:3]
-        part.sensitivity = weighted[number] + piece.halves[begin] * piece.seen[begin]
+        part.sensitivity = weighted[number] + sums[3] * piece.seen[begin]
         block.duration, block.count, block.total, block.squares, block.differences = (
-            part.duration, end - begin, *sums[3:])
+            part.duration, end - begin, *sums[4:])
         turned = self._corrected(part)
         if self.resting:
             self.deleted += turned
