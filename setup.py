@@ -44,10 +44,12 @@ lint = ['ruff', 'mypy', 'pydocstyle', 'flake8', 'flake8-blind-except', 'flake8-b
         'flake8-class-newline', 'flake8-comprehensions', 'flake8-deprecated', 'flake8-docstrings',
         'flake8-import-order', 'flake8-quotes']
 build = ['setuptools', 'wheel', 'colcon-ros', 'colcon-bash', 'colcon-package-information']
+# vqf and imufusion are other programs that `benchmarks` compares with
+peers = ['vqf', 'imufusion']
 # launch_testing, where it is installed, needs a pytest older than 8.4; rosbags writes recordings;
 # mujoco reads what export writes
 test = ['pytest<8.4', 'pytest-xdist', 'rosbags', 'mcap>=1.6', 'mujoco', *plot, *fuzz, *lint,
-        *build]
+        *build, *peers]
 
 # Executables belong into lib/<package>, where `ros2 run` and launch look; only the command line
 # has to be on the PATH. setup.cfg says so to colcon and to bloom. pip does not read that: it puts
@@ -69,7 +71,7 @@ setup(
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
     ], extras_require={
         'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED),
-        'plot': plot, 'test': test
+        'plot': plot, 'test': test, 'peers': peers
     }, zip_safe=False, entry_points={
         'console_scripts': [
             'gyro_calibration = gyro_calibration.cli.main:main',

@@ -22,8 +22,8 @@ A course has no common clock with the gyro and no common zero: the offset in tim
 the one with the least median error of the heading of this program, and is used for all; the zero
 is the median of the first 20 s of the course. The table has the median and the 95th percentile of
 the error over the drive, the median over the last 20 s, and for this program the share of the
-course inside of the stated 95 %, where the course has an error of its own: 1 deg for cars, 3 deg for
-RC cars, plus what is turned in 0.2 s, for side slip and smoothing.
+course inside of the stated 95 %, where the course has an error of its own: 1 deg for cars, 3 deg
+for RC cars, plus what is turned in 0.2 s, for side slip and smoothing.
 
 """
 

@@ -1135,6 +1135,17 @@ def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance
     return replace(live, heading=later, variance=with_hindsight, resting=rested)
 
 
+def _without_spikes(time: Array, rate: Array) -> Array:
+    """Return rates with what the tracker holds for no motion interpolated, shape (n,)."""
+    jumps = np.abs(np.diff(rate)) > _JUMP + _ACCELERATION * np.diff(time)
+    back = np.abs(rate[2:] - rate[:-2]) <= _JUMP + _ACCELERATION * (time[2:] - time[:-2])
+    spikes = np.flatnonzero(jumps[:-1] & back) + 1
+    if not len(spikes):
+        return rate
+    kept = np.delete(np.arange(len(rate)), spikes)
+    return np.interp(time, time[kept], rate[kept])
+
+
 def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
     """
     Return heading, rad, its variance, rad², and rest, shape (n,) each, with all that came later.
@@ -1162,7 +1173,7 @@ def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Arr
     ends = np.array([time[0], *(step.end for step in steps)])
     heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
                                   for state in states]).T
-    turned = integrate(time, rate)
+    turned = integrate(time, _without_spikes(time, rate))
     rested = np.array([step.resting for step in steps] or [False])
     resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
     moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
