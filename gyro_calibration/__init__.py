@@ -25,8 +25,8 @@ Reading order: `columns`, `log`, `messages`, `storage`, `recording`, `stamps`, `
 `simulator_export`, `compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`,
 `assumptions`, `heading_estimator`, `log_compensation`, `likelihood`, `doubt`, `mishap`,
 `self_calibration`, `whole_turns`, `plan`; then, for the laboratory, `allan`, `dwells`, `scatter`,
-`calibration`, `selection`, `course_over_ground`, `encoder`, `turn`, `diagnosis`, `reproduction`;
-then the folders `driver`, on the robot `ros`, and `cli`.
+`tolerance`, `calibration`, `selection`, `course_over_ground`, `encoder`, `turn`, `diagnosis`,
+`reproduction`; then the folders `driver`, on the robot `ros`, and `cli`.
 
 """
 

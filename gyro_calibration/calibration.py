@@ -31,6 +31,7 @@ from gyro_calibration.scatter import (
     Uncertainty,
     Whitener,
 )
+from gyro_calibration.tolerance import tolerance_of
 import numpy as np
 from scipy.linalg import solve_triangular
 
@@ -92,9 +93,27 @@ class Calibration:
     def model(self) -> GyroModel:
         """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
         used = take(self.dwells, self.scatter.kept)
-        columns, residual = _forward(used, self.terms)
-        covariance = self._uncertainty(columns, residual).covariance() if self.freedom else None
-        return _model(used, self.terms, covariance)
+        if not self.freedom:
+            return _model(used, self.terms, None)
+        uncertainty = self._uncertainty(*_forward(used, self.terms))
+        covariance, sweeps = uncertainty.covariance(), uncertainty.sweeps.tolist()
+        scatter = replace(self.scatter, sweep_bias=sweeps[0], sweep_scale=sweeps[1])
+
+        def columns(rate: Array, temperature: Array) -> Array:
+            channels = Channels(rate, rate, temperature)
+            return np.column_stack([row for term in self.terms
+                                    for row in term.sensitivity(channels)])
+
+        tolerance = tolerance_of(used, Whitener(used, scatter), uncertainty.sweeps, columns,
+                                 covariance)
+        return replace(_model(used, self.terms, covariance), tolerance=tolerance)
+
+    def deviation_of(self, effect: Effect) -> float:
+        """Return the standard deviation of the last value of an effect."""
+        owners = [term.effect for term in self.terms for _ in term.fitted]
+        assert self.model.covariance is not None
+        place = len(owners) - 1 - owners[::-1].index(effect)
+        return math.sqrt(float(self.model.covariance[place, place]))
 
     def chance_of(self, effect: Effect) -> float:
         """Return the two-sided probability of as much of an effect where there is none."""

@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 from gyro_calibration.effects import Channels, Effect, Number
-from gyro_calibration.history import History
+from gyro_calibration.history import clip, History
 from gyro_calibration.log import Array, DEGREE, Mask
 from gyro_calibration.noise import Noise
 import numpy as np
@@ -30,6 +30,9 @@ import numpy as np
 _FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
 #: Plausible temperatures, degC, where no valid range is stated.
 _TEMPERATURES = (-100.0, 200.0)
+#: A correction is extrapolated over the width of the valid temperatures, K, and at least over so
+#: much, which is what a robot warms up by after a cold start; from there on it is held.
+_EXTRAPOLATED = 20.0
 #: The response is inverted where the output grows by at least so much with the rate, 1.
 _FLATTEST = 0.1
 #: Numbers of Python overflow without a word, and to say so for each sample would take time.
@@ -145,6 +148,28 @@ class SelfCalibration:
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """
+    What a rate may be off by beside the covariance of the values: standard deviations.
+
+    Attributes
+    ----------
+    bias, scale_factor_error : their change from one run to the next, rad/s and 1; a
+        self-calibration finds these, and they do not count where there is one
+    bias_per_kelvin, scale_factor_error_per_kelvin : for each K beyond the temperatures that were
+        seen, rad/s/K and 1/K
+    per_rate : error of the rate for each rad/s of the output beyond those that were seen, 1
+
+    """
+
+    bias: float = 0.0
+    scale_factor_error: float = 0.0
+    bias_per_kelvin: float = 0.0
+    scale_factor_error_per_kelvin: float = 0.0
+    per_rate: float = 0.0
+
+
+@dataclass(frozen=True)
 class GyroModel:
     """
     What is known of one gyro.
@@ -155,9 +180,11 @@ class GyroModel:
     covariance : of all fitted values in the order of the terms, shape (m, m); None if unknown
     rate_range, temperature_range : what the values were fitted on, rad/s and degC
     noise : its noise figures
+    noise_bounds : by name of a noise figure, the bounds that hold it with 95 % confidence
     gyro : name, serial_number, technology, as text
     origin : files, date and program that it comes from
     self_calibration : the last one
+    tolerance : what a rate may be off by beside the covariance
 
     """
 
@@ -170,6 +197,8 @@ class GyroModel:
     gyro: Mapping[str, str] = field(default_factory=dict)
     origin: Mapping[str, Any] = field(default_factory=dict)
     self_calibration: SelfCalibration | None = None
+    tolerance: Tolerance = Tolerance()
+    noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def error(self, channels: Channels) -> Number:
         """Return the sum of all effects, rad/s."""
@@ -195,15 +224,42 @@ class GyroModel:
     @cached_property
     def temperature_limits(self) -> tuple[float, float]:
         """Return plausible temperatures, degC: usual ones, and three times the valid range."""
-        low, high = self.used_temperatures
+        low, high = self.valid_temperatures
         return min(2.0 * low - high, _TEMPERATURES[0]), max(2.0 * high - low, _TEMPERATURES[1])
 
     @cached_property
-    def used_temperatures(self) -> tuple[float, float]:
-        """Return the temperatures, degC, to which others are clipped: valid, or plausible."""
+    def valid_temperatures(self) -> tuple[float, float]:
+        """Return the temperatures, degC, that were seen; plausible ones where none is stated."""
         low, high = ((value if math.isfinite(value) else usual)
                      for value, usual in zip(self.temperature_range, _TEMPERATURES))
         return low, max(low, high)
+
+    @cached_property
+    def used_temperatures(self) -> tuple[float, float]:
+        """Return the temperatures, degC, up to which the correction is extrapolated."""
+        (low, high), (coldest, hottest) = self.valid_temperatures, self.temperature_limits
+        reach = max(high - low, _EXTRAPOLATED)
+        return max(low - reach, coldest), min(high + reach, hottest)
+
+    @cached_property
+    def tolerated(self) -> tuple[str, ...]:
+        """Return the names of the tolerances that count."""
+        found = ('bias', 'scale_factor_error') if self.self_calibration else ()
+        return tuple(name for name, value in vars(self.tolerance).items()
+                     if value > 0.0 and name not in found)
+
+    def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
+        """
+        Return how far outputs and temperatures are outside of those that were seen, rad/s and K.
+
+        A temperature at which the gyro was self-calibrated was seen.
+
+        """
+        low, high = self.valid_temperatures
+        known = self.self_calibration.temperature if self.self_calibration else None
+        if known is not None:
+            low, high = min(low, known), max(high, known)
+        return output - clip(output, *self.rate_range), temperature - clip(temperature, low, high)
 
     @cached_property
     def rate_domain(self) -> tuple[float, float]:
@@ -344,8 +400,10 @@ def _parted(terms: Sequence[Term], channel: str) -> Parted:
 
 
 def _sum(terms: Sequence[Term], channels: Channels) -> Number:
-    total: Number = 0.0
-    for term in terms:
+    if not terms:
+        return 0.0
+    total = terms[0].adding(channels)
+    for term in terms[1:]:
         total = total + term.adding(channels)
     return total
 

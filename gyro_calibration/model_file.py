@@ -26,7 +26,7 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.files import InputError, LARGEST, reason, write_atomically
 from gyro_calibration.log import Array, shown
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.noise import Noise
 from gyro_calibration.settings_file import read_settings, settings_text
 import numpy as np
@@ -105,7 +105,21 @@ def _from_content(content: Any) -> GyroModel:
         _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
         {key: _text(f'gyro.{key}', value)
          for key, value in _mapping('gyro', top.get('gyro', {})).items()},
-        _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')))
+        _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')),
+        _tolerance(top.get('tolerance', {})), _noise_bounds(top.get('noise_bounds', {})))
+
+
+def _noise_bounds(value: Any) -> dict[str, tuple[float, float]]:
+    given = _mapping('noise_bounds', value)
+    _only('noise_bounds', given, Noise.__dataclass_fields__)
+    return {name: _range(f'noise_bounds.{name}', ends) for name, ends in given.items()}
+
+
+def _tolerance(value: Any) -> Tolerance:
+    given = _mapping('tolerance', value)
+    _only('tolerance', given, Tolerance.__dataclass_fields__)
+    return Tolerance(**{name: _number(f'tolerance.{name}', each, low=0.0)
+                        for name, each in given.items()})
 
 
 def _mapping(place: str, value: Any) -> dict[str, Any]:
@@ -265,10 +279,14 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
                         if all(map(math.isfinite, values))}
     content['reference_temperature'] = model.reference_temperature
     content['noise'] = dict(vars(model.noise))
+    if model.noise_bounds:
+        content['noise_bounds'] = {name: list(ends) for name, ends in model.noise_bounds.items()}
     content['gyro'] = dict(model.gyro)
     content['origin'] = dict(model.origin)
     if model.self_calibration is not None:
         content['self_calibration'] = _self_calibration_content(model.self_calibration)
+    if model.tolerance != Tolerance():
+        content['tolerance'] = dict(vars(model.tolerance))
     return content
 
 

@@ -290,6 +290,8 @@ class Uncertainty:
     offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
     covariances : scale matrices of the distribution, shape (k, m, m)
     freedom : of Student's distribution
+    sweeps : root mean square over all possible scatters of the bias of a sweep, rad/s, and of its
+        scale factor, 1, shape (2,)
 
     """
 
@@ -297,6 +299,7 @@ class Uncertainty:
     offsets: Array
     covariances: Array
     freedom: int
+    sweeps: Array
 
     @classmethod
     def of(cls, dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Uncertainty:
@@ -315,8 +318,10 @@ class Uncertainty:
         deviation = scatter.deviation(dwells)
         sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
         freedom = len(dwells) - len(lengths)
-        weights, offsets, covariances = _averaged(sums, freedom, _units(dwells, deviation))
-        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), freedom)
+        weights, offsets, covariances, sweeps = _averaged(sums, freedom,
+                                                          _units(dwells, deviation))
+        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), freedom,
+                   sweeps)
 
     @property
     def deviations(self) -> Array:
@@ -348,11 +353,12 @@ def _units(dwells: Dwells, deviation: Array) -> Array:
             * (_sought(dwells) == 4))
 
 
-def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array]:
+def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array, Array]:
     """
     Return weights of possible scatters of sweeps, offsets of the values and their covariances.
 
-    The shapes are (k,), (k, m) and (k, m, m).
+    The shapes are (k,), (k, m) and (k, m, m). The last one, of shape (2,), is the root mean square
+    of the scatters.
 
     """
     shown = bool(units.any())
@@ -367,20 +373,27 @@ def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Ar
         weights /= weights.sum()
         axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
     likely = weights.ravel() > 1e-4
-    values, covariances = (np.concatenate([each[place] for each in found])[likely]
-                           for place in (1, 2))
-    return weights.ravel()[likely] / weights.ravel()[likely].sum(), values, covariances
+    values, covariances, squares = (np.concatenate([each[place] for each in found])[likely]
+                                    for place in (1, 2, 3))
+    share = weights.ravel()[likely] / weights.ravel()[likely].sum()
+    return share, values, covariances, np.sqrt(share @ squares)
 
 
-def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array]:
-    """Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances."""
+def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array, Array]:
+    """
+    Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances.
+
+    Last come the squares of the scatters, in which the sizes are parts of what dwells show.
+
+    """
     gram, log_determinant = sums.reduced(sizes)
     inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
     values = np.einsum('kij,kj->ki', inverse, right)
     misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
                         1e-12 * sums.gram[-1, -1]) + 1e-200
     logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
-    return logarithm, values, inverse * (misfit / freedom)[:, None, None]
+    size = misfit / freedom
+    return logarithm, values, inverse * size[:, None, None], sizes ** 2 * size[:, None]
 
 
 def _prior(sizes: Array) -> Array:

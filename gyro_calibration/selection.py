@@ -11,9 +11,11 @@
 """
 Selection of a gyro's effects: by the prediction of left-out sweeps, each choice with its reason.
 
-An effect is taken where the error of left-out sweeps falls with it and its evidence is beyond
-chance, given the number of effects tried. Where two effects explain the data alike, the one that
-the physics of the instrument gives decides, if the instrument is known.
+Bias, scale factor error and their slopes over temperature belong to every model, as every gyro has
+them: the slopes where the dwells determine them better than a data sheet does. Another effect is
+taken where the error of left-out sweeps falls with it and its evidence is beyond chance, given the
+number of effects tried. Where two effects explain the data alike, the one that the physics of the
+instrument gives decides, if the instrument is known.
 
 """
 
@@ -33,11 +35,13 @@ from gyro_calibration.effects import (
     CUBIC_NONLINEARITY,
     Effect,
     SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
     STEADY,
 )
 from gyro_calibration.log import Array, DataRefused, Progress
 from gyro_calibration.scatter import find_scatter, Scatter
+from gyro_calibration.tolerance import BIAS_SLOPE, SCALE_SLOPE
 import numpy as np
 
 #: Probability of taking an effect that is not there, in one calibration.
@@ -45,10 +49,15 @@ FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.
 PARTED = 4.0
+#: With fewer, the data hardly prefer one of two causes.
+HARDLY = 2.0
 #: Of effects that look alike, the one that the physics of an instrument gives.
 TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                 'mems': CUBIC_NONLINEARITY}
 _TWINS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
+#: What every gyro has, if the dwells determine it better than these standard deviations, of what
+#: data sheets leave open.
+_SLOPES = {BIAS_TEMPERATURE: BIAS_SLOPE, SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE}
 #: An effect that is of no use without another one.
 _NEEDS = {BIAS_TEMPERATURE_QUADRATIC: BIAS_TEMPERATURE}
 
@@ -130,6 +139,9 @@ def select_effects(dwells: Dwells, technology: str | None = None,
 
     """
     best, twins = supported_effects(dwells, technology, progress)
+    best = with_slopes(best)
+    if technology is None:
+        best, twins = part_twins(best, None, SINE_RESPONSE)
     tried = _tried(best.effects)
     choices = tuple(_choice(best, effect, tried, twins)
                     for effect in progress(list(STEADY.values())))
@@ -146,6 +158,16 @@ def supported_effects(dwells: Dwells, technology: str | None = None, progress: P
     best = _grow(base, candidates, limit, progress)
     best = _prune(best, base.effects, limit)
     return part_twins(best, technology)
+
+
+def with_slopes(fit: Calibration) -> Calibration:
+    """Add the slopes over temperature that the dwells determine better than a data sheet."""
+    for slope, usual in _SLOPES.items():
+        wider = None if slope in fit.effects else _try(fit.dwells, (*fit.effects, slope),
+                                                       fit.scatter)
+        if wider is not None and wider.freedom and wider.deviation_of(slope) < usual:
+            fit = wider
+    return fit
 
 
 def _tried(effects: Sequence[Effect]) -> int:
@@ -216,8 +238,14 @@ def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibratio
 
 # twins
 
-def part_twins(fit: Calibration, technology: str | None) -> tuple[Calibration, tuple[Twins, ...]]:
-    """Decide between effects that explain the same."""
+def part_twins(fit: Calibration, technology: str | None,
+               bounded: Effect | None = None) -> tuple[Calibration, tuple[Twins, ...]]:
+    """
+    Decide between effects that explain the same.
+
+    Without a technology, a `bounded` effect is taken where the data hardly prefer the other one.
+
+    """
     found = []
     for pair in _TWINS:
         for taken, other in (pair, pair[::-1]):
@@ -226,14 +254,14 @@ def part_twins(fit: Calibration, technology: str | None) -> tuple[Calibration, t
                 swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
                                fit.scatter)
             if swapped is not None:
-                fit, twins = _decide((fit, taken), (swapped, other), technology)
+                fit, twins = _decide((fit, taken), (swapped, other), technology, bounded)
                 found.append(twins)
                 break
     return fit, tuple(found)
 
 
 def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect],
-            technology: str | None) -> tuple[Calibration, Twins]:
+            technology: str | None, bounded: Effect | None) -> tuple[Calibration, Twins]:
     (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
     sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
     reason = f'{taken.name} fits better by {sigmas:.1f} standard deviations'
@@ -244,6 +272,10 @@ def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect
         reason = (f'{taken.name} is what the physics of {technology} gives, and fits '
                   f'{"better" if sigmas > 0.0 else "worse"} by {abs(sigmas):.1f} '
                   'standard deviations')
+    if technology is None and bounded is other and sigmas < HARDLY:
+        (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
+        reason = (f'{taken.name} fits worse by {abs(sigmas):.1f} standard deviations only, and '
+                  'its error stays bounded beyond the rates that were seen')
     return fit, Twins(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
 
 

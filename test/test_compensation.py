@@ -23,8 +23,8 @@ from gyro_calibration.effects import (
     SCALE_FACTOR_ERROR,
 )
 from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
-from gyro_calibration.log import CACHED
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
+from gyro_calibration.log import CACHED, DEGREE
+from gyro_calibration.model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.noise import Noise
 import numpy as np
 import pytest
@@ -46,13 +46,13 @@ def test_the_self_calibration_comes_after_the_model():
     assert done.rate == pytest.approx((done.modelled - 0.002) / 1.04, abs=1e-12)
 
 
-def test_beyond_the_calibrated_temperatures_their_nearest_end_is_used():
+def test_beyond_the_calibrated_temperatures_the_correction_is_extrapolated_and_then_held():
     model = GyroModel((WARM,), temperature_range=(10.0, 40.0))
-    degc = np.array([-20.0, 10.0, 25.0, 40.0, 90.0])
-    done = compensate(model, np.zeros(5), degc)
-    assert (done.rate.tolist()
-            == compensate(model, np.zeros(5), np.clip(degc, 10.0, 40.0)).rate.tolist())
-    assert done.temperature_clipped.tolist() == [True, False, False, False, True]
+    degc = np.array([-30.0, -20.0, 10.0, 25.0, 40.0, 69.0, 90.0, 1e4])
+    done = compensate(model, np.zeros(8), degc)
+    assert done.rate / DEGREE == pytest.approx(-0.1 * np.clip(degc, -20.0, 70.0))
+    assert done.temperature.tolist() == [*degc[:-1].tolist(), 200.0]
+    assert done.temperature_clipped.tolist() == [True, True, False, False, False, True, True, True]
     assert ([bool(compensate(model, 0.0, float(one)).temperature_clipped) for one in degc]
             == done.temperature_clipped.tolist())
 
@@ -187,6 +187,31 @@ def test_the_sensitivity_of_one_sample_is_that_of_the_log():
     at_once = rate_sensitivity(model, rates, rates, np.full(2, 25.0))
     assert ([rate_sensitivity(model, rate, rate, 25.0).tolist() for rate in rates.tolist()]
             == at_once.T.tolist())
+
+
+TOLERANT = replace(MODEL, tolerance=Tolerance(0.001, 0.0002, 1e-4, 2e-5, 0.003))
+
+
+def test_the_standard_deviation_grows_outside_of_what_was_calibrated():
+    def deviation(model, rate, degc):
+        done = compensate(model, rate, degc)
+        return math.sqrt(quadratic_form(covariance(model), rate_sensitivity(
+            model, rate, done.rate, done.temperature)))
+
+    inside = deviation(TOLERANT, 0.0, 25.0)
+    assert inside == pytest.approx(math.hypot(1e-3, 0.001), rel=1e-3)  # of the bias alone
+    warmer = [deviation(TOLERANT, 0.0, degc) for degc in (40.0, 45.0, 60.0, 90.0, 150.0)]
+    assert warmer[0] == inside and np.all(np.diff(warmer) > 0.0)
+    assert warmer[2] == pytest.approx(math.hypot(inside, 20.0 * 1e-4), rel=1e-3)
+    turning = [deviation(TOLERANT, 1.0, degc) for degc in (40.0, 60.0)]
+    assert turning[1] ** 2 - turning[0] ** 2 == pytest.approx(
+        (20.0 * 1e-4) ** 2 + (20.0 * 2e-5) ** 2, rel=0.01)
+    faster = [deviation(TOLERANT, rate, 25.0) for rate in (2.0, 3.0)]
+    assert faster[1] ** 2 - faster[0] ** 2 > 0.9 * 0.003 ** 2
+    # a self-calibration finds bias and scale factor of this run, at its temperature
+    known = replace(TOLERANT, self_calibration=replace(CALIBRATION, temperature=55.0))
+    assert deviation(known, 0.0, 55.0) == deviation(known, 0.0, 25.0) < deviation(
+        known, 0.0, 60.0)
 
 
 def test_the_covariance_has_the_order_of_the_sensitivity():

@@ -10,6 +10,7 @@
 
 """Model files: a good one is read as written, a bad one is a ModelError of one sentence."""
 
+from dataclasses import replace
 import math
 import random
 import tracemalloc
@@ -20,6 +21,7 @@ from gyro_calibration.model import (
     same_effects,
     SelfCalibration,
     Term,
+    Tolerance,
     with_self_calibration,
 )
 from gyro_calibration.model_file import ModelError, read_model, write_model
@@ -35,7 +37,9 @@ FULL = GyroModel(TERMS, np.diag(np.arange(1.0, 8.0)) * 1e-8, (-1.7, 1.7), (20.0,
                  Noise(7e-4, 9e-5, 1e-6), {'name': 'Köln', 'serial_number': '0012'},
                  {'files': ['a.csv'], 'date': '2024-05-01'},
                  SelfCalibration(0.0373, 2e-4, ((1e-8, 1e-10), (1e-10, 4e-8)),
-                                 '2024-05-01T10:00:00+00:00', 31.5, 'likelihood'))
+                                 '2024-05-01T10:00:00+00:00', 31.5, 'likelihood'),
+                 Tolerance(1e-5, 2e-4, 3e-5, 1e-4, 4e-3),
+                 {'bias_instability': (7e-5, 1.1e-4)})
 
 
 def read(folder, text):
@@ -64,7 +68,7 @@ def test_a_model_is_read_back_as_it_was_written(tmp_path):
         (term.effect.name, term.values) for term in FULL.terms]
     assert np.array_equal(again.covariance, FULL.covariance)
     for name in ('rate_range', 'temperature_range', 'reference_temperature', 'noise', 'gyro',
-                 'origin', 'self_calibration'):
+                 'origin', 'self_calibration', 'tolerance', 'noise_bounds'):
         assert getattr(again, name) == getattr(FULL, name), name
 
 
@@ -73,7 +77,15 @@ def test_an_empty_model_is_read_back(tmp_path):
     assert read_model(tmp_path / 'model.yaml') == GyroModel()
 
 
+def test_a_file_without_tolerances_is_one_of_a_model_that_has_none(tmp_path):
+    assert read(tmp_path, 'effects: {}').tolerance == Tolerance()
+    write_model(tmp_path / 'model.yaml', replace(FULL, tolerance=Tolerance()))
+    assert 'tolerance' not in (tmp_path / 'model.yaml').read_text(encoding='utf-8')
+
+
 BAD = {
+    'a tolerance below zero': ('effects: {}\ntolerance: {bias: -1.0}', 'tolerance.bias is -1.0'),
+    'an unknown tolerance': ('effects: {}\ntolerance: {magic: 1.0}', 'tolerance.magic is 1.0'),
     'empty': ('', 'the file is None'),
     'a list': ('[1, 2]', 'the file is [1, 2]'),
     'a number': ('3', 'the file is 3'),

@@ -23,7 +23,13 @@ from gyro_calibration.effects import (
 )
 from gyro_calibration.log import DEGREE
 from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.selection import FALSE_ALARM_RATE, PARTED, select_effects, TECHNOLOGIES
+from gyro_calibration.selection import (
+    FALSE_ALARM_RATE,
+    HARDLY,
+    PARTED,
+    select_effects,
+    TECHNOLOGIES,
+)
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -33,6 +39,8 @@ RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
                         for name in ('recovery', 'rate_table'))
 Table, TRUTH, LINEAR, CUBIC, SINE = (RECOVERY[name]
                                      for name in ('Table', 'TRUTH', 'LINEAR', 'CUBIC', 'SINE'))
+#: Every gyro has these, and these tables determine them better than a data sheet.
+SLOPES = ('bias_temperature', 'scale_factor_temperature')
 #: A test of the choice fails by chance as rarely as this.
 RARE = 1e-4
 WANDERING = Table(sweep_bias=0.02 * DEGREE, sweep_scale=3e-4)
@@ -53,7 +61,7 @@ def measured(table, terms, seed=1):
 def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
     generator = np.random.default_rng(2)
     wrong = sum(names(select_effects(table.measure(GyroModel(LINEAR), generator)))
-                != {'bias', 'scale_factor_error'} for _ in range(runs))
+                != {'bias', 'scale_factor_error', *SLOPES} for _ in range(runs))
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
 
 
@@ -66,7 +74,7 @@ def test_effects_of_clear_size_are_found(terms, technology, runs):
     generator = np.random.default_rng(3)
     found = [names(select_effects(Table().measure(GyroModel(terms), generator), technology))
              for _ in range(runs)]
-    right = sum(each == {term.effect.name for term in terms} for each in found)
+    right = sum(each == {term.effect.name for term in terms} | set(SLOPES) for each in found)
     assert right >= binom.ppf(RARE, runs, 1 - FALSE_ALARM_RATE)
 
 
@@ -128,7 +136,21 @@ def test_what_cannot_be_seen_says_what_would_show_it():
 def test_rests_show_a_bias_alone():
     table = measured(Table(), LINEAR)
     steady = replace(table, rate=np.zeros(len(table)), output=table.output - table.rate)
-    assert names(select_effects(steady)) == {'bias'}
+    assert names(select_effects(steady)) == {'bias', 'bias_temperature'}
+
+
+def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
+    """Dwells that scatter by 10 deg/s leave a slope of 0.07 deg/s/K open."""
+    assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
+
+
+def test_of_look_alikes_that_fit_alike_the_bounded_one_is_taken_where_nobody_says_what_it_is():
+    generator = np.random.default_rng(6)
+    for _ in range(4):
+        fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
+                                               generator))
+        pair, = fit.twins
+        assert pair.taken == 'sine_response' or pair.sigmas >= HARDLY
 
 
 @pytest.mark.parametrize('technology', [None, *TECHNOLOGIES])
@@ -141,8 +163,7 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_parted_and_the_rates_th
         data):
     dwells = RATE_TABLE['table'](data)
     selection = select_effects(dwells, 'open_loop_fog')
-    assert names(selection) == {'bias', 'scale_factor_error', 'sine_response',
-                                'scale_factor_temperature'}
+    assert names(selection) == {'bias', 'scale_factor_error', 'sine_response', *SLOPES}
     pair, = selection.twins
     assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < PARTED
             and 110.0 < pair.rate / DEGREE < 200.0)

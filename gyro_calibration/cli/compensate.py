@@ -310,7 +310,8 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
             ('lost_samples', 'samples are lost; the heading goes on over the true intervals, '
              'and the deviation allows for it.'),
             ('temperature_clipped',
-             'rows are outside the calibrated temperatures; the nearest end was used.'),
+             'rows are outside the calibrated temperatures; the correction is extrapolated, and '
+             'the standard deviation grows.'),
             ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
              'extrapolated, or held where no rate explains the output.')):
         if data[name]:

@@ -110,7 +110,7 @@ def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
                        'the model was used at its reference temperature')
     if clipped:
         remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated '
-                       'temperatures; the nearest end was used')
+                       'temperatures; the correction is extrapolated')
     if beyond:
         remarks.append(f'{beyond} of {len(found)} dwells are beyond the calibrated rates; '
                        'the correction is extrapolated')

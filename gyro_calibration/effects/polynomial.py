@@ -39,10 +39,13 @@ def rate_temperature_polynomial(rate_order: int, temperature_order: int) -> Effe
 
     def scaled(channels: Channels, output_centre: float, output_scale: float,
                temperature_centre: float, temperature_scale: float) -> tuple[Number, Number]:
-        output = (channels.output - output_centre) / output_scale
+        output = channels.output - output_centre
+        output /= output_scale
         if not temperature_order:  # then the temperature need not be known
             return output, 0.0 * output
-        return output, (channels.temperature - temperature_centre) / temperature_scale
+        temperature = channels.temperature - temperature_centre
+        temperature /= temperature_scale
+        return output, temperature
 
     def columns(channels: Channels, *shapes: float) -> Sequence[Number]:
         output, temperature = scaled(channels, *shapes)

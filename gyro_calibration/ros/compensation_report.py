@@ -94,7 +94,8 @@ class CompensationReport:
             'beyond_range': 'the rate is beyond the calibrated range; the correction is '
                             'extrapolated',
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
-                                   f'{high:g} degC; its nearest end is used'}
+                                   f'{high:g} degC; the correction is extrapolated, and its '
+                                   'variance grows'}
         return [text for name, text in texts.items() if name in growing]
 
     def _values(self, rate: float) -> dict[str, object]:

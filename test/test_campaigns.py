@@ -1,0 +1,48 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+
+"""A calibration by one campaign on a rate table holds in a hotter and faster one."""
+
+from pathlib import Path
+import runpy
+
+from gyro_calibration.dwells import from_table, take
+from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.selection import select_effects
+import numpy as np
+import pytest
+
+CAMPAIGNS = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'campaigns.py'))
+judge, simulated, least_squares_error = (
+    CAMPAIGNS[name] for name in ('judge', 'simulated', 'least_squares_error'))
+
+
+@pytest.mark.parametrize('sine', [True, False], ids=['open-loop', 'MEMS'])
+@pytest.mark.parametrize('gyros', [4, pytest.param(40, marks=pytest.mark.evidence)])
+def test_the_stated_deviation_is_that_of_another_campaign(sine, gyros):
+    """With 12 sweeps of a gyro that hang together, the scatter of z² is that of few numbers."""
+    errors, z, peers = [], [], []
+    for seed in range(100, 100 + gyros):
+        cool, hot = (simulated(np.random.default_rng(seed), sine, each) for each in (False, True))
+        found = judge(select_effects(cool).calibration.model, hot)
+        errors.append(found[0])
+        z.append(found[1])
+        peers.append(least_squares_error(cool, hot))
+    assert np.mean(errors) < 1.1 * np.mean(peers)
+    assert 0.4 < np.sqrt(np.mean(np.square(z))) < 2.0
+
+
+def test_on_the_recorded_table_the_cooler_half_predicts_the_hotter_one(data):
+    dwells = from_table(read_log(data / 'fog_rate_table' / 'table.csv'))
+    first, second = (take(dwells, (dwells.sweep < 12) == part) for part in (True, False))
+    error, z = judge(select_effects(first).calibration.model, second)
+    assert error < 0.065 and z < 1.6
+    slow = take(first, np.abs(first.rate) < 60.0 * DEGREE)
+    error, z = judge(select_effects(slow).calibration.model, second)
+    assert error < 0.08 and z < 1.6
