@@ -15,10 +15,10 @@ How well a calibration by one campaign on a rate table holds in another, hotter 
 
 From the recording of 24 sweeps, 6 to 12 neighbouring ones are a campaign, limited to rates below
 45 to 75 deg/s or not; the sweeps after it, hotter and at all rates, are the other one. Then
-CAMPAIGNS (default: 40) are simulated: an open-loop fibre-optic gyro or a MEMS one, whose bias and scale
-factor curve over temperature and change from sweep to sweep; fitted at 20 to 32 degC and up to
-60 deg/s, tested at 30 to 50 degC and up to 100 deg/s. Prints the root mean square of the error of
-the rate beside weighted least squares of bias, scale factor, its slope over temperature and a
+CAMPAIGNS (default: 40) are simulated: an open-loop fibre-optic gyro or a MEMS one, whose bias and
+scale factor curve over temperature and change from sweep to sweep; fitted at 20 to 32 degC and up
+to 60 deg/s, tested at 30 to 50 degC and up to 100 deg/s. Prints the root mean square of the error
+of the rate beside weighted least squares of bias, scale factor, its slope over temperature and a
 sine, and the root mean square of z, the mean error of a sweep over the mean stated standard
 deviation: 1 where the statement is true.
 

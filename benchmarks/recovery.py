@@ -25,7 +25,7 @@ the compensated rates over the whole range.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import sys
 
 from gyro_calibration.calibration import fit_effects
@@ -45,7 +45,7 @@ from gyro_calibration.effects import (
     SINE_RESPONSE,
 )
 from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.model import GyroModel, Term, Tolerance
 import numpy as np
 
 #: An effect of clear size each; those of temperature count from 36 degC.
@@ -165,6 +165,8 @@ def run(terms: Sequence[Term], table: Table,
     """Return the normalized errors of the fitted values, and of the compensated rates."""
     truth = GyroModel(tuple(terms))
     model = fit_effects(table.measure(truth, generator), [term.effect for term in terms]).model
+    # the truth here is the mean of all sweeps, not the gyro in another run
+    model = replace(model, tolerance=Tolerance())
     found = np.array([term.values[place] for term in model.terms for place in term.fitted])
     errors = (found - expressed(truth, model)) / np.sqrt(np.diag(model.covariance))
     rate, temperature = (each.ravel() for each in np.meshgrid(
