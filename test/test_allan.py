@@ -129,6 +129,16 @@ def test_the_bounds_hold_in_95_of_100_records(case):
         assert held >= 0.95 - 4.0 * math.sqrt(0.05 * 0.95 / RUNS), (symbol, held)
 
 
+@pytest.mark.parametrize('walk', [3e-5, 2e-4])
+@pytest.mark.parametrize('runs', [12, pytest.param(200, marks=pytest.mark.evidence)])
+def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, runs):
+    truth = Noise(1e-3, 3e-4, walk)
+    found = figures(truth, runs, 11, samples=200_000)
+    for symbol, true in zip('NBK', vars(truth).values()):
+        held = np.mean([figure.lower <= true <= figure.upper for figure in found[symbol]])
+        assert held >= 0.95 - 4.0 * math.sqrt(0.05 * 0.95 / runs), (symbol, held)
+
+
 def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
     for symbol, (truth, records) in case.items():
         seen = [figure for figure in records if figure.value and truth]
@@ -386,8 +396,10 @@ def test_the_verb_puts_the_figures_into_a_model_and_loses_nothing_else(log, tmp_
     assert after.noise == alone.noise and after.noise.rate_random_walk == 0.0
     assert (after.noise.angle_random_walk == pytest.approx(1e-3, rel=0.03)
             and after.noise.bias_instability == pytest.approx(1e-3, rel=0.3))
-    assert ({**vars(after), 'noise': 0, 'covariance': 0}
-            == {**vars(before), 'noise': 0, 'covariance': 0})
+    low, high = after.noise_bounds['angle_random_walk']
+    assert low < 1e-3 < high and after.noise_bounds['rate_random_walk'][0] == 0.0
+    other = {'noise': 0, 'covariance': 0, 'noise_bounds': 0}
+    assert {**vars(after), **other} == {**vars(before), **other}
     assert (after.covariance == before.covariance).all() and not alone.terms
 
 

@@ -115,20 +115,26 @@ class Description:
         return float(lower), float(upper)
 
 
-def describe(octaves: Octaves, places: tuple[int, ...], misfit: float) -> Description:
+def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: int = -1,
+             square: float = 0.0) -> Description:
     """
     Fit a combination of parts, none negative, with the covariance that the fitted noise implies.
 
-    For `misfit` see `NoiseFit`.
+    For `misfit` see `NoiseFit`. A further part may be held at a squared coefficient.
 
     """
-    both = np.column_stack([octaves.columns[:, places], octaves.variance])
-    squares, half = np.zeros(BEND_PLACE + 1), np.diag(octaves.variance)
-    for _ in range(_PASSES):
+    given = np.zeros(BEND_PLACE + 1)
+    if held_at >= 0:
+        given[held_at] = square
+    both = np.column_stack([octaves.columns[:, places],
+                            octaves.variance - octaves.columns @ given])
+    squares, half = given.copy(), np.diag(octaves.variance)
+    for number in range(_PASSES):
         white = np.linalg.solve(half, both)
         size = np.linalg.norm(white[:, :-1], axis=0)
         found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
-        if not found.any() or np.allclose(squares[list(places)], found, rtol=1e-4, atol=0.0):
+        if not (found.any() or square) or (number and np.allclose(
+                squares[list(places)], found, rtol=1e-4, atol=0.0)):
             break
         squares[list(places)] = found
         half = _half(octaves, squares, misfit)

@@ -13,16 +13,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 import math
 
 from gyro_calibration.allan.chart import allan_deviation, AllanChart
+from gyro_calibration.allan.description import describe
 from gyro_calibration.allan.octaves import Octaves
-from gyro_calibration.allan.parts import BEND_PLACE, Part, PARTS
+from gyro_calibration.allan.parts import (
+    ANGLE_WALK_PLACE,
+    BEND_PLACE,
+    FLICKER_PLACE,
+    Part,
+    PARTS,
+    RATE_WALK_PLACE,
+)
 from gyro_calibration.allan.ranking import rank, Ranking
 from gyro_calibration.log import Array, DataRefused
 from gyro_calibration.noise import Noise
 import numpy as np
 
+#: -2 ln likelihood above its least at the ends of an interval of 95 %: that of chi squared.
+_CONFIDENCE = 3.84
+#: Halvings of the distance to such an end.
+_HALVINGS = 12
+#: Parts of the size of a coefficient at which the least is looked for.
+_TRIED = (0.25, 0.5, 0.75, 0.9, 1.0, 1.1)
+#: Parts that may be there without being seen, and are fitted beside each other for the bounds.
+_ALWAYS = (ANGLE_WALK_PLACE, FLICKER_PLACE, RATE_WALK_PLACE)
 #: The least number that shows a slope and its end.
 _FEWEST_OCTAVES = 4
 
@@ -82,6 +99,12 @@ class NoiseFit:
         """Return the figures that a model holds."""
         return Noise(*(self.figures[symbol].value for symbol in 'NBK'))
 
+    @property
+    def noise_bounds(self) -> dict[str, tuple[float, float]]:
+        """Return the bounds of these figures, by their names in a model."""
+        return {name: (self.figures[symbol].lower, self.figures[symbol].upper)
+                for name, symbol in zip(Noise.__dataclass_fields__, 'NBK')}
+
     def deviation(self, time: Array) -> Array:
         """Return the Allan deviation, rad/s, that the figures add up to."""
         return np.sqrt(sum(figure.variance(time) for figure in self.figures.values()))
@@ -132,26 +155,53 @@ def fit_noise(rate: Array, interval: float) -> NoiseFit:
 
 
 def _figure(ranking: Ranking, place: int) -> Figure:
-    return _held(ranking, place) if place in ranking.seen else _absent(ranking, place)
-
-
-def _held(ranking: Ranking, place: int) -> Figure:
     """Return a figure with bounds that hold with and without parts of too little evidence."""
-    lower, upper = zip(*(each.bounds(place) for each in ranking.tempting if place in each.held))
-    value = math.sqrt(ranking.best.squares[place])
-    return Figure(PARTS[place], value, 0.5 * ranking.best.deviation(place) / value,
-                  min(lower), max(upper))
-
-
-def _absent(ranking: Ranking, place: int) -> Figure:
-    """Return the largest coefficient of a part beside those that are seen."""
     best = ranking.best
-    places = [*(each for each in best.held if each not in (place, BEND_PLACE)), place]
-    estimates = [each.estimate(places) for each in ranking.descriptions
-                 if each is best or set(each.held) == set(places)]
-    limits = [squares[-1] + 1.96 * deviations[-1] for squares, deviations in estimates]
-    limits += [each.bounds(place)[1] ** 2 for each in ranking.rivals if place in each.held]
-    return Figure(PARTS[place], 0.0, math.nan, 0.0, math.sqrt(max(*limits, 0.0)))
+    if place not in ranking.seen:
+        return Figure(PARTS[place], 0.0, math.nan, 0.0, _bounds(ranking, place)[1])
+    value = math.sqrt(best.squares[place])
+    lower, upper = zip(_bounds(ranking, place), *(
+        each.bounds(place) for each in ranking.tempting if place in each.held))
+    return Figure(PARTS[place], value, 0.5 * best.deviation(place) / value,
+                  min(*lower, value), max(*upper, value))
+
+
+def _bounds(ranking: Ranking, place: int) -> tuple[float, float]:
+    """
+    Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
+
+    At each coefficient the other parts are fitted anew, those of `_ALWAYS` among them, so that
+    what one of flicker and random walk takes from the other is in the bounds.
+
+    """
+    octaves, misfit = ranking.best.octaves, ranking.misfit
+    held = {*_ALWAYS, *(each for one in (*ranking.tempting, *ranking.rivals)
+                        for each in one.held)}
+    others = tuple(sorted(held - {place}))
+    joint = describe(octaves, (*others, place), misfit)
+    (*_, square), (*_, deviation) = joint.estimate((*others, place))
+
+    @cache
+    def surprise(coefficient: float) -> float:
+        return describe(octaves, others, misfit, place, coefficient ** 2).surprise
+
+    found = math.sqrt(joint.squares[place])
+    scale = math.sqrt(max(square, 0.0) + deviation)
+    least = min(surprise(found), *(surprise(scale * factor) for factor in _TRIED))
+    likeliest = min((found, *(scale * factor for factor in _TRIED)), key=surprise)
+
+    def border(inside: float, outside: float) -> float:
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (inside + outside)
+            inside, outside = ((middle, outside) if surprise(middle) < least + _CONFIDENCE
+                               else (inside, middle))
+        return inside
+
+    high = max(likeliest, scale)
+    while surprise(high) < least + _CONFIDENCE and high < 1e3 * scale:
+        high *= 1.5
+    lower = 0.0 if surprise(0.0) < least + _CONFIDENCE else border(likeliest, 0.0)
+    return lower, border(likeliest, high)
 
 
 def _in_seconds(figure: Figure, interval: float) -> Figure:

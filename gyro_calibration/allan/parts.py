@@ -68,6 +68,7 @@ PARTS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
 
 #: Places of the parts that are treated apart.
 ANGLE_WALK_PLACE, RATE_WALK_PLACE = PARTS.index(ANGLE_RANDOM_WALK), PARTS.index(RATE_RANDOM_WALK)
+FLICKER_PLACE = PARTS.index(FLICKER)
 QUANTIZATION_PLACE, RAMP_PLACE = PARTS.index(QUANTIZATION), PARTS.index(RATE_RAMP)
 
 #: Beside the parts: what a filter takes from the variance. Over times beyond the memory of the

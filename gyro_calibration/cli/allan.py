@@ -81,7 +81,8 @@ def _allan(given: argparse.Namespace) -> Answer:
             symbol: _named(symbol, figure) for symbol, figure in fit.figures.items()
             if figure.value})
     if given.out:
-        write_model(given.out, replace(with_origin(given, model), noise=fit.noise))
+        write_model(given.out, replace(with_origin(given, model), noise=fit.noise,
+                                       noise_bounds=fit.noise_bounds))
     return Answer('\n'.join(_lines(given, record, chart, fit)), _data(given, record, chart, fit))
 
 

@@ -67,8 +67,10 @@ def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hyg
                                       for each in findings if each.effect in NAMES})
     if model is not None and same_effects(new, model) and figures == model.noise:
         return model
-    return noted(replace(new, noise=figures if given.noise.angle_random_walk else noise), given,
-                 hygiene, findings)
+    figures = figures if given.noise.angle_random_walk else noise
+    bounds = {name: ends for name, ends in given.noise_bounds.items()
+              if getattr(figures, name) == getattr(given.noise, name)}
+    return noted(replace(new, noise=figures, noise_bounds=bounds), given, hygiene, findings)
 
 
 def extended(model: GyroModel, found: Outcome, bias_deviation: float) -> GyroModel:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+import math
 
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
@@ -318,7 +319,7 @@ def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | Non
     findings = [*_named(known, generator), *of_record,
                 *(each for each in known.changed if each.effect not in said)]
     if model is not None:
-        findings += _of_noise(known.figures, model.noise, rate, found.replays)
+        findings += _of_noise(known.figures, model, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
     plain, deviation = (Outcome(work(search.field, []), found.replays),
                         _bias_deviation(known.inside, noise))
@@ -409,13 +410,16 @@ def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) 
         'from nothing', cause.along)
 
 
-def _of_noise(figures: NoiseFigures, expected: Noise, rate: float,
+def _of_noise(figures: NoiseFigures, model: GyroModel, rate: float,
               replays: Sequence[Replay]) -> list[Finding]:
-    """Return the noise figures that are not those of the model."""
-    found = []
+    """Return the noise figures that are not those of the model, nor within its bounds of them."""
+    found, expected = [], model.noise
     # The steps of an encoder hide white noise.
     for name in NAMES[1:] if any(each.rounded for each in replays) else NAMES:
         if figures.chance.get(name, 1.0) < _OF_NOISE * rate:
+            low, high = model.noise_bounds.get(name, (math.inf, -math.inf))
+            if figures.interval[name][0] <= high and low <= figures.interval[name][1]:
+                continue
             cause, value = CAUSES[name], getattr(figures.noise, name)
             unit = next(iter(cause.units.values()))
             said = (f'the model says {amount(getattr(expected, name), unit, name)}, the log '
