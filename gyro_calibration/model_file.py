@@ -96,7 +96,7 @@ def _from_content(content: Any) -> GyroModel:
     valid = _mapping('valid', top.get('valid', {}))
     temperature_range = _range('valid.temperature', valid.get('temperature'))
     middle = sum(temperature_range) / 2.0 if all(map(math.isfinite, temperature_range)) else 25.0
-    noise = {name: _number(f'noise.{name}', value, low=0.0)
+    noise = {name: _noise(f'noise.{name}', value)
              for name, value in _mapping('noise', top.get('noise', {})).items()}
     _only('noise', noise, Noise.__dataclass_fields__)
     return GyroModel(
@@ -141,6 +141,14 @@ def _number(place: str, value: Any, low: float = -math.inf) -> float:
         least = f' of at least {low:g}' if low > -math.inf else ''
         raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
     return float(value)
+
+
+def _noise(place: str, value: Any) -> float:
+    """Read a figure whose square can be divided by: 0, or none that vanishes."""
+    number = _number(place, value, low=0.0)
+    if 0.0 < number < 1.0 / LARGEST:
+        raise _PlaceError(place, value, f'0 where it is not known, or at least {1.0 / LARGEST}')
+    return number
 
 
 def _only(place: str, given: Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]) -> None:

@@ -210,6 +210,31 @@ def test_a_damaged_time_of_the_device_harms_for_a_moment_only(jump, generator):
     assert (np.diff(run.stamps) > 0.0).all()
 
 
+DAMAGED = {  # time, generator -> what a line that is damaged there says
+    'ahead': lambda time, generator: time + generator.uniform(0.0, 3.0),
+    'back': lambda time, generator: time - generator.uniform(0.0, 3.0),
+    'a digit': lambda time, generator: time + generator.integers(-9, 10) * 10.0 ** -generator.
+    integers(0, 4),
+}
+
+
+@pytest.mark.parametrize('damage', DAMAGED.values(), ids=DAMAGED)
+def test_times_of_the_device_that_are_often_damaged_lose_no_sample(damage, generator):
+    times = true_times(100, 0.0, 60.0)
+    said = np.round([damage(time, generator) if generator.random() < 0.05 else time
+                     for time in 50.0 + times], 3)
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
+    assert run.clock.lost < 0.5 * np.count_nonzero(said != np.round(50.0 + times, 3))
+    assert abs(run.stamps - times).max() < 0.1
+
+
+def test_a_first_interval_that_is_too_short_loses_no_sample_later(generator):
+    times = true_times(100, 0.0, 10.0)
+    said = np.concatenate([[50.0 + times[1] - 1e-4], 50.0 + times[1:]])
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
+    assert run.clock.lost == 0 and run.clock.period == pytest.approx(0.01, rel=0.01)
+
+
 def test_a_device_that_was_restarted_begins_anew(generator):
     times = true_times(100, 0.0, 30.0)
     run = play(SampleClock(100.0), times, arrivals_of(times, generator),

@@ -59,6 +59,7 @@ _JITTER_TIME = 10.0  # s; over which jitter is averaged
 _DRIFT = 2e-5  # by which the clock of a device may become faster while counts are in doubt
 _FINEST = 0.5e-3  # s; a host that wakes up later than before is no proof of a loss below this
 _OUTLYING = 0.02  # s; above the 16 ms of a burst: with a sequence, no sample is off by more
+_ODD = 8  # advances in a row that do not fit their size show that the size is wrong
 _LARGEST_JUMP = 3.0  # s; beyond it the time of the device does not continue
 _SET = 0.1  # s; a clock that differs by more was set, and was not slewed
 _MIXED = 10.0  # s; after a clock was set, stamps of before and after it may come for this long
@@ -87,6 +88,11 @@ class LowerLine:
         self._points: list[_Point] = []
         self._anchor = (0.0, 0.0)
         self._begin, self._block_begin, self._length = 0.0, -math.inf, 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a point."""
+        return bool(self._points)
 
     def at(self, x: float) -> float:
         """Return the height of the line."""
@@ -180,14 +186,21 @@ class _Numbers:
 
     def reset(self) -> None:
         self.size, self.unit, self._unevenness = 1.0, 1, 0.0
+        self._odd_advances: list[float] = []
+        self._odd_lost = 0
         self._sequence = self._time = self._outlier = None
 
-    def step(self, sample: Sample) -> tuple[float, int]:
-        """Return how far it is to this sample, and how many were lost before it."""
+    def step(self, sample: Sample, most: float = math.inf) -> tuple[float, int]:
+        """
+        Return how far it is to this sample, and how many were lost before it.
+
+        A time of the device that is further than `most` is wrong: the sample came too early.
+
+        """
         if self._modulus and sample.sequence is not None:
             return self._by_sequence(sample.sequence, sample.missing)
         if sample.time is not None:
-            return self._by_time(sample.time, sample.missing)
+            return self._by_time(sample.time, sample.missing, most)
         advance = self.size * (1 + sample.missing)
         self._time = None if self._time is None else self._time + advance / self._rate
         return advance, sample.missing
@@ -201,9 +214,9 @@ class _Numbers:
         advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
         return advance, advance - 1
 
-    def _by_time(self, time: float, missing: int) -> tuple[float, int]:
+    def _by_time(self, time: float, missing: int, most: float) -> tuple[float, int]:
         self.unit = 0
-        elapsed = self._elapsed(time)
+        elapsed = self._elapsed(time, most)
         if elapsed is None:
             advance = self.size * (1 + missing)
             self._time = time if self._time is None else self._time + advance / self._rate
@@ -212,24 +225,41 @@ class _Numbers:
         advance = elapsed * self._rate
         return advance, max(missing, self._lost(advance))
 
-    def _elapsed(self, time: float) -> float | None:
+    def _elapsed(self, time: float, most: float) -> float | None:
         """Return the time since the last sample, s; None where only this one time shows it."""
+        largest = min(_LARGEST_JUMP, most / self._rate)
         for last in (self._time, self._outlier):
-            if last is not None and _LEAST_STEP <= time - last <= _LARGEST_JUMP:
+            if last is not None and _LEAST_STEP <= time - last <= largest:
                 return time - last
         self._outlier = time
         return None
 
     def _lost(self, advance: float) -> int:
-        if self._unevenness == 0.0 or advance < 0.3 * self.size:
-            self.size, self._unevenness = advance, max(self._unevenness, 0.01)
+        if self._unevenness == 0.0:
+            self.size, self._unevenness = advance, 0.01
             return 0
         steps = advance / self.size
-        if steps <= 2.5:
-            self.size += 0.05 * (advance - self.size)
-            self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
         # Times that are coarse against the period do not show single samples.
-        return round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
+        lost = round(steps) - 1 if steps > 2.5 or steps > 1.5 and self._unevenness < 0.15 else 0
+        if not 0.3 <= steps <= 2.5:
+            return self._odd(advance, max(lost, 0))
+        self._odd_advances.clear()
+        self._odd_lost = 0
+        self.size += 0.05 * (advance - self.size)
+        self._unevenness += 0.05 * (abs(steps - round(steps)) - self._unevenness)
+        return lost
+
+    def _odd(self, advance: float, lost: int) -> int:
+        """Take the size from advances where none fits it; what seemed lost by it was not."""
+        self._odd_advances.append(advance)
+        self._odd_lost += lost
+        if len(self._odd_advances) < _ODD:
+            return lost
+        self.size = sorted(self._odd_advances)[_ODD // 2]
+        before = self._odd_lost - lost
+        self._odd_advances.clear()
+        self._odd_lost = 0
+        return -before
 
 
 class _Lateness:
@@ -393,7 +423,7 @@ class SampleClock:
         number, before = self._number, self.lost
         numbers: list[float] = []
         for sample in samples:
-            advance, lost = self._numbers.step(sample)
+            advance, lost = self._numbers.step(sample, self._most(number, arrival))
             number += advance
             self.lost += lost
             numbers.append(number)
@@ -402,6 +432,14 @@ class SampleClock:
             self._doubtful += self._just_lost
             self._doubtful_since = arrival
         return numbers
+
+    def _most(self, number: float, arrival: float) -> float:
+        """Return how far it may be from a number to one that has come by now."""
+        if not self._line.is_known:
+            return math.inf
+        margin = 0.5 * max(self.period, _FINEST) if self.is_settled else _OUTLYING
+        left = (arrival + margin - self._line.at(number)) / self._line.slope
+        return max(left, 1.5 * self._numbers.size)
 
     def _evidence(self, number: float, arrival: float) -> int:
         """Correct the count of lost samples by the arrivals; return by how much it was wrong."""
