@@ -35,7 +35,8 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
     """
     Read a YAML file of names, texts, numbers, true, false, null and lists.
 
-    Dates are texts, and 1e-4, which YAML 1.1 takes for a text, is a number.
+    Dates are texts, and 1e-4, which YAML 1.1 takes for a text, is a number. What a program wrote,
+    which names its format, must end with a whole line: 9.3e-06 that is cut off may be 9.3.
 
     Raises
     ------
@@ -44,13 +45,17 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
 
     """
     try:
-        return yaml.load(read_bytes(path, most).decode('utf-8-sig'), _Loader)
+        text = read_bytes(path, most).decode('utf-8-sig')
+        content = yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f'line {mark.line + 1}: ' if mark else ''
         raise ValueError(f'{place}{_line(error.problem or error.context)}') from error
     except yaml.YAMLError as error:
         raise ValueError(_line(error)) from error
+    if isinstance(content, dict) and 'format' in content and not text.endswith(('\n', '\r')):
+        raise ValueError('its last line has no end, as that of a file which was cut off')
+    return content
 
 
 def _line(text: object) -> str:

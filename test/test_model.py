@@ -10,6 +10,7 @@
 
 """Model files: a good one is read as written, a bad one is a ModelError of one sentence."""
 
+import contextlib
 from dataclasses import replace
 import math
 import random
@@ -225,6 +226,18 @@ def test_a_file_cut_off_anywhere_is_a_model_or_refused(tmp_path):
     data = full_text(tmp_path).encode()
     read_at = [end for end in range(len(data)) if is_read_or_refused(tmp_path, data[:end])]
     assert len(read_at) < len(data), 'no cut was refused'
+
+
+def test_a_calibration_cut_off_within_a_number_is_refused(tmp_path):
+    path, stored = tmp_path / 'model.yaml', SelfCalibration(0.0125, 9.3e-6, ((1e-9, 0), (0, 2e-9)))
+    write_model(path, GyroModel(self_calibration=stored))
+    data, found = path.read_bytes(), []
+    for end in range(len(data) + 1):
+        path.write_bytes(data[:end])
+        with contextlib.suppress(ModelError):
+            found.append(read_model(path).self_calibration)
+    values = {(each.scale_factor_error, each.bias) for each in found if each}
+    assert found[-1] == stored and values == {(0.0125, 9.3e-6)}
 
 
 JUNK = ['.nan', '-.inf', '1e400', '1' + '0' * 330, 'null', 'true', '[]', '{}', '[[[]]]', '"', "'",
