@@ -95,7 +95,7 @@ BAD = {
     'a noise that vanishes when it is squared': (
         'effects: {}\nnoise: {angle_random_walk: 1.0e-300}', 'noise.angle_random_walk is 1e-300'),
     'other YAML': ('name: a robot\nwheels: 4\n', 'effects is None'),
-    'another format': ('format: a/b\neffects: {}', "format is 'a/b'"),
+    'another format': ('format: a/b\neffects: {}\n', "format is 'a/b'"),
     'newer version': ('version: 2\neffects: {}',
                       'version is 2; wanted at most 1: install a newer'),
     'version of text': ('version: one\neffects: {}', 'version is'),
