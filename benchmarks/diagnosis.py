@@ -26,10 +26,16 @@ failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
         triples   the same with three
         outside   N logs of each effect outside the catalogue, at 3 times
         sets      N logs of each pair of twins, either of them hidden where they are confounded
+        references
+                  N logs of 10 min at 25 Hz for each reference that errs: with nothing hidden,
+                  without a model, and with one that is right (its bias instability is the floor
+                  of the Allan deviation); and N with effects at each multiple, in turn
 
-    The figures: `detected`, something is reported; `first`, the strongest finding has the right
-    name; `in set`, each hidden cause is a finding or in the set of one; `set size`, of the
-    findings that hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
+    What is suspected only does not count, but for the column `suspected`, which has such names a
+    log; of what happens once (`ONCE`), which is never established, it does. The figures:
+    `detected`, something is reported; `first`, the strongest finding has the right name; `in
+    set`, each hidden cause is a finding or in the set of one; `set size`, of the findings that
+    hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
     structures without a name, a log; `right`, each hidden cause is found or in a set of at most
     three, and nothing else is reported; `interval`, the size lies in its 95 % interval, of those
     that are named and are numbers; `gain`, the improvement on held-out parts over that with all
@@ -66,6 +72,7 @@ from diagnosed import diagnosis_of, Judged, judged, won  # noqa: E402
 from gyro_calibration.diagnosis.finding import Finding  # noqa: E402
 from hidden import Cause, FORMS, HiddenLog, hide, OUTSIDE, twin, TWINS  # noqa: E402
 from hidden.effects import AGAINST_A_MODEL  # noqa: E402
+from hidden.reference import hide_beside, Imperfect  # noqa: E402
 import numpy as np  # noqa: E402  (after the number of its threads is set)
 
 MULTIPLES = (1.2, 2.0, 5.0)
@@ -75,6 +82,35 @@ NOISES = ('mixed', 'walk', 'flicker', 'white', 'gauss_markov')
 #: References in turn: a rate, a heading, and the heading of an encoder.
 REFERENCES = ('rate', 'heading', 'rate', 'encoder')
 ENCODER_STEP = 2.0 * math.pi / 65536
+#: References that err, and the effects that are hidden beside them in turn.
+IMPERFECT = {
+    f'{kind}_{size:g}': Imperfect(kind, size)
+    for kind, sizes in (
+        ('rate', (0.1, 0.3, 0.5)),
+        ('capture', (0.02, 0.05, 0.1)),
+        ('encoder', (0.09, 0.5)),
+        ('course', (1.0, 5.0, 10.0)),
+    )
+    for size in sizes
+}
+BESIDE = (
+    'scale_factor_asymmetry',
+    'cubic_nonlinearity',
+    'heading_sensitivity',
+    'bias_temperature',
+    'scale_factor_temperature',
+    'warm_up',
+    'time_offset',
+    'bandwidth',
+    'reference_once_per_rev',
+    'reference_slip',
+    'bias_step',
+    'acceleration_sensitivity',
+)
+#: What is true of references without being hidden.
+TRUE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
+#: Causes that happen once; their names count even where they are suspected only.
+ONCE = ('bias_step', 'reference_slip')
 #: Not in pairs: findings against a model only, and a wrong unit, which changes other sizes.
 ALONE = {*AGAINST_A_MODEL, 'unit_error'}
 #: So much of its multiple each of several effects must keep beside the others.
@@ -94,7 +130,7 @@ class Case:
     twins: tuple[str, str] | None = None
 
     def __str__(self) -> str:
-        what = '+'.join(self.names) or ('nothing' if self.part == 'nothing' else 'random')
+        what = '+'.join(self.names) or ('random' if self.multiple else 'nothing')
         beside = '' if self.twins is None else f'({"|".join(self.twins)})'
         return (f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/'
                 f'{self.number}')
@@ -107,6 +143,9 @@ class Case:
     @property
     def row(self) -> str:
         """Return the row of the table that it belongs to."""
+        if self.part == 'references':
+            kind, beside = self.reference, ', with a model' if self.noise == 'floor' else ''
+            return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + beside)
         return {'nothing': f'nothing, {self.noise}',
                 'effects': f'one effect, {self.multiple:g} times',
                 'pairs': f'two effects, {self.multiple:g} times',
@@ -128,6 +167,7 @@ class Answer:
     how: Judged
     gain: Mapping[str, tuple[float, float]]
     right: bool
+    suspected: Sequence[str]
 
 
 # the cases
@@ -140,6 +180,14 @@ def cases(part: str, logs: int) -> Iterator[Case]:
     elif part == 'sets':
         yield from (Case(part, (name,), 0.0, 'white', 'rate', number, pair)
                     for number in range(logs) for pair in TWINS for name in pair)
+    elif part == 'references':
+        for place, reference in enumerate(IMPERFECT):
+            for number in range(logs):
+                yield Case(part, (), 0.0, _turn(NOISES, number), reference, number)
+                yield Case(part, (), 0.0, 'floor', reference, number)
+                for multiple in MULTIPLES:
+                    name = _turn(BESIDE, number * len(IMPERFECT) + place)
+                    yield Case(part, (name,), multiple, _turn(NOISES, number), reference, number)
     else:
         multiples = (3.0,) if part == 'outside' else MULTIPLES
         names: Sequence[tuple[str, ...]] = (
@@ -161,6 +209,10 @@ def _reference(names: Sequence[str], number: int) -> str:
 
 def made(case: Case, generator: np.random.Generator) -> HiddenLog:
     """Hide what a case asks for."""
+    if case.part == 'references':
+        noise = 'gauss_markov' if case.noise == 'floor' else case.noise
+        return hide_beside(
+            case.names, case.multiple, generator, IMPERFECT[case.reference], noise)
     if case.twins is not None:
         return twin(case.twins, case.names[0], generator)
     step = ({'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder'
@@ -184,19 +236,25 @@ def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
     hidden = made(case, generator)
     begin, found, problem = time.process_time(), None, ''
     try:
-        found = diagnosis_of([hidden], generator, with_model or case.against_a_model)
+        found = diagnosis_of([hidden], generator, with_model or case.against_a_model
+                             or case.noise == 'floor')
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
     findings, beyond = ((), []) if found is None else (found.findings,
                                                        [each.along for each in found.unexplained])
-    # an encoder does have steps
-    how = judged(hidden, findings, beyond,
-                 ['reference_quantization'] if case.reference == 'encoder' else [])
+    findings = tuple(each for each in findings
+                     if each.status == 'established'
+                     or each.effect in ONCE and each.p_value < 0.01)
+    suspected = [] if found is None else [each.effect for each in found.findings
+                                          if each not in findings]
+    how = judged(hidden, findings, beyond, TRUE.get(case.reference.partition('_')[0], ()))
     return Answer(str(case), case.row,
                   {cause.name: _told(cause) for cause in hidden.truth.gyro.causes},
-                  [_answer(each) for each in findings], problem, seconds, how, won(hidden, found)
-                  if found is not None and hidden.truth.names else {}, how.right and not problem)
+                  [_answer(each) for each in findings], problem, seconds, how,
+                  won(hidden, found) if found is not None and hidden.truth.names
+                  and case.part != 'references' else {},
+                  how.right and not problem, suspected)
 
 
 def _told(cause: Cause) -> dict[str, Any]:
@@ -213,8 +271,8 @@ def _answer(finding: Finding) -> dict[str, Any]:
 
 # the table
 
-HEADER = ('| hidden | logs | detected | first | in set | set size | extra | beyond | right '
-          '| interval | gain | heading | time, s |')
+HEADER = ('| hidden | logs | detected | first | in set | set size | extra | beyond '
+          '| suspected | right | interval | gain | heading | time, s |')
 
 
 def line(row: str, answers: Sequence[Answer]) -> str:
@@ -228,6 +286,7 @@ def line(row: str, answers: Sequence[Answer]) -> str:
     cells += [f'{np.mean(sizes):.2f}' if sizes else '',
               f'{np.mean([len(each.how.extra) for each in answers]):.3f}',
               f'{np.mean([len(each.how.beyond) for each in answers]):.3f}',
+              f'{np.mean([len(each.suspected) for each in answers]):.3f}',
               _percent([each.right for each in answers]), _percent(held), _share(answers, 'rate'),
               _share(answers, 'heading'), f'{np.mean([each.seconds for each in answers]):.1f}']
     return f'| {" | ".join(cells)} |'
@@ -269,7 +328,8 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--logs', type=int, default=2, help='of each kind; default: 2')
     parser.add_argument('--part', nargs='+',
-                        default=['nothing', 'effects', 'pairs', 'triples', 'outside', 'sets'])
+                        default=['nothing', 'effects', 'pairs', 'triples', 'outside', 'sets',
+                                 'references'])
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--only', default='',
                         help='cases in whose names this regular expression is found')
@@ -279,7 +339,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument('--verbose', action='store_true', help='print each case that fails')
     parser.add_argument('--out', help='a file for all cases, JSON, one a line')
     given = parser.parse_args(words)
-    print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 12}',
+    print(f'seed {given.seed}, {given.logs} logs of each kind\n\n{HEADER}\n|---|{"---:|" * 13}',
           flush=True)
     for part in given.part:
         chosen = [case for case in cases(part, given.logs) if re.search(given.only, str(case))]

@@ -184,12 +184,15 @@ def test_what_allows_no_answer_is_refused_in_one_sentence(spoilt, reason, log, d
     assert not (tmp_path / 'found').exists()
 
 
-def test_a_model_of_other_units_is_refused(log, diagnose, tmp_path):
+def test_a_model_of_other_units_is_the_finding_alone(log, diagnose, tmp_path):
     (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: '
                                          '56.3}}\n')
-    code, text, errors = diagnose(log, '--model', tmp_path / 'wrong.yaml')
-    assert code == 1 and not text and 'of other units' in errors and one_sentence(errors)
-    assert not (tmp_path / 'found').exists()
+    code, text, _ = diagnose(log, '--model', tmp_path / 'wrong.yaml', '--json')
+    told = json.loads(text)
+    (finding,) = told['findings']
+    assert code == 0 and told['verdict'] == 'mismatched' and finding['effect'] == 'model'
+    assert 'write it in rad/s' in finding['remedy']
+    assert {gate['name']: gate['passed'] for gate in told['gates']}['model'] is False
 
 
 @pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)],

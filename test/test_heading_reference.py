@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from diagnosed import judged, log_of
 from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
@@ -19,6 +20,7 @@ from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.effects import BIAS
 from gyro_calibration.log import DEGREE, Log
 from gyro_calibration.model import GyroModel, Term
+from hidden.reference import hide_beside, Imperfect
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -145,10 +147,45 @@ def test_the_answer_is_about_heading_and_is_told_in_all_files():
 def test_the_kind_of_a_reference_is_told_or_found():
     log = drive(9)
     exact = replace(log, reference_heading=np.cumsum(log.output) / RATE)
-    assert reference_of(log).kind == 'course' and limits(reference_of(log))
-    assert reference_of(exact).kind == 'motion_capture' and not limits(reference_of(exact))
+    assert reference_of(log).kind == 'course' and limits(log, reference_of(log))
+    assert reference_of(exact).kind == 'motion_capture' and not limits(exact, reference_of(exact))
     assert reference_of(exact, 'odometry').kind == 'odometry' and limits(
-        reference_of(exact, 'odometry')
+        exact, reference_of(exact, 'odometry')
     )
     assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
+
+
+ERRING = [Imperfect('rate', 0.1), Imperfect('rate', 0.5), Imperfect('capture', 0.05),
+          Imperfect('encoder', 0.5)]
+
+
+def established(hidden):
+    found = diagnosed(log_of(hidden))
+    return found, [each for each in found.findings if each.status == 'established']
+
+
+@pytest.mark.parametrize('reference', ERRING, ids=str)
+def test_the_noise_of_a_reference_is_no_effect_of_the_gyro(reference):
+    # taken for exact, it was named dead zone, bandwidth or delay in nearly every such log
+    hidden = hide_beside([], 0.0, np.random.default_rng(0), reference)
+    found, named = established(hidden)
+    assert limits(log_of(hidden), found.reference) and not named, lines(found)
+    assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
+
+
+# not the coarse encoder: sizes take its rounding as new each sample, which at rest it is not
+@pytest.mark.parametrize('reference', ERRING[:3], ids=str)
+def test_an_effect_of_the_rate_is_established_beside_the_noise_of_a_reference(reference):
+    hidden = hide_beside(['scale_factor_asymmetry'], 5.0, np.random.default_rng(1), reference)
+    found, named = established(hidden)
+    assert judged(hidden, named, ()).right, lines(found)
+    assert named[0].minimum_detectable > 0.0
+
+
+def test_a_fine_encoder_and_an_exact_rate_are_taken_as_they_are():
+    hidden = hide_beside([], 0.0, np.random.default_rng(2), Imperfect('encoder', 0.0055))
+    log = log_of(hidden)
+    assert reference_of(log).kind == 'encoder' and not limits(log, reference_of(log))
+    exact = replace(log, reference_heading=None, reference_rate=hidden.truth.rate)
+    assert not limits(exact, reference_of(exact))

@@ -22,27 +22,33 @@ than no cause does; else it is suspected.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+import math
 
 from gyro_calibration.diagnosis.regression import (
-    all_columns,
     Column,
     FEWEST_STRETCHES,
     Fitted,
     fitted,
-    whitening,
+    Whitened,
+    whitened,
 )
+from gyro_calibration.effects import CATALOGUE
 from gyro_calibration.log import Array, Mask
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 #: Most causes that are added, and parts of a log for cross-fitting.
 MOST, FOLDS = 4, 5
 #: A cause is suspected up to so many times the level.
 _SUSPECTED = 5.0
-#: By how many standard deviations a cause must win on stretches that are held out.
-_SURELY = 1.65
+#: By how many standard deviations a cause must win on stretches that are held out, where a stretch
+#: counts no more than so much log-likelihood: what one stretch shows is not sure.
+_SURELY, _BOUND = 1.65, 3.0
+#: Causes explain a log as well as the best of them up to this likelihood ratio.
+_LIKELY = 25.0
 #: No probability below this is printed: the assumptions carry none.
 LEAST_CHANCE = 1e-4
 
@@ -71,24 +77,10 @@ class Confirmed:
     probability: dict[str, float]
 
 
-@dataclass(frozen=True)
-class _Whitened:
-    """Whitened observations, plain and candidate columns; the prior is rows of stretch -1."""
-
-    observed: Array
-    plain: Array
-    candidates: Sequence[Array]
-    stretch: Array
-
-    def rest(self, rows: Mask, columns: Array) -> tuple[Array, Array]:
-        """Return values of plain columns for each of some columns, and the rest of all rows."""
-        values = np.linalg.lstsq(self.plain[rows], columns[rows], rcond=None)[0]
-        return values, columns - self.plain @ values
-
-
 def candidates(done: Fitted) -> Iterator[Column]:
     """Give the causes that headings over spans can show, for the channels that the log has."""
     log, duration = done.spans.log, float(done.spans.time[-1] - done.spans.time[0])
+    fine = done.spans.fine
     for name in (
         'scale_factor_asymmetry',
         'quadratic_nonlinearity',
@@ -98,17 +90,25 @@ def candidates(done: Fitted) -> Iterator[Column]:
     ):
         yield Column(name)
     yield Column('reference_once_per_rev')
-    for constant in np.geomspace(duration / 50.0, 0.7 * duration, 5):
+    if fine:
+        yield Column('bandwidth', positive=True)
+    for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5):
         yield Column('warm_up', (float(constant),))
-    for moment in np.linspace(done.spans.time[0], done.spans.time[-1], 22)[1:-1]:
+    for moment in np.linspace(done.spans.time[0], done.spans.time[-1], 62 if fine else 22)[1:-1]:
         yield Column('bias_step', (float(moment),), once=True)
-        yield Column('reference_slip', (float(moment),), once=True)
+        if not fine:
+            yield Column('reference_slip', (float(moment),), once=True)
     if log.temperature is not None and np.ptp(log.temperature) > 0.2:
         middle = float(log.temperature.mean())
         for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
             yield Column(name, (middle,))
         for filter_time in (3.0, 10.0):
             yield Column('bias_temperature_rate', (filter_time,))
+        if fine:
+            for constant in np.geomspace(5.0, min(duration, 3000.0), 6):
+                yield Column('thermal_lag', (float(constant),))
+            for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
+                yield Column('thermal_hysteresis', (filter_time, threshold))
     if log.specific_force is not None and np.ptp(log.specific_force) > 0.0:
         yield Column('acceleration_sensitivity')
         yield Column('vibration_rectification', (1.0,))
@@ -123,11 +123,10 @@ def search(done: Fitted, level: float) -> tuple[Fitted, list[Confirmed]]:
     # beside one column of each cause, so that the noise does not swallow what a cause leaves
     columns = {each.cause: each for each in offered if not each.once}
     rich = fitted(done.spans, list(columns.values()))
-    whiten = whitening(rich.spans, rich.fit)
     while len(found) < MOST:
         taken = {each.column.cause for each in found}
         open_ones = [each for each in offered if each.cause not in taken]
-        best = _best(done, whiten, open_ones, [each.column for each in found], level)
+        best = _best(done, rich, open_ones, [each.column for each in found], level)
         if best is None:
             break
         found.append(best)
@@ -137,41 +136,60 @@ def search(done: Fitted, level: float) -> tuple[Fitted, list[Confirmed]]:
 
 def _best(
     done: Fitted,
-    whiten: Array,
+    rich: Fitted,
     open_ones: Sequence[Column],
     beside: Sequence[Column],
     level: float,
 ) -> Confirmed | None:
     """Return the best of the causes that are open, beside those found; None where it is chance."""
-    data = _whitened(done, whiten, open_ones, beside)
+    data = whitened(done, beside, rich, most=True)
+    widths = [done.spans.columns(each) for each in open_ones]
+    columns = data.columns(np.column_stack(widths))
+    edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
+    places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
     everything = np.ones(len(data.observed), dtype=bool)
-    chances = [_evidence(data, each, everything) for each in data.candidates]
-    names = {each.cause for each in open_ones}
+    positive = [each.positive for each in open_ones]
+    chances = _evidences(data, columns, places, positive, everything)
     # what happens once is never established, and does not cost the others a part of the level
     lasting = sum(not each.once for each in open_ones)
     tried = [
         chance * (len(open_ones) if each.once else lasting)
         for each, (chance, _, _) in zip(open_ones, chances)
     ]
-    place = int(np.argmin(tried))
-    _, gain, stretches = chances[place]
-    p_value = min(tried[place], 1.0)
-    if p_value > _SUSPECTED * level:
+    strongest = int(np.argmin(tried))
+    once = open_ones[strongest].once
+    if min(tried[strongest], 1.0) > (level if once else _SUSPECTED * level):
         return None
-    predicted, surely, chosen = _cross_fitted(data, open_ones, place)
-    column = open_ones[place]
-    gains = {
-        name: max(chances[other][1] for other, each in enumerate(open_ones) if each.cause == name)
-        for name in names
+    best_of: dict[str, int] = {}
+    for other, each in enumerate(open_ones):
+        name = each.cause
+        if name not in best_of or chances[other][1] > chances[best_of[name]][1]:
+            best_of[name] = other
+    gain = chances[strongest][1]
+    alike = {
+        name: other
+        for name, other in best_of.items()
+        if chances[other][1] > gain - math.log(_LIKELY) or other == strongest
     }
+    # of those that explain the log as well, the simplest
+    place = min(
+        alike.values(), key=lambda other: (_size(open_ones[other], widths[other]), tried[other])
+    )
+    _, _, stretches = chances[place]
+    p_value = min(tried[place], 1.0)
+    found = _cross_fitted(data, columns, places, positive, open_ones, alike)
+    # the errors of a course last: there a cause has to predict distant stretches as well
+    surely, predicted, chosen = max(found) if done.spans.fine else min(found)
+    column = open_ones[place]
     weights = {
-        name: float(np.exp(max(min(value - gain, 0.0), -50.0))) for name, value in gains.items()
+        name: float(np.exp(max(min(chances[other][1] - gain, 0.0), -50.0)))
+        for name, other in best_of.items()
     }
     total = sum(weights.values())
     probability = {
         name: max(weight / total, LEAST_CHANCE)
         for name, weight in sorted(weights.items(), key=lambda each: -each[1])
-        if weight / total > 0.01
+        if name in alike
     }
     established = (
         p_value < level
@@ -185,31 +203,41 @@ def _best(
     )
 
 
-def _whitened(
-    done: Fitted, whiten: Array, open_ones: Sequence[Column], beside: Sequence[Column]
-) -> _Whitened:
-    spans = done.spans
-    plain = all_columns(spans, beside)
-    prior = np.diag(1.0 / done.prior)
-    rows = np.concatenate([whiten @ plain, np.pad(prior, ((0, 0), (0, plain.shape[1] - 3)))])
-    columns = [np.pad(whiten @ spans.columns(each), ((0, 3), (0, 0))) for each in open_ones]
-    return _Whitened(
-        np.append(whiten @ spans.observed, np.zeros(3)),
-        rows,
-        columns,
-        np.append(spans.stretches, [-1, -1, -1]),
-    )
+def _size(column: Column, columns: Array) -> int:
+    """Return how many values a cause has, shapes that are fitted included."""
+    shapes = CATALOGUE[column.cause].shapes if column.cause in CATALOGUE else ()
+    return columns.shape[1] + sum(each.default is None for each in shapes)
 
 
-def _evidence(data: _Whitened, columns: Array, rows: Mask) -> tuple[float, float, float]:
+def _evidences(
+    data: Whitened,
+    columns: Array,
+    places: Sequence[slice],
+    positive: Sequence[bool],
+    rows: Mask,
+) -> list[tuple[float, float, float]]:
+    """Return chance, gain in log-likelihood and effective stretches of each cause."""
+    base, _ = np.linalg.qr(data.plain[rows])
+    both = np.column_stack([columns, data.observed])[rows]
+    both -= base @ (base.T @ both)
+    stretch = data.stretch[rows]
+    sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
+    return [
+        (1.0, 0.0, 0.0)
+        if above and float(both[:, place.start] @ both[:, -1]) <= 0.0
+        else _evidence(both[:, place], both[:, -1], stretch, 1e-6 * sizes[place])
+        for place, above in zip(places, positive)
+    ]
+
+
+def _evidence(
+    x: Array, left: Array, stretch: NDArray[np.intp], least: Array
+) -> tuple[float, float, float]:
     """Return chance, gain in log-likelihood (both cluster-robust) and effective stretches."""
-    _, both = data.rest(rows, np.column_stack([columns, data.observed]))
-    x, left = both[rows, :-1], both[rows, -1]
     information = x.T @ x
     size = np.sqrt(np.diag(information))
-    if not (size > 1e-9 * np.sqrt(np.sum(columns**2, axis=0) + 1e-300)).all():
+    if not (size > least).all():
         return 1.0, 0.0, 0.0
-    stretch = data.stretch[rows] + 1
     # by what the candidate leaves: a score that holds the effect itself would hide it
     off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
     scores = np.array([np.bincount(stretch, part * off) for part in x.T])
@@ -225,33 +253,46 @@ def _evidence(data: _Whitened, columns: Array, rows: Mask) -> tuple[float, float
 
 
 def _cross_fitted(
-    data: _Whitened, open_ones: Sequence[Column], place: int
-) -> tuple[float, float, float]:
+    data: Whitened,
+    columns: Array,
+    places: Sequence[slice],
+    positive: Sequence[bool],
+    open_ones: Sequence[Column],
+    alike: Mapping[str, int],
+) -> list[tuple[float, float, float]]:
     """
     Choose and fit without each fold, and predict it.
 
     Returns
     -------
-    what is won in log-likelihood, the same over its standard deviation by the scatter between
-    stretches, and the part of the folds in which the choice was the same
+    for folds of every fifth stretch, and for fifths of the log (between neighbours, what is slow
+    is predicted by the wander as well): what is won in log-likelihood over its standard
+    deviation by the scatter between stretches, what is won, and the part of the folds in which
+    the choice was one of those alike
 
     """
-    numbers = np.unique(data.stretch[data.stretch >= 0])
+    numbers = np.arange(data.of_log)
     folds = min(FOLDS, len(numbers))
-    won: list[float] = []
-    same = 0
-    for fold in range(folds):
-        held = np.isin(data.stretch, numbers[fold::folds])
-        rest = ~held
-        gains = [_evidence(data, each, rest)[1] for each in data.candidates]
-        best = int(np.argmax(gains))
-        same += open_ones[best].cause == open_ones[place].cause
-        plain = data.rest(rest, data.observed[:, None])[1][held, 0]
-        both = np.column_stack([data.plain, data.candidates[best]])
-        values = np.linalg.lstsq(both[rest], data.observed[rest], rcond=None)[0]
-        left = data.observed[held] - both[held] @ values
-        won += np.bincount(
-            np.searchsorted(numbers[fold::folds], data.stretch[held]), 0.5 * (plain**2 - left**2)
-        ).tolist()
-    total, scatter = float(np.sum(won)), float(np.std(won, ddof=1)) * len(won) ** 0.5
-    return total, total / scatter if scatter > 0.0 else 0.0, same / folds
+    found = []
+    for sets in ([numbers[fold::folds] for fold in range(folds)], np.array_split(numbers, folds)):
+        won: list[float] = []
+        same = 0
+        for fold in sets:
+            held = np.isin(data.stretch, fold)
+            rest = ~held
+            gains = [each[1] for each in _evidences(data, columns, places, positive, rest)]
+            best = int(np.argmax(gains))
+            same += open_ones[best].cause in alike
+            off = []
+            for design in (data.plain, np.column_stack([data.plain, columns[:, places[best]]])):
+                values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
+                off.append(data.observed[held] - design[held] @ values)
+            won += np.bincount(
+                np.searchsorted(fold, data.stretch[held]), 0.5 * (off[0] ** 2 - off[1] ** 2)
+            ).tolist()
+        bounded = np.clip(won, -_BOUND, _BOUND)
+        scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
+        total = float(np.sum(won))
+        surely = float(np.sum(bounded)) / max(scatter, 1e-9) if total > 0.0 else 0.0
+        found.append((surely, total, same / folds))
+    return found

@@ -23,6 +23,7 @@ from gyro_calibration.diagnosis.compared import (
     scale_of,
     white_noise,
 )
+from gyro_calibration.diagnosis.finding import Gate
 from gyro_calibration.dwells.samples import between_values, output_of, where_lost
 from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.model import GyroModel
@@ -74,6 +75,16 @@ def refuse(log: Log, model: GyroModel | None = None) -> None:
     _refuse_copy(log, output)
     if model is not None:
         _refuse_units(log, output, model)
+
+
+def model_gate(log: Log, model: GyroModel) -> Gate:
+    """Tell whether a model is of the units of a log."""
+    try:
+        _refuse_units(prepared(log)[0], output_of(log), model)
+    except DataRefused as refusal:
+        said, _, remedy = str(refusal).partition('; ')
+        return Gate('model', False, said, remedy)
+    return Gate('model', True, 'the model is of the units of the log')
 
 
 def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:

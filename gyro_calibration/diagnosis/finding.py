@@ -43,7 +43,7 @@ class Gate:
 
     Attributes
     ----------
-    name : wrapped_heading, motion, tilt, sense, unit or time_unit
+    name : wrapped_heading, motion, tilt, sense, unit, time_unit or model
     passed : None where the log does not show it
     said : what was seen, in numbers
     remedy : what to do where it failed

@@ -316,6 +316,7 @@ def mismatch(checked: Sequence[Gate]) -> Finding | None:
         'wrapped_heading': 'The reference heading is wrapped.',
         'tilt': 'The axis of the gyro tilts, so that its integral is no heading.',
         'motion': 'The reference shows another motion than the gyro.',
+        'model': 'The model is of other units than the log, or of another gyro.',
     }
     effect = 'unit_error' if parameters else failed.name
     return Finding(

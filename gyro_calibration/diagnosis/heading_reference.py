@@ -33,13 +33,14 @@ from gyro_calibration.diagnosis.gain import change_over, WINDOW
 from gyro_calibration.diagnosis.hygiene import inspect
 from gyro_calibration.diagnosis.regression import (
     all_columns,
+    Column,
     FEWEST_STRETCHES,
     Fitted,
     fitted,
     PLAIN,
-    SPAN,
+    shared_noise,
     spans_of,
-    whitening,
+    whitened,
 )
 from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.log import Array, DEGREE, Log
@@ -53,11 +54,20 @@ from scipy.stats import t as student
 _FEWEST_PARTS, _MOST_PARTS, _PART = 2, 6, 80.0
 #: A window is no longer than this part of what is held out.
 _WITHIN = 0.75
+#: Kinds whose values come with the samples of the gyro, by one clock.
+_SAME_CLOCK = ('rate_command', 'encoder')
+#: Standard deviations from which on a value is found in 95 % of logs, and from which on a lag is
+#: ruled out.
+SEEN, _RULED_OUT = 4.8, 3.0
 #: A gyro is no more sluggish than this, s.
 _OF_A_LAG = 0.1
 #: Bins of a curve.
 _BINS = 20
+#: Shares of the false-alarm rate: of the causes that are searched for, and beside a model of bias
+#: and of scale factor error. A delay between two clocks is no surprise: it has a level of its own.
+_OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05}
 _SPOKEN = {
+    'rate_command': 'a reference rate with noise',
     'course': 'a course over ground',
     'encoder': 'an encoder',
     'odometry': 'odometry',
@@ -86,22 +96,30 @@ def diagnose_heading(
     rate : of false alarms
 
     """
+    if reference.kind != 'rate_command' and log.reference_heading is not None:
+        log = replace(log, reference_rate=None)
+    else:
+        log = replace(log, reference_heading=None)
     record = inspect(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
     output = np.where(record.trusted, log.output, np.nan)
     mended = replace(log, output=output)
     corrected = mended if model is None else replace(mended, output=compensate_log(model, mended))
-    plain = fitted(spans_of(corrected))
-    extended, found = search(plain, rate)
+    plain = fitted(spans_of(corrected, reference.kind))
+    extended, found = search(plain, _OF_SEARCH * rate)
     gain = _gain(plain, extended)
+    inside = extended
     if gain is not None and extended.causes and gain.models['extended'] > gain.models['plain']:
-        found = [replace(each, established=False) for each in found]
-        extended = plain
+        # what predicts no better is in no model; a course shows no more than that
+        inside = plain
+        if not plain.spans.fine:
+            found = [replace(each, established=False) for each in found]
+            extended = plain
         gain = _gain(plain, plain)
     given = model or GyroModel()
     base = _model(GyroModel(), plain, log) if model is None else model
     findings = [
-        *_of_values(plain, model is not None, rate),
+        *_of_values(extended, model, rate, reference),
         *record.findings,
         *(_finding(each, extended, plain) for each in found),
     ]
@@ -121,7 +139,7 @@ def diagnose_heading(
         and each.effect not in {one.effect for one in record.findings}
         for each in findings
     )
-    after = _model(given, extended, log) if changed or model is None else given
+    after = _model(given, inside, log) if changed or model is None else given
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     noise = {name: extended.size(name) for name in ('reference', 'motion')}
     return Diagnosis(
@@ -148,38 +166,94 @@ def diagnose_heading(
 # values
 
 
-def _of_values(plain: Fitted, given: bool, rate: float) -> Iterator[Finding]:
+def _of_values(
+    done: Fitted, model: GyroModel | None, rate: float, reference: Reference
+) -> Iterator[Finding]:
     """Give delay, and beside a model bias and scale factor error, where they are established."""
+    lag = next((each for each in done.causes if each.cause == 'bandwidth'), None)
     for place, name in enumerate(PLAIN):
-        if name != 'time_offset' and not given:
+        if name != 'time_offset' and model is None:
             continue
-        value, deviation = float(plain.values[place]), math.sqrt(plain.covariance[place, place])
-        effective = float(plain.stretches_of[place])
-        chance = float(2.0 * student.sf(abs(value) / deviation, max(effective - 1.0, 1.0)))
-        if chance >= rate or effective < FEWEST_STRETCHES:
+        value, deviation = float(done.values[place]), math.sqrt(done.covariance[place, place])
+        if name == 'bias' and model is not None:
+            deviation = math.sqrt(deviation**2 + _wander_of(done, model))
+        if name == 'time_offset' and lag is not None:
+            # to first order a lag is a delay
+            square, half = _value_of(done, lag)
+            constant = _lag(square, half)
+            value -= constant.estimate
+            deviation = math.hypot(
+                deviation, (constant.interval[1] - constant.interval[0]) / (2.0 * 1.96)
+            )
+        effective = float(done.stretches_of[place])
+        freedom = max(effective - 1.0, 1.0)
+        chance = float(2.0 * student.sf(abs(value) / deviation, freedom))
+        if chance >= _OF_VALUE.get(name, 1.0) * rate or effective < FEWEST_STRETCHES:
             continue
-        half, cause = plain.half(place), CAUSES[name]
+        half = min(
+            float(student.ppf(0.975, freedom)) * deviation,
+            1.96 * done.spans.treatment.prior[place],
+        )
+        cause = CAUSES[name]
+        own_clock = reference.kind not in _SAME_CLOCK
         of_reference = name == 'time_offset' and not 0.0 < value < _OF_A_LAG
+        twins = {
+            'time_offset': () if of_reference or lag or not _may_lag(done, value)
+            else ('bandwidth',),
+            'scale_factor_error': ('reference_scale',),
+        }.get(name, ())
         yield Finding(
             name,
-            'Gyro and reference are not of the same time.' if of_reference else cause.sentence,
+            'Gyro and reference are not of the same time.'
+            if of_reference and own_clock
+            else cause.sentence,
             {
                 name: Estimate(
                     value, (value - half, value + half), next(iter(cause.units.values()))
                 )
             },
             max(chance, LEAST_CHANCE),
-            ambiguous_with={
-                'time_offset': () if of_reference else ('bandwidth',),
-                'scale_factor_error': ('reference_scale',),
-            }.get(name, ()),
-            separate_by=cause.separate_by if not of_reference else '',
+            SEEN * deviation,
+            ambiguous_with=twins,
+            separate_by=cause.separate_by if twins else '',
             evidence=f'it rests on {effective:.0f} stretches',
             along=cause.along,
             remedy='synchronize the clocks of gyro and reference; the model has none of it'
-            if name == 'time_offset'
+            if name == 'time_offset' and own_clock
             else '',
         )
+
+
+def _value_of(done: Fitted, cause: Column) -> tuple[float, float]:
+    """Return the first value of a cause, and half of its interval."""
+    start = len(PLAIN)
+    for each in done.causes:
+        if each == cause:
+            break
+        start += done.spans.columns(each).shape[1]
+    return float(done.values[start]), done.half(start)
+
+
+def _may_lag(done: Fitted, delay: float) -> bool:
+    """Tell whether a lag explains the log as well as the delay does."""
+    if not done.spans.fine:
+        return True
+    data = whitened(done, (*done.causes, Column('bandwidth')))
+    place = len(done.values)
+    inverse = np.linalg.pinv(data.plain.T @ data.plain)
+    square = float((inverse @ data.plain.T @ data.observed)[place])
+    return abs(square - 0.5 * delay**2) < _RULED_OUT * math.sqrt(inverse[place, place])
+
+
+def _wander_of(done: Fitted, model: GyroModel) -> float:
+    """Return the variance of the mean of a log about the bias of a model, by their wander."""
+    duration = float(done.spans.time[-1] - done.spans.time[0])
+    seen, noise = _noise(done), model.noise
+    of_log, of_model = (
+        2.0 / math.pi * each.bias_instability**2 + each.rate_random_walk**2 * duration / 3.0
+        for each in (seen, noise)
+    )
+    return max(of_log, of_model)
 
 
 def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
@@ -195,10 +269,12 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
     values, half = done.values[start: start + width], [done.half(start + k) for k in range(width)]
     unit = (
         CATALOGUE[name].coefficients[0].unit
-        if name in CATALOGUE
+        if name in CATALOGUE and CATALOGUE[name].coefficients
         else next(iter(CAUSES[name].units.values()))
     )
-    if width == 1:
+    if name == 'bandwidth':
+        parameters = {name: _lag(float(values[0]), half[0])}
+    elif width == 1:
         size = float(values[0])
         parameters = {name: Estimate(size, (size - half[0], size + half[0]), unit)}
     else:
@@ -207,7 +283,7 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
         parameters = {name: Estimate(size, (size - within, size + within), unit)}
     shapes = CATALOGUE[name].shapes if name in CATALOGUE else ()
     for parameter, value in zip(shapes, each.column.shapes):
-        if parameter.default is None:
+        if parameter.default is None and parameter.name not in parameters:
             parameters[parameter.name] = Estimate(value, (value, value), parameter.unit)
     known = CAUSES[name]
     others = tuple(other for other in each.probability if other != name)
@@ -231,7 +307,7 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
         known.sentence,
         parameters,
         each.p_value,
-        None,
+        SEEN * half[0] / 1.96 if width == 1 and name != 'bandwidth' else None,
         others,
         known.separate_by if others else '',
         evidence,
@@ -244,6 +320,14 @@ def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
     )
 
 
+def _lag(square: float, half: float) -> Estimate:
+    """Return a time constant from half of its square."""
+    low, size, high = (
+        math.sqrt(2.0 * max(each, 0.0)) for each in (square - half, square, square + half)
+    )
+    return Estimate(size, (low, high), 's')
+
+
 def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
     own = 1.0 + sum(term.values[0] for term in given.terms if term.effect is SCALE_FACTOR_ERROR)
@@ -253,7 +337,11 @@ def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
     start = len(PLAIN)
     for cause in done.causes:
         width = done.spans.columns(cause).shape[1]
-        if cause.cause in CATALOGUE:
+        if cause.cause == 'bandwidth':
+            size = math.sqrt(2.0 * max(float(done.values[start]), 1e-10))
+            terms.append(Term(CATALOGUE['bandwidth'], (size,)))
+            places.append(None)
+        elif cause.cause in CATALOGUE:
             terms.append(
                 Term(
                     CATALOGUE[cause.cause],
@@ -274,9 +362,12 @@ def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
 
 def _noise(done: Fitted) -> Noise:
     """Return the noise of the gyro; a wander that the log does not show is none."""
-    lower = done.fit.sizes['bias_instability'][1]
-    seen = done.size('bias_instability') if lower > 1e-6 else 0.0
-    return Noise(done.size('angle_random_walk'), seen)
+    shown = {}
+    for part in shared_noise(done.spans):
+        lower = done.fit.sizes[part.name][1]
+        # at the edge of the grid nothing bounds it from below
+        shown[part.name] = done.size(part.name) if lower > 1.01 * part.range[0] else 0.0
+    return Noise(done.size('angle_random_walk'), **shown)
 
 
 # what is won
@@ -321,7 +412,7 @@ def _shares(done: Fitted) -> dict[str, float]:
 def _over(change: Array, time: Array, window: float) -> Array:
     """Return changes over windows from changes over spans."""
     whole = np.concatenate([[0.0], np.cumsum(change)])
-    later = np.searchsorted(time, time + window - 0.5 * SPAN)
+    later = np.searchsorted(time, time + window - 0.5 * float(np.median(np.diff(time))))
     inside = np.flatnonzero(later < len(time))
     return np.asarray(whole[later[inside]] - whole[inside])
 
@@ -333,17 +424,17 @@ def _gain(plain: Fitted, extended: Fitted) -> Gain | None:
     parts = int(np.clip(duration / _PART, _FEWEST_PARTS, _MOST_PARTS))
     count = len(time) - 1
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
-    whiten = whitening(plain.spans, plain.fit)
     window = min(WINDOW, _WITHIN * duration / parts)
+    # under the noise of the plain fit, and beside the bias that wanders
+    noisy = whitened(plain, ())
+    prior = len(noisy.observed) - len(spans.observed)
     models = {
-        'given': plain.spans.plain()[:, 2:],
-        'plain': all_columns(spans, ()),
-        'extended': all_columns(extended.spans, extended.causes),
-    }
-    priors = {
-        'given': plain.prior[2:],
-        'plain': plain.prior,
-        'extended': np.append(extended.prior, np.full(models['extended'].shape[1] - 3, np.inf)),
+        'given': (plain.spans.plain()[:, 2:], noisy.plain[:, 2:]),
+        'plain': (all_columns(spans, ()), noisy.plain),
+        'extended': (
+            all_columns(extended.spans, extended.causes),
+            whitened(extended, extended.causes, plain).plain,
+        ),
     }
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
     sizes: list[tuple[int, int]] = []
@@ -353,10 +444,10 @@ def _gain(plain: Fitted, extended: Fitted) -> Gain | None:
         kept = np.setdiff1d(np.arange(len(spans.observed)), [*held, *(held + 1), *(held - 1)])
         if len(held) < 4 or len(kept) < 8:
             return None
-        for name, columns in models.items():
-            rows = np.vstack([whiten[kept] @ columns, np.diag(1.0 / priors[name])])
-            target = np.append(whiten[kept] @ spans.observed, np.zeros(len(priors[name])))
-            values = np.linalg.lstsq(rows, target, rcond=None)[0]
+        rows = np.append(kept, len(spans.observed) + np.arange(prior))
+        for name, (columns, white) in models.items():
+            values = np.linalg.lstsq(white[rows], noisy.observed[rows], rcond=None)[0]
+            values = values[: columns.shape[1]]
             left = (spans.observed - columns @ values)[:count][held]
             stamps = time[held[0]: held[-1] + 2]
             turned = _over(left, stamps, window)
@@ -431,10 +522,10 @@ def _remarks(reference: Reference, plain: Fitted) -> Iterator[str]:
         f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and by '
         f'{1000.0 * plain.size("motion"):.2g} ms of the motion.'
     )
-    if plain.prior[0] < PLAIN['scale_factor_error']:
+    if plain.prior[0] < plain.spans.treatment.prior[0]:
         yield (
             'The scale factor error rests on fewer than three stretches that turn, and is left '
-            'at 0 +- 1 %: turn more often, both ways.'
+            f'at 0 +- {100.0 * plain.spans.treatment.prior[0]:g} %: turn more often, both ways.'
         )
 
 

@@ -11,16 +11,18 @@
 """
 Headings over spans: the change of a reference regressed on what the gyro integrates to.
 
-The reference errs, and its errors are larger than those of the gyro over seconds. So the heading
-of the reference is observed, and all columns are integrals of what the gyro says: nothing of the
-reference is a regressor. With the output ``y``, the rate ``w`` that the values so far make of it,
-and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the heading ``psi`` of the reference is,
-at points ``t`` and less a constant::
+The reference errs, and its errors are larger than those of the gyro from sample to sample. So the
+heading of the reference (of a rate, its integral) is observed, and all columns are integrals of
+what the gyro says: nothing of the reference is a regressor. With the output ``y``, the rate ``w``
+that the values so far make of it, and effects ``y = w + b + s w + sum(a f(w, T, t, ...))``, the
+heading ``psi`` of the reference is, at points ``t`` and less a constant::
 
     psi(t) - J(t + d) = -b t - s J_w(t) - sum(a J_f(t)) + d w(t) + errors of the reference
 
 with ``J`` the integrals. A point is the mean over some samples; the observations are the
 differences between points, so that a gap of the reference is a long span that the gyro bridges.
+How long the spans are, and which parts the noise has, depends on the kind of the reference
+(`Treatment`). The cost grows linearly with the number of spans.
 
 """
 
@@ -38,15 +40,11 @@ from gyro_calibration.log import Array, DEGREE, Log
 from gyro_calibration.noise_grid import GridFit, heading_noise, noise_grid, SharedNoise, wander
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
-#: Names and prior standard deviations of the values that every model has: what gyros on wheels are
-#: sold with (scale 1 %, bias 1 deg/s), and delays of references (1 s).
-PLAIN = {'scale_factor_error': 0.01, 'bias': DEGREE, 'time_offset': 1.0}
-#: Length of a span, s; most spans of a log; stretches whose scores count as independent, s.
-SPAN, MOST_SPANS, STRETCH = 1.0, 400, 15.0
+#: Names of the values that every model has.
+PLAIN = ('scale_factor_error', 'bias', 'time_offset')
 #: Evidence of fewer stretches establishes nothing.
 FEWEST_STRETCHES = 3.0
 #: A point counts no less than one that errs by so many times the usual.
@@ -55,13 +53,60 @@ _WILDEST = 10.0
 _NOT = 1e-6
 #: Delays of a reference that are tried first, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
-#: Angle random walk of gyros on wheels at most, rad/√s (1.7 deg/√h): samples may vibrate more.
-_WALK = 5e-4
-#: Cosines of a bias that wanders, and the bias instability that gyros on wheels have, rad/s (up to
-#: 40 deg/h).
-_COSINES, _WANDER = 12, (1e-6, 2e-4)
 #: A gyro rests where its course is lost for so long, s, and its output is as quiet as ever.
 _REST, _QUIET = 3.0, 2.0
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """
+    How a kind of reference is compared with the gyro.
+
+    Attributes
+    ----------
+    span : least length, s
+    most : spans of a log, at most
+    prior : standard deviations of scale factor error, bias (rad/s) and delay (s) beforehand
+    walk : smallest and largest angle random walk, in units of the white noise of the samples
+    largest_walk : rad/√s; what vibrates has more white noise than walks
+    cosines : of a bias that wanders
+    flicker, random_walk : smallest and largest bias instability and rate random walk, rad/s and
+        rad/s/√s; relative to the angle random walk if `relative`
+    relative : whether they are
+    stretch : length of stretches whose scores count as independent, s
+    of_heading : whether the reference errs as a heading; the integral of a rate does not
+    averaged : whether a point is the mean of a span
+
+    """
+
+    span: float
+    most: int
+    prior: tuple[float, float, float]
+    walk: tuple[float, float]
+    largest_walk: float
+    cosines: int
+    flicker: tuple[float, float]
+    random_walk: tuple[float, float] | None
+    relative: bool
+    stretch: float
+    of_heading: bool
+    averaged: bool
+
+
+#: What gyros on wheels are sold with: scale 1 %, bias 1 deg/s, angle random walk of 1.7 deg/√h,
+#: bias instability of 40 deg/h at most; and delays of a course of 1 s.
+COURSE = Treatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12, (1e-6, 2e-4), None, False,
+                   15.0, True, True)
+#: A reference with errors of an instrument; the wander of a gyro is in units of its white noise.
+HEADING = Treatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf, 24, (3e-3, 0.5),
+                    (1e-4, 0.1), True, 5.0, True, True)
+RATE = replace(HEADING, of_heading=False, averaged=False, cosines=60)
+
+
+def treatment_of(kind: str) -> Treatment:
+    """Return how a kind of reference is compared."""
+    return {'rate_command': RATE, 'encoder': HEADING, 'motion_capture': HEADING,
+            'gyro': HEADING}.get(kind, COURSE)
 
 
 @dataclass(frozen=True)
@@ -74,12 +119,14 @@ class Column:
     cause : its name
     shapes : of the effect
     once : whether it happens at one time only
+    positive : whether its value is no less than 0
 
     """
 
     cause: str
     shapes: tuple[float, ...] = ()
     once: bool = False
+    positive: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,6 +142,8 @@ class Spans:
     known : these rows
     time, heading : of the points, s and rad, shape (n + 1,)
     rests : begin and end row of each stretch at rest
+    treatment : of the kind of the reference
+    white : standard deviation of the white noise of a sample, with that of a reference rate, rad/s
     delay : by which the stamps of the gyro are late beside the reference, s
 
     """
@@ -106,13 +155,20 @@ class Spans:
     time: Array
     heading: Array
     rests: tuple[tuple[int, int], ...]
+    treatment: Treatment
+    white: float
     delay: float = 0.0
+
+    @property
+    def fine(self) -> bool:
+        """Tell whether the reference errs so little that lags and short events show."""
+        return self.treatment is not COURSE
 
     @property
     def stretches(self) -> NDArray[np.intp]:
         """Return the number of the stretch of each observation, shape (n + r,)."""
         middle = 0.5 * (self.time[1:] + self.time[:-1]) - self.time[0]
-        count = max(int(np.ceil(middle[-1] / STRETCH)), 1)
+        count = max(int(np.ceil(middle[-1] / self.treatment.stretch)), 1)
         of_spans = np.minimum(middle * count / (middle[-1] + 1e-9), count - 1).astype(np.intp)
         return np.concatenate([of_spans, count + np.arange(len(self.rests))])
 
@@ -126,7 +182,7 @@ class Spans:
     def integrals(self, rate: Array) -> Array:
         """Return the change of the integral of a rate over spans and rests, shape (n + r,)."""
         assert self.log.time is not None
-        whole = integral_of(self.log.time, np.broadcast_to(rate, self.log.time.shape))
+        whole = angle_of(self.log.time, np.broadcast_to(rate, self.log.time.shape))
         still = [whole[end] - whole[begin] for begin, end in self.rests]
         return np.concatenate([np.diff(self.points(whole)), still])
 
@@ -157,6 +213,10 @@ class Spans:
             found = [
                 self.changes((np.asarray(self.channels.time) >= cause.shapes[0]).astype(float))
             ]
+        elif cause.cause == 'bandwidth':
+            # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
+            assert self.log.time is not None
+            found = [-self.changes(np.gradient(np.asarray(self.channels.rate), self.log.time))]
         else:
             effect = CATALOGUE[cause.cause]
             found = [
@@ -175,7 +235,7 @@ class Spans:
         assert self.log.time is not None
         rate = (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
-        turned = integral_of(self.log.time, rate)
+        turned = angle_of(self.log.time, rate)
         # of the reference, and between its points of the gyro
         away = np.interp(
             self.log.time - moved.delay, self.time, self.heading - moved.points(turned)
@@ -197,6 +257,7 @@ class Fitted:
     values, covariance : estimates and their cluster-robust covariance
     stretches_of : effective number of stretches that each value rests on
     prior : standard deviations of what is known of scale factor error, bias and delay beforehand
+    outlying : variance of each point beside the usual one
 
     """
 
@@ -207,13 +268,14 @@ class Fitted:
     covariance: Array
     stretches_of: Array
     prior: Array
+    outlying: Array
 
     def half(self, place: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
         freedom = max(self.stretches_of[place] - 1.0, 1.0)
         deviation = math.sqrt(max(self.covariance[place, place], 0.0))
         half = float(student.ppf(0.975, freedom)) * deviation
-        prior = list(PLAIN.values())
+        prior = self.spans.treatment.prior
         return min(half, 1.96 * prior[place]) if place < len(prior) else half
 
     def size(self, name: str) -> float:
@@ -221,26 +283,46 @@ class Fitted:
         return float(self.fit.likely.get(name, 0.0))
 
 
-def spans_of(log: Log) -> Spans:
-    """Lay a log with a reference heading out in spans."""
+def spans_of(log: Log, kind: str = 'course') -> Spans:
+    """Lay a log with a reference out in spans."""
     assert log.time is not None and log.output is not None
+    treatment = treatment_of(kind)
     time, output = log.time - log.time[0], bridged(log.output)
+    white = white_noise(log.output)
+    if log.reference_heading is None:
+        assert log.reference_rate is not None
+        white = math.hypot(white, white_noise(log.reference_rate))
+        heading = angle_of(time, bridged(log.reference_rate))
+        log = replace(log, reference_heading=heading, reference_rate=None)
     log = replace(log, time=time, output=output)
     reference = log.reference_heading
     assert reference is not None
     known = np.flatnonzero(np.isfinite(reference))
-    length = max(SPAN, float(time[known[-1]] - time[known[0]]) / MOST_SPANS)
+    interval = float(np.median(np.diff(time)))
+    length = max(treatment.span, float(time[known[-1]] - time[known[0]]) / treatment.most,
+                 2.0 * interval)
     # a gap begins a new point
-    number = np.floor((time[known] - time[known[0]]) / length)
+    number = np.floor((time[known] - time[known[0]]) / length + 1e-6)
     place = np.cumsum(
         (np.diff(number, prepend=number[0]) > 0.0)
         | (np.diff(time[known], prepend=time[known[0]]) > length)
     )
+    if not treatment.averaged:
+        known = known[np.diff(place, prepend=-1) > 0]
+        place = np.arange(len(known))
     count = np.bincount(place)
     heading = np.bincount(place, reference[known]) / count
     middle = np.bincount(place, time[known]) / count
     channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
-    return Spans(log, channels, known, place, middle, heading, _rests(log, known))
+    return Spans(log, channels, known, place, middle, heading, _rests(log, known), treatment,
+                 white)
+
+
+def angle_of(time: Array, rate: Array) -> Array:
+    """Return the integral of a rate, its curvature between samples included, shape (n,)."""
+    slope = np.gradient(rate, time)
+    step = float(np.median(np.diff(time)))
+    return integral_of(time, rate) - step**2 / 12.0 * (slope - slope[0])
 
 
 def _rests(log: Log, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
@@ -286,20 +368,28 @@ def fitted(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> Fitt
             values[:2], [0.0, *values[3:]]
         )
         outlying = _outlying(left[: len(spans.time) - 1])
-    columns = all_columns(moved, causes)
-    prior = np.array(list(PLAIN.values()))
-    fit = _likelihood(moved, columns, outlying, prior)
-    covariance, effective = _cluster_robust(
-        moved, fit, causes, np.append(prior, np.full(len(fit.values) - 3, np.inf))
-    )
-    if effective[0] < FEWEST_STRETCHES:
-        moved = moved.corrected(np.append(0.0, fit.values[1:3]))
-        prior[0] *= _NOT
-        fit = _likelihood(moved, all_columns(moved, causes), outlying, prior)
-        covariance[0, 0] = PLAIN['scale_factor_error'] ** 2
+    prior = np.array(spans.treatment.prior)
+    done = _with_deviations(moved, causes, outlying, prior)
+    if done.stretches_of[0] >= FEWEST_STRETCHES:
+        return done
+    moved = moved.corrected(np.append(0.0, done.fit.values[1:3]))
+    prior[0] *= _NOT
+    done = _with_deviations(moved, causes, outlying, prior)
+    done.covariance[0, 0] = spans.treatment.prior[0] ** 2
+    return done
+
+
+def _with_deviations(
+    spans: Spans, causes: Sequence[Column], outlying: Array, prior: Array
+) -> Fitted:
+    fit = _likelihood(spans, all_columns(spans, causes), outlying, prior)
     values = fit.values.copy()
-    values[2] += moved.delay
-    return Fitted(moved, tuple(causes), fit, values, covariance, effective, prior)
+    values[2] += spans.delay
+    done = Fitted(
+        spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior, outlying
+    )
+    covariance, effective = _cluster_robust(whitened(done, causes), fit)
+    return replace(done, covariance=covariance, stretches_of=effective)
 
 
 def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
@@ -314,7 +404,7 @@ def _first_delay(spans: Spans) -> float:
         moved = replace(spans, delay=float(delay))
         columns = moved.plain()[:, :2]
         left = _robustly(
-            columns, moved.observed, np.array([PLAIN['scale_factor_error'], PLAIN['bias']])
+            columns, moved.observed, np.array(spans.treatment.prior[:2])
         )[1]
         best = min(
             best,
@@ -327,7 +417,7 @@ def _first_delay(spans: Spans) -> float:
 
 
 def _robust(spans: Spans, columns: Array) -> Array:
-    prior = np.concatenate([list(PLAIN.values()), np.full(columns.shape[1] - 3, np.inf)])
+    prior = np.concatenate([spans.treatment.prior, np.full(columns.shape[1] - 3, np.inf)])
     return _robustly(columns, spans.observed, prior)[0]
 
 
@@ -365,10 +455,10 @@ def _outlying(left: Array) -> Array:
 
 def _likelihood(spans: Spans, columns: Array, outlying: Array, prior: Array) -> GridFit:
     """Fit by the restricted likelihood over a grid of noise, rests beside the spans."""
-    assert spans.log.output is not None and spans.log.time is not None
-    step = float(np.median(np.diff(spans.log.time)))
-    walk = min(max(white_noise(spans.log.output) * math.sqrt(step), 1e-9), _WALK)
+    assert spans.log.time is not None
+    walk = _walk(spans)
     still = np.array([spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
+    low, high = spans.treatment.walk
     parts = [
         replace(
             part,
@@ -380,8 +470,9 @@ def _likelihood(spans: Spans, columns: Array, outlying: Array, prior: Array) -> 
             else np.concatenate([part.neighbours, 0.0 * still]),
         )
         for part in heading_noise(
-            spans.time, spans.rates(), outlying, angle_random_walk=(0.1 * walk, walk)
+            spans.time, spans.rates(), outlying, angle_random_walk=(low * walk, high * walk)
         )
+        if spans.treatment.of_heading or part.name == 'angle_random_walk'
     ]
     waves, shared = _waves(spans)
     deviation = np.full(columns.shape[1], np.inf)
@@ -389,9 +480,14 @@ def _likelihood(spans: Spans, columns: Array, outlying: Array, prior: Array) -> 
     return noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
 
 
-def _cluster_robust(
-    spans: Spans, fit: GridFit, causes: Sequence[Column], prior: Array
-) -> tuple[Array, Array]:
+def _walk(spans: Spans) -> float:
+    """Return the angle random walk that the white noise of the samples amounts to, rad/√s."""
+    assert spans.log.time is not None
+    step = float(np.median(np.diff(spans.log.time)))
+    return min(max(spans.white * math.sqrt(step), 1e-9), spans.treatment.largest_walk)
+
+
+def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
     """
     Return the covariance of the values, not less than the scatter of the scores between stretches.
 
@@ -399,17 +495,18 @@ def _cluster_robust(
     information of the stretches over the sum of its squares.
 
     """
-    stretch, whiten = spans.stretches, whitening(spans, fit)
+    count, stretch = len(fit.values), data.stretch
     clusters = int(stretch.max()) + 1
-    plain = all_columns(spans, causes)
-    columns = whiten @ plain
-    # whitened, scores of neighbouring stretches are independent
-    left = whiten @ (spans.observed - plain @ fit.values)
-    influence = columns @ np.linalg.pinv(columns.T @ columns + np.diag(1.0 / prior**2))
+    values = np.linalg.lstsq(data.plain, data.observed, rcond=None)[0]
+    left = data.observed - data.plain @ values
+    influence = data.plain @ np.linalg.pinv(data.plain.T @ data.plain)[:, :count]
     scores = np.array([np.bincount(stretch, part * left, clusters) for part in influence.T])
     found = clusters / max(clusters - 1.0, 1.0) * np.sum(scores**2, axis=1)
     larger = np.maximum(np.sqrt(found / np.diag(fit.covariance)), 1.0)
-    shares = np.array([np.bincount(stretch, part**2, clusters) for part in columns.T])
+    inside = stretch < data.of_log
+    shares = np.array(
+        [np.bincount(stretch[inside], part**2) for part in data.plain[inside, :count].T]
+    )
     effective = shares.sum(axis=1) ** 2 / np.maximum((shares**2).sum(axis=1), 1e-300)
     return fit.covariance * np.outer(larger, larger), effective
 
@@ -417,7 +514,13 @@ def _cluster_robust(
 def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
     """Return the columns of a wandering bias over spans and rests, and their noise."""
     assert spans.log.time is not None
-    waves, shared = wander(spans.time, _WANDER, None, _COSINES)
+    treatment = spans.treatment
+    unit = _walk(spans) if treatment.relative else 1.0
+    flicker, walk = (
+        None if limits is None else (limits[0] * unit, limits[1] * unit)
+        for limits in (treatment.flicker, treatment.random_walk)
+    )
+    waves, shared = wander(spans.time, flicker, walk, treatment.cosines)
     begin, end = spans.time[0], spans.time[-1]
     omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
     still = [np.clip(spans.log.time[list(rest)], begin, end) - begin for rest in spans.rests]
@@ -426,12 +529,75 @@ def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
     ), shared
 
 
-def whitening(spans: Spans, fit: GridFit) -> Array:
-    """Return the inverse root of the covariance of the observations, shape (n + r, n + r)."""
-    count = len(spans.observed)
-    precision = fit.solve(np.eye(count))
-    waves, shared = _waves(spans)
-    variance = sum(fit.likely[part.name] ** 2 * part.variance for part in shared)
-    covariance = np.linalg.inv(0.5 * (precision + precision.T)) + (waves * variance) @ waves.T
-    root = cholesky(0.5 * (covariance + covariance.T), lower=True)
-    return np.asarray(solve_triangular(root, np.eye(count), lower=True))
+def shared_noise(spans: Spans) -> list[SharedNoise]:
+    """Return the parts of the noise of a bias that wanders."""
+    return _waves(spans)[1]
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """
+    A regression in units of its noise: ordinary least squares of it is generalized least squares.
+
+    What is known beforehand, of values and of the bias that wanders, is rows below those of the
+    observations. Each of them is a stretch of its own.
+
+    Attributes
+    ----------
+    observed : shape (n + r + m,)
+    plain : columns of scale factor error, bias, delay and causes, then those of the wander
+    stretch : of each row
+    of_log : the number of stretches of the log; those from it on are known beforehand
+
+    """
+
+    observed: Array
+    plain: Array
+    stretch: NDArray[np.intp]
+    of_log: int
+    _done: Fitted
+
+    def columns(self, columns: Array) -> Array:
+        """Return more columns, shape (n + r, k), in units of the noise, shape (n + r + m, k)."""
+        more = len(self.observed) - len(columns)
+        return np.pad(self._done.fit.whiten(columns), ((0, more), (0, 0)))
+
+
+def whitened(
+    done: Fitted, causes: Sequence[Column], noise: Fitted | None = None, most: bool = False
+) -> Whitened:
+    """
+    Return the regression of a log on causes, under the noise of a fit of the same log.
+
+    Parameters
+    ----------
+    done : the log, and what is known beforehand
+    causes : the columns beside scale factor error, bias and delay
+    noise : the fit whose noise is taken; `done` where it is None
+    most : whether the rate random walk is the largest that the log allows (upper limit of 95 %),
+        for what is slow is taken for a cause otherwise
+
+    """
+    spans, noise = done.spans, noise or done
+    waves, shared = _waves(noise.spans)
+    sizes = {
+        part.name: noise.fit.sizes[part.name][2]
+        if most and part.name == 'rate_random_walk'
+        else noise.fit.likely[part.name]
+        for part in shared
+    }
+    variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
+    columns = np.column_stack([all_columns(spans, causes), waves])
+    width = columns.shape[1] - waves.shape[1]
+    prior = np.zeros((3 + waves.shape[1], columns.shape[1]))
+    prior[:3, :3] = np.diag(1.0 / done.prior)
+    prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
+    stretches = spans.stretches
+    of_log = int(stretches.max()) + 1
+    return Whitened(
+        np.append(noise.fit.whiten(spans.observed), np.zeros(len(prior))),
+        np.concatenate([noise.fit.whiten(columns), prior]),
+        np.concatenate([stretches, of_log + np.arange(len(prior))]),
+        of_log,
+        noise,
+    )

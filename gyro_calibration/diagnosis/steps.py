@@ -26,7 +26,7 @@ from gyro_calibration.diagnosis.curves import (
     noise_curve,
     what_is_left,
 )
-from gyro_calibration.diagnosis.door import refuse
+from gyro_calibration.diagnosis.door import model_gate, refuse
 from gyro_calibration.diagnosis.experiment import separating
 from gyro_calibration.diagnosis.extension import (
     calibrated,
@@ -114,12 +114,18 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             if failed.effect != 'wrapped_heading':
                 refuse(logs[place])
             return _mismatched(failed, each, given or GyroModel(), names[place:place + 1], rate)
-    for log in logs:
-        refuse(log, model)
+    for place, log in enumerate(logs):
+        refuse(log)
+        if model is None:
+            continue
+        checked[place] = (*checked[place], model_gate(log, model))
+        if (failed := mismatch(checked[place])) is not None:
+            return _mismatched(failed, checked[place], given or GyroModel(),
+                               names[place:place + 1], rate)
     told = [reference_of(log, kind) for log in logs]
-    if len(logs) == 1 and limits(told[0]) and logs[0].reference_heading is not None:
+    if len(logs) == 1 and limits(logs[0], told[0]):
         say('search')
-        answer = diagnose_heading(replace(logs[0], reference_rate=None), told[0], model, rate)
+        answer = diagnose_heading(logs[0], told[0], model, rate)
         return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
     say('hygiene')
     hygiene = [decided(inspect(log, model)) for log in logs]
