@@ -36,6 +36,9 @@ VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 #: Highest order of a polynomial.
 _HIGHEST = 20
+#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it double precision does not
+#: carry the variance of the heading.
+_LEAST_KNOWN = 100.0
 
 
 class ModelError(InputError):
@@ -255,6 +258,14 @@ def _self_calibration(value: Any) -> SelfCalibration | None:
 def _calibration_covariance(place: str, given: Mapping[str, Any]
                             ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Read the covariance of (s, b), or else their standard deviations; None without both."""
+    covariance = _read_covariance(place, given)
+    if covariance and max(covariance[0][0], covariance[1][1]) > _LEAST_KNOWN ** 2:
+        raise _PlaceError(place, given, f'standard deviations of at most {_LEAST_KNOWN:g}')
+    return covariance
+
+
+def _read_covariance(place: str, given: Mapping[str, Any]
+                     ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     if 'covariance' in given:
         (a, b), (_, c) = _matrix(f'{place}.covariance', given['covariance'], 2).tolist()
         return (a, b), (b, c)

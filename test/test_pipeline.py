@@ -164,6 +164,15 @@ def test_a_turn_while_the_gyro_is_unplugged_is_in_the_variance(tmp_path, wheels,
     assert known or after.heading_variance > math.tau ** 2
 
 
+def test_no_variance_is_zero(tmp_path):
+    rig = Rig(tmp_path, model=KNOWN)
+    found = rig.feed(noisy(1.0), SLOW)
+    rig.pipeline.reset()
+    found += rig.feed(noisy(1.0), SLOW)
+    assert min(each.heading_variance for each in found) > 0.0
+    assert min(each.rate_variance for each in found) > 0.0
+
+
 # Rest
 
 

@@ -362,9 +362,11 @@ class Pipeline:
             self.session.add(time, output, receivers)
         known = self._noise_is_known
         spread = 0.0 if known and self._interval < math.inf else self.values.assumed_bias ** 2
+        # Right after a reset nothing but the last sample is unknown; zero would say exactly known.
+        least = tracker.rate_variance * min(self._interval, 1.0) ** 2
         found = Output(
             stamp + self._delay, tracker.heading,
-            tracker.variance if known else UNMEASURED_VARIANCE, estimator.rate,
+            max(tracker.variance, least) if known else UNMEASURED_VARIANCE, estimator.rate,
             tracker.rate_variance + spread)
         if not math.isfinite(found.heading + found.heading_variance + found.rate
                              + found.rate_variance):
