@@ -90,7 +90,7 @@ class Limits:
 @dataclass(frozen=True)
 class Reference:
     """
-    The errors of a reference that no run can show; all zero for an exact one.
+    The errors of a reference that no run can show; all zero for an exact one, or a measured one.
 
     Attributes
     ----------
@@ -104,6 +104,17 @@ class Reference:
     scale_deviation: float = 0.0
     rate_deviation: float = 0.0
     random_walk: float = 0.0
+
+
+#: Wheels that follow commanded rates slip by up to so much of each turn on a good floor, 1; slip that
+#: is the same in each turn looks like a scale factor error.
+_SLIPPING = 0.01
+
+
+def usual_reference(motion: Motion) -> Reference:
+    """Return what is not known of a motion of which nothing is said: commanded rates slip."""
+    commanded = motion.rate is not None
+    return Reference(_SLIPPING / math.sqrt(3.0)) if commanded else Reference()
 
 
 #: Standard deviations from which on a stretch is a slip. With three times the noise of the
@@ -174,7 +185,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
     noise : of the gyro, if it is known; the wander of the bias goes into its standard deviation,
         and the residual is compared with it
-    reference : the errors of a measured motion; goes into the standard deviations
+    reference : the errors of the motion; goes into the standard deviations. By default a motion of
+        rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
     output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
         dead or at its limit
 
@@ -183,7 +195,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     DataRefused : with the reason and the remedy
 
     """
-    limits, reference = limits or Limits(), reference or Reference()
+    limits = limits or Limits()
+    reference = usual_reference(motion) if reference is None else reference
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)

@@ -82,7 +82,8 @@ def test_the_next_start_uses_the_stored_calibration_and_the_heading_is_right(tmp
     again.robot.command(FULL)
     again.go(8.0)
     error, deviation = again.error(begin)
-    assert abs(error) < 4.0 * deviation and deviation < 0.5 * DEGREE
+    # wheels that slip by up to 1 % of a turn leave the scale factor known to 0.58 %
+    assert abs(error) < 4.0 * deviation and deviation < 0.008 * 8.0 * FULL
 
 
 def test_a_calibration_behind_another_model_is_not_used_and_the_reason_is_given(tmp_path):

@@ -43,6 +43,7 @@ from gyro_calibration.self_calibration import (
     rest_after,
     RestCheck,
     self_calibrate,
+    usual_reference,
 )
 from gyro_calibration.whole_turns import calibrate_turns, MARKING, Turns
 import numpy as np
@@ -70,9 +71,10 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     for name, unit, what in (('scale-deviation', '%%', 'the scale factor error'),
                              ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
-        parser.add_argument(f'--reference-{name}', type=not_negative, default=0.0, metavar='X',
+        default = '; default: 0.58 for rates of a profile' if name == 'scale-deviation' else ''
+        parser.add_argument(f'--reference-{name}', type=not_negative, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
-                            f'or of who drives the profile, {unit}')
+                            f'or of who drives the profile, {unit}{default}')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
     return parser
@@ -112,7 +114,7 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rates = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
-                         reference=_goodness(given), output=output[run])
+                         reference=_goodness(given, motion), output=output[run])
     rest = rest_after(time[known], rates[known], fit, motion)
     check = (None if rest is None
              else check_rest(time[known][rest], rates[known][rest], fit, model.noise))
@@ -148,10 +150,13 @@ def _turned(found: Turns, marking: float) -> str:
             f'{before:.1f} and {after:.1f} s; the mark is met to {marking / DEGREE:g} deg.')
 
 
-def _goodness(given: argparse.Namespace) -> Reference:
-    """Return how good the reference is said to be."""
-    return Reference(given.reference_scale_deviation / 100.0, given.reference_drift * DEGREE,
-                     given.reference_random_walk * DEGREE / 60.0)
+def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
+    """Return how good the reference is said to be; a profile is driven, a reference measured."""
+    scale = given.reference_scale_deviation
+    usual = usual_reference(motion) if given.profile else Reference()
+    return Reference(usual.scale_deviation if scale is None else scale / 100.0,
+                     (given.reference_drift or 0.0) * DEGREE,
+                     (given.reference_random_walk or 0.0) * DEGREE / 60.0)
 
 
 def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask,

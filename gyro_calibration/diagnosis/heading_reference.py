@@ -139,7 +139,12 @@ def diagnose_heading(
         and each.effect not in {one.effect for one in record.findings}
         for each in findings
     )
-    after = _model(given, inside, log) if changed or model is None else given
+    # between two clocks a delay is no property of the gyro
+    late = next((each for each in findings if each.effect == 'time_offset'
+                 and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
+    after = _model(given, inside, log) if changed or late or model is None else given
+    if late:
+        after = _delayed(after, late)
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     noise = {name: extended.size(name) for name in ('reference', 'motion')}
     return Diagnosis(
@@ -358,6 +363,15 @@ def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
     output = log.output[np.isfinite(log.output)]
     new = with_terms(given, terms, spread, output, log.temperature)
     return new if given.noise.angle_random_walk else replace(new, noise=_noise(done))
+
+
+def _delayed(model: GyroModel, found: Finding) -> GyroModel:
+    """Return a model whose stamps are late by what was found."""
+    size = found.parameters['time_offset']
+    deviation = (size.interval[1] - size.interval[0]) / (2.0 * 1.96)
+    term = Term(CATALOGUE['time_offset'], (size.estimate,))
+    outputs = np.array(model.rate_range)
+    return with_terms(model, [term], np.array([[deviation ** 2]]), outputs, None)
 
 
 def _noise(done: Fitted) -> Noise:

@@ -163,4 +163,4 @@ def chance(probability: float) -> str:
         return 'less than 1 in a million'
     if probability >= 0.1:
         return f'{100.0 * probability:.0f} %'
-    return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', '\u202f')
+    return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', ' ')
