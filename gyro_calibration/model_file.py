@@ -36,8 +36,8 @@ VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
 #: Highest order of a polynomial.
 _HIGHEST = 20
-#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it double precision does not
-#: carry the variance of the heading.
+#: Largest standard deviation of a self-calibration, rad/s and 1; beyond it double precision does
+#: not carry the variance of the heading.
 _LEAST_KNOWN = 100.0
 
 

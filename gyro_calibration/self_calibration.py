@@ -106,8 +106,8 @@ class Reference:
     random_walk: float = 0.0
 
 
-#: Wheels that follow commanded rates slip by up to so much of each turn on a good floor, 1; slip that
-#: is the same in each turn looks like a scale factor error.
+#: Wheels that follow commanded rates slip by up to so much of each turn on a good floor, 1; slip
+#: that is the same in each turn looks like a scale factor error.
 _SLIPPING = 0.01
 
 
