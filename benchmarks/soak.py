@@ -63,10 +63,12 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
 SOAKED, SOAKED_RATE = 'kvh_1750', 1000.0  # Hz
-SMALLEST = 0.5  # rad/s; of a numbered sample
+# rad/s; of a numbered sample: where the sign changes, a robot must be able to turn so quickly, or
+# the tracker waits for the next sample
+SMALLEST = 0.08
 CYCLE = 1 << 18  # samples, after which the number that a rate holds begins anew
 STEP = 2.0 ** -20  # rad/s a number; 16 times what the wire format resolves
-LEADING = -0.25  # rad/s; of samples without a number, until the whole graph is connected
+LEADING = -0.5  # rad/s; of samples without a number, until the whole graph is connected
 STRETCH = 2.0  # s, after which it turns the other way
 INTERVAL = 1.0  # s between looks at the processes
 LARGEST_RATE = 1000.0  # Hz; above it the driver is told to average
@@ -115,7 +117,7 @@ def numbered_rate(number: int) -> float:
 
 def number_of(rate: float, last: int) -> int | None:
     """Return the number that a rate encodes, as the one nearest to the last; None if leading."""
-    if abs(rate) < 0.5 * (SMALLEST + abs(LEADING)):
+    if abs(rate) > 0.5 * (SMALLEST + CYCLE * STEP + abs(LEADING)):
         return None
     held = round((abs(rate) - SMALLEST) / STEP)
     return last + (held - last + CYCLE // 2) % CYCLE - CYCLE // 2

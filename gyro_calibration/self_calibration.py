@@ -438,13 +438,15 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
         return None
     corrected = (rate[first:last] - fit.bias) / (1.0 + fit.scale_factor_error)
     means = np.array([part.mean() for part in np.array_split(corrected, 4)])
-    apart = max(CHANCE * 2.0 * _white(corrected, limits.rest), 0.25 * DRIVING)
-    return (None if abs(means.mean()) > DRIVING or np.ptp(means) > 2.0 * apart
+    apart = max(CHANCE * 2.0 * _white(corrected, limits.rest), _DRIVING)
+    # a slow and steady turn is no drive: before the fit it passed for a bias
+    return (None if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart
             else slice(int(first), int(last)))
 
 
-#: Time after the profile at which a robot is at rest, s; rate above which it is driving on, rad/s.
-SETTLED, DRIVING = 1.0, 1.0 * DEGREE
+#: Time after the profile at which a robot is at rest, s; change of the rate within a rest by which
+#: it is driving on, rad/s.
+SETTLED, _DRIVING = 1.0, 0.25 * DEGREE
 
 
 def _white(rate: Array, duration: float) -> float:

@@ -193,6 +193,18 @@ def test_the_rest_after_a_run_is_found_and_a_drive_is_none():
     assert rest_after(TIME, rate[:2001], calibrated(0), CALIBRATION) is None
 
 
+@pytest.mark.parametrize('yaw', [0.5, 2.0, -5.0])
+def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
+    """The fit takes it for one, and sees a turn of the other sign in the rest after it."""
+    time = np.arange(2600) / 100.0
+    rate = output(0, time=time) + np.where(time < 20.5, yaw * DEGREE, 0.0)
+    fit = self_calibrate(time[:2001], rate[:2001], CALIBRATION, noise=XV3500.noise)
+    assert fit.bias - B == pytest.approx(yaw * DEGREE, rel=0.1)
+    rest = rest_after(time, rate, fit, CALIBRATION)
+    with pytest.raises(DataRefused, match='the corrected rate is'):
+        check_rest(time[rest], rate[rest], fit, XV3500.noise)
+
+
 def odometry(seed, deviation, drift):
     """Return the heading of wheels at 50 Hz with errors of scale and drift, and with slip."""
     generator = np.random.default_rng([seed, 2])

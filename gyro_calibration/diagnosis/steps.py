@@ -26,7 +26,7 @@ from gyro_calibration.diagnosis.curves import (
     noise_curve,
     what_is_left,
 )
-from gyro_calibration.diagnosis.door import model_gate, refuse
+from gyro_calibration.diagnosis.door import model_gate, refuse, rests
 from gyro_calibration.diagnosis.experiment import separating
 from gyro_calibration.diagnosis.extension import (
     calibrated,
@@ -123,7 +123,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
             return _mismatched(failed, checked[place], given or GyroModel(),
                                names[place:place + 1], rate)
     told = [reference_of(log, kind) for log in logs]
-    if len(logs) == 1 and limits(logs[0], told[0]):
+    if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], told[0]):
         say('search')
         answer = diagnose_heading(logs[0], told[0], model, rate)
         return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
