@@ -126,8 +126,10 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     assert {term.effect.name for term in found.model.terms} == {'bias', 'scale_factor_error'}
 
 
-@pytest.mark.parametrize('name', ['third_harmonic_of_heading', 'resonance_at_a_speed',
-                                  'bias_pulse', 'supply_times_rate'])
+@pytest.mark.parametrize('name', evidence(
+    lambda name: name in ('third_harmonic_of_heading', 'bias_pulse'),
+    ('third_harmonic_of_heading',), ('resonance_at_a_speed',), ('bias_pulse',),
+    ('supply_times_rate',)))
 def test_what_the_catalogue_does_not_have_is_said_to_be_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))

@@ -131,8 +131,9 @@ def is_unbroken(log):
 
 
 @pytest.mark.parametrize(('name', 'number'),
-                         [('a.csv', signal.SIGINT), ('a.csv.gz', signal.SIGTERM),
-                          ('a.mcap', signal.SIGINT), ('b.mcap', signal.SIGHUP)])
+                         [pytest.param('a.csv', signal.SIGINT, marks=pytest.mark.evidence),
+                          ('a.csv.gz', signal.SIGTERM), ('a.mcap', signal.SIGINT),
+                          pytest.param('b.mcap', signal.SIGHUP, marks=pytest.mark.evidence)])
 def test_an_interrupted_recording_is_done(record, wait_until, tmp_path, name, number):
     with gyro(tmp_path / 'gyro'):
         recording = record(*words_for(tmp_path / 'gyro', tmp_path / name, '--json'))
@@ -207,8 +208,8 @@ def angles(link, rate=100.0):
 
 @pytest.mark.parametrize(('options', 'seconds', 'rate', 'factor'), [
     ([], 6, 1.0, 1000.0),  # the period of the samples is known after 4 s
-    (['--sample-rate', '100'], 2, 0.1, 100.0),
-    (['--increments', 'never'], 2, 0.001, 1.0),
+    pytest.param(['--sample-rate', '100'], 2, 0.1, 100.0, marks=pytest.mark.evidence),
+    pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
 def test_angles_at_another_rate_than_set_are_told(run, tmp_path, options, seconds, rate, factor):
     """Where nothing is to be told is tested in test_driver_report.py, without a port."""
@@ -265,7 +266,12 @@ def test_a_gyro_that_is_unplugged_leaves_a_gap(record, wait_until, tmp_path):
     assert np.count_nonzero(steps > 0.5) == 1
 
 
-@pytest.mark.parametrize('name', KINDS)
+#: A kill of each kind of file as evidence; one of text and one of messages in `make test`.
+KILLED = [pytest.param(name, marks=pytest.mark.evidence if name == 'a.csv' else [])
+          for name in KINDS]
+
+
+@pytest.mark.parametrize('name', KILLED)
 def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until, tmp_path, name):
     # 7 of each kind make more than 20; each is killed at another time.
     generator, lateness = np.random.default_rng(KINDS.index(name)), []
@@ -289,7 +295,7 @@ def test_a_killed_recording_can_be_read_up_to_the_last_second(record, wait_until
     assert np.median(lateness) < 1.0 and max(lateness) < 2.0, lateness  # the machine may be busy
 
 
-@pytest.mark.parametrize('name', KINDS)
+@pytest.mark.parametrize('name', KILLED)
 def test_what_came_before_a_silence_outlives_a_kill(record, wait_until, tmp_path, name):
     samples = [Sample(1e-4 * number, 25.0, time=number / RATE) for number in range(500)]
     columns = Settings(columns=('gyro_rad_s', 'temperature_degc'))
@@ -309,7 +315,9 @@ def _begin(log):
 
 
 @pytest.mark.parametrize(('name', 'limit'),
-                         [('a.csv', 60_000), ('a.csv.gz', 25_000), ('a.mcap', 600_000)])
+                         [('a.csv', 60_000),
+                          pytest.param('a.csv.gz', 25_000, marks=pytest.mark.evidence),
+                          ('a.mcap', 600_000)])
 def test_a_file_that_may_not_grow_stays_readable(record, tmp_path, name, limit):
     with gyro(tmp_path / 'gyro', 1000.0):
         code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=limit).end()
