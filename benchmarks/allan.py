@@ -32,8 +32,8 @@ from pathlib import Path
 import time
 
 from gyro_calibration.allan import allan_deviation, averaging_sizes, fit_noise
-from gyro_calibration.log import read_log
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.logs.log import read_log
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 
 INTERVAL = 0.01

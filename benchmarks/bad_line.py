@@ -27,7 +27,7 @@ import math
 
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.serial_faults import damaged, SerialFaults
-from gyro_calibration.log import DEGREE
+from gyro_calibration.logs.log import DEGREE
 import numpy as np
 
 SHARES = (0.001, 0.01, 0.1)

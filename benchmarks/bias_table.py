@@ -34,7 +34,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
 from bias_history import answers, carried_answers, coverage, cubic, linear  # noqa: E402
-from gyro_calibration.log import DEGREE  # noqa: E402
+from gyro_calibration.logs.log import DEGREE  # noqa: E402
 
 #: Name, curve, size of the coefficient, and what else is simulated.
 CASES = [('linear', linear, 1.0, {}), ('cubic', cubic, 1.0, {}),

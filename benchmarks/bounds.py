@@ -22,9 +22,9 @@ from __future__ import annotations
 import math
 
 from drives import Drive
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.motion import CALIBRATION
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.motion import CALIBRATION
 import numpy as np
 
 #: Longest time that is one step of the filter, s.

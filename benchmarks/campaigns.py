@@ -31,11 +31,16 @@ import os
 from pathlib import Path
 import sys
 
-from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.dwells import Dwells, from_table, take
-from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.selection import select_effects
+from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.model.compensation import (
+    compensate,
+    covariance,
+    quadratic_form,
+    rate_sensitivity,
+)
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy.optimize import least_squares
 

@@ -28,10 +28,10 @@ from collections.abc import Callable, Mapping
 import resource
 import time as clock
 
-from gyro_calibration.compensation import compensate
-from gyro_calibration.effects import rate_temperature_polynomial
-from gyro_calibration.heading import integrate
-from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import rate_temperature_polynomial
+from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 
 #: Errors of some 0.01 rad/s, as a fit to a fibre-optic gyro on a rate table gives them.

@@ -34,8 +34,8 @@ import math
 from pathlib import Path
 import sys
 
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import Array, DataRefused, Log, read_log
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.logs.log import Array, DataRefused, Log, read_log
 import numpy as np
 
 DEGREE = math.pi / 180.0

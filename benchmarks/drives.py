@@ -16,12 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import CALIBRATION, Motion, ROBOT
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
 import numpy as np
 from numpy.typing import NDArray

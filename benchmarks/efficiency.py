@@ -38,10 +38,10 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 import sys
 
-from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.motion import CALIBRATION, from_headings, Motion
-from gyro_calibration.self_calibration import fit_heading
+from gyro_calibration.calibration.likelihood import fit_likelihood
+from gyro_calibration.calibration.self_calibration import fit_heading
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion
 import numpy as np
 
 INTERVAL = 0.01

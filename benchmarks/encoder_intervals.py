@@ -26,10 +26,10 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 import sys
 
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import Array, DEGREE, Log
-from gyro_calibration.motion import from_rates, Motion
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.model.motion import from_rates, Motion
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 
 SCALE_FACTOR_ERROR, BIAS, STEP, INTERVAL = 0.02, 0.3 * DEGREE, 0.088 * DEGREE, 0.05

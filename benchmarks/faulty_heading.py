@@ -35,16 +35,16 @@ import os
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from drives import begun_any_time, Gyro, GYROS, of_motion, random_path, STEP
-from gyro_calibration.compensation import covariance, rate_sensitivity
+from gyro_calibration.calibration.self_calibration import record, self_calibrate
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import Array, DataRefused, DEGREE
-from gyro_calibration.model import GyroModel
-from gyro_calibration.motion import CALIBRATION
-from gyro_calibration.noise import simulate_noise
-from gyro_calibration.self_calibration import record, self_calibrate
-from gyro_calibration.tracking import Settings, track
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.tracker import Settings, track
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.noise import simulate_noise
 import numpy as np
 
 BURST = 0.016  # s; what an FTDI adapter collects by default

@@ -29,12 +29,12 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 import sys
 
-from gyro_calibration.likelihood import UNLIKELY
-from gyro_calibration.log import Array, DataRefused, DEGREE
-from gyro_calibration.motion import CALIBRATION, from_rates, Motion, turns
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.likelihood import UNLIKELY
+from gyro_calibration.calibration.self_calibration import self_calibrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
-from gyro_calibration.self_calibration import self_calibrate
 import numpy as np
 from scipy.signal import lfilter
 

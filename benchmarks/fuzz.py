@@ -47,14 +47,17 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 PACKAGE = Path(__file__).parents[1] / 'gyro_calibration'
 GIGABYTE = 1 << 30
 #: What reads the bytes of a target, in the package.
-FILES = {'decoder': ('protocols/protocol.py', 'protocols/frames.py', 'protocols/lines.py'),
-         'listening': ('protocols/listening.py',),
-         'sample clock': ('sample_clock.py',), 'log': ('log.py',), 'compressed log': ('log.py',),
-         'model': ('model_file.py', 'settings_file.py'),
-         'bias table': ('bias_table.py', 'settings_file.py'), 'motion profile': ('motion.py',),
-         'motion limits': ('settings_file.py',),
-         'recording': ('recording.py', 'storage.py', 'messages.py'), 'parameters': ('node.py',),
-         'arguments': ('verbs/verb.py',)}
+FILES = {'decoder': ('driver/protocols/protocol.py', 'driver/protocols/frames.py',
+                     'driver/protocols/lines.py'),
+         'listening': ('driver/protocols/listening.py',),
+         'sample clock': ('driver/timestamps.py',),
+         'log': ('logs/log.py',), 'compressed log': ('logs/log.py',),
+         'model': ('model/model_file.py', 'model/settings_file.py'),
+         'bias table': ('heading/bias_table.py', 'model/settings_file.py'),
+         'motion profile': ('model/motion.py',), 'motion limits': ('model/settings_file.py',),
+         'recording': ('logs/recording.py', 'logs/ros_bag.py', 'logs/cdr.py'),
+         'parameters': ('ros/compensation_node.py', 'ros/driver_node.py'),
+         'arguments': ('cli/verb.py',)}
 
 
 @dataclass

@@ -44,14 +44,14 @@ import re
 
 import bounds
 from drives import Course, COURSES, Drive, Gyro, GYROS, simulate, slow_path
-from gyro_calibration.compensation import covariance, rate_sensitivity
-from gyro_calibration.heading import filter_rates, integrate, Threshold
-from gyro_calibration.log import Array, DataRefused, DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.motion import CALIBRATION
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import fit_heading, record, self_calibrate
-from gyro_calibration.tracking import HeadingTracker, in_hindsight, Settings
+from gyro_calibration.calibration.self_calibration import fit_heading, record, self_calibrate
+from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.heading.tracker import HeadingTracker, in_hindsight, Settings
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from peers import PEERS, tuned
 

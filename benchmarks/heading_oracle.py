@@ -31,10 +31,10 @@ import argparse
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.compensation import covariance, rate_sensitivity
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.noise import Noise
-from gyro_calibration.tracking import Settings, track
+from gyro_calibration.heading.tracker import Settings, track
+from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.signal import lfilter
 

@@ -30,10 +30,10 @@ from dataclasses import dataclass
 import math
 import sys
 
-from gyro_calibration.log import DataRefused
-from gyro_calibration.motion import from_headings, from_rates
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import check_rest, rest_after, self_calibrate
+from gyro_calibration.calibration.self_calibration import check_rest, rest_after, self_calibrate
+from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.model.motion import from_headings, from_rates
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 

@@ -42,11 +42,11 @@ import time
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistWithCovarianceStamped
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find, Sample
-from gyro_calibration.effects import BIAS, rate_temperature_polynomial, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model_file import write_model
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import BIAS, rate_temperature_polynomial, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.runner import PUBLISHED_QOS, SENSOR_QOS
 from nav_msgs.msg import Odometry
 import numpy as np

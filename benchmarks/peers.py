@@ -28,9 +28,9 @@ from types import ModuleType
 from typing import Any
 
 from drives import Drive
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.model import SelfCalibration
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.gyro_model import SelfCalibration
 import numpy as np
 from scipy.signal import lfilter
 

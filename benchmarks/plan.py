@@ -34,11 +34,11 @@ from dataclasses import replace
 from functools import partial
 import sys
 
-from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.motion import CALIBRATION, Motion, ROBOT, turns
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.plan import Ability, best, Forecast, plain
+from gyro_calibration.calibration.likelihood import fit_likelihood
+from gyro_calibration.calibration.motion_design import Ability, best, Forecast, plain
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.hong_park import XV3500
 import numpy as np
 

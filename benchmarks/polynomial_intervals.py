@@ -25,9 +25,9 @@ from __future__ import annotations
 import math
 import sys
 
-from gyro_calibration.calibration import channels_of, fit_effects
-from gyro_calibration.dwells import Dwells
-from gyro_calibration.effects import rate_temperature_polynomial
+from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.rate_table import channels_of, fit_effects
+from gyro_calibration.model.effects import rate_temperature_polynomial
 import numpy as np
 
 DEGREE = math.pi / 180.0

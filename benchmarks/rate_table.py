@@ -26,10 +26,13 @@ from dataclasses import replace
 import os
 from pathlib import Path
 
-from gyro_calibration.calibration import fit_effects
-from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, from_table, take
-from gyro_calibration.effects import (
+from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.scatter import rms
+from gyro_calibration.calibration.selection import select_effects, TECHNOLOGIES
+from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import (
     BIAS,
     CUBIC_NONLINEARITY,
     Effect,
@@ -38,10 +41,7 @@ from gyro_calibration.effects import (
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
 )
-from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.scatter import rms
-from gyro_calibration.selection import select_effects, TECHNOLOGIES
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: Slower dwells are seen, faster ones predicted, rad/s.

@@ -34,13 +34,13 @@ import os
 from pathlib import Path
 import sys
 
-from gyro_calibration.compensation import quadratic_form
-from gyro_calibration.heading import integrate
-from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, read_log
-from gyro_calibration.motion import from_headings
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import fit_heading, Limits, self_calibrate
+from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
+from gyro_calibration.calibration.self_calibration import fit_heading, Limits, self_calibrate
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
+from gyro_calibration.model.compensation import quadratic_form
+from gyro_calibration.model.motion import from_headings
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 FOLLOWED = 300.0

@@ -28,10 +28,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import sys
 
-from gyro_calibration.calibration import fit_effects
-from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.dwells import Dwells
-from gyro_calibration.effects import (
+from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.compensation import (
+    compensate,
+    covariance,
+    quadratic_form,
+    rate_sensitivity,
+)
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -44,8 +50,7 @@ from gyro_calibration.effects import (
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
 )
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term, Tolerance
+from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 import numpy as np
 
 #: An effect of clear size each; those of temperature count from 36 degC.

@@ -49,11 +49,11 @@ from types import SimpleNamespace
 from diagnostic_msgs.msg import DiagnosticArray
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import write_model
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.runner import SENSOR_QOS
 import numpy as np
 from processes import end, processor_time

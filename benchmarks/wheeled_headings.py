@@ -34,14 +34,14 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 
-from gyro_calibration.assumptions import Assumptions
-from gyro_calibration.bias_table import BiasTable
-from gyro_calibration.heading import integrate
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import Array, read_log
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.noise import Noise
-from gyro_calibration.tracking import Settings
+from gyro_calibration.heading.assumptions import Assumptions
+from gyro_calibration.heading.bias_table import BiasTable
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.logs.log import Array, read_log
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from peers import PEERS
 

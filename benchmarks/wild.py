@@ -34,8 +34,8 @@ import time
 
 from gyro_calibration.diagnosis.finding import Diagnosis, Finding
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, QUANTITIES, read_log
-from gyro_calibration.log_compensation import compensate_log
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, QUANTITIES, read_log
 import numpy as np
 from scipy.optimize import least_squares
 

@@ -20,13 +20,10 @@ Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise p
 Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist
 only in files, wires and the command line, where the name says so: ``gyro_dps``.
 
-Reading order: `columns`, `log`, `messages`, `storage`, `recording`, `stamps`, `effects`,
-`history`, `noise`, `noise_grid`, `model`, `settings_file`, `model_file`, `motion`, `simulation`,
-`simulator_export`, `compensation`, `gaps`, `heading`, `drift`, `rest`, `tracking`, `bias_table`,
-`assumptions`, `heading_estimator`, `log_compensation`, `likelihood`, `doubt`, `mishap`,
-`self_calibration`, `whole_turns`, `plan`; then, for the laboratory, `allan`, `dwells`, `scatter`,
-`tolerance`, `calibration`, `selection`, `course_over_ground`, `encoder`, `turn`, `diagnosis`,
-`reproduction`; then the folders `driver`, on the robot `ros`, and `cli`.
+Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `reproduction`;
+then, with ports, processes and ROS 2, `driver`, `ros`, `cli`. Each folder imports only what
+stands before it, and so does each module of a folder, by the reading order that its docstring
+gives. `files` opens and writes files for all of them.
 
 """
 

@@ -13,10 +13,10 @@
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.bias_table import BiasTable, carry, Prior
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.heading.bias_table import BiasTable, carry, Prior
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 
 #: Time between two rests, s.

@@ -18,10 +18,10 @@ import itertools
 
 from gyro_calibration.diagnosis.finding import Diagnosis, Finding
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import COLUMNS, Log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import COLUMNS, Log
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 from hidden import Cause, HiddenLog, OUTSIDE
 from hidden.effects import AGAINST_A_MODEL, COUNTED, STEPPED, WITHOUT_COLUMN
 import numpy as np

@@ -34,25 +34,32 @@ import struct
 import tempfile
 import zlib
 
-from gyro_calibration.bias_table import BiasTable, carry, read_bias_table, write_bias_table
 from gyro_calibration.cli.main import _parser
 from gyro_calibration.cli.plan import read_limits, write_motion
 from gyro_calibration.cli.verb import UsageError
-from gyro_calibration.compensation import compensate
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.listening import recognize
 from gyro_calibration.driver.protocols.protocol import Splitter
 from gyro_calibration.driver.timestamps import SampleClock
-from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.files import LARGEST
-from gyro_calibration.log import Log, LogError, QUANTITIES, read_log, read_log_blocks, write_log
-from gyro_calibration.messages import IMU, LAYOUTS, serialize, TEMPERATURE
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model_file import model_text, ModelError, read_model, write_model
-from gyro_calibration.motion import CALIBRATION, MotionError, read_motion
-from gyro_calibration.noise import Noise
-from gyro_calibration.recording import read_recording, Topics
+from gyro_calibration.heading.bias_table import BiasTable, carry, read_bias_table, write_bias_table
+from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
+from gyro_calibration.logs.log import (
+    Log,
+    LogError,
+    QUANTITIES,
+    read_log,
+    read_log_blocks,
+    write_log,
+)
+from gyro_calibration.logs.recording import read_recording, Topics
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.model_file import model_text, ModelError, read_model, write_model
+from gyro_calibration.model.motion import CALIBRATION, MotionError, read_motion
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Longest message of an error, in characters without the path; s that an input may take; bytes

@@ -28,8 +28,8 @@ import signal
 import sys
 import time
 
-from gyro_calibration.bias_table import Prior
-from gyro_calibration.model import SelfCalibration
+from gyro_calibration.heading.bias_table import Prior
+from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.ros.state_store import StateStore
 
 FILES = ('calibration.yaml', 'biases.yaml')

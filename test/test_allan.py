@@ -15,10 +15,10 @@ import math
 
 from gyro_calibration.allan import allan_deviation, even_record, fit_noise, PARTS
 from gyro_calibration.cli.main import main
-from gyro_calibration.log import DataRefused, DEGREE, Log, read_log, write_log
-from gyro_calibration.model_file import read_model
-from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
-from gyro_calibration.stamps import number_stamps
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
+from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.noise import ALLAN_FLOOR, Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter

@@ -28,7 +28,7 @@ from bias_history import (
     simulate,
     WHITE,
 )
-from gyro_calibration.bias_table import (
+from gyro_calibration.heading.bias_table import (
     BiasTable,
     BIN,
     carry,
@@ -41,10 +41,10 @@ from gyro_calibration.bias_table import (
     read_bias_table,
     write_bias_table,
 )
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, same_effects, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, same_effects, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 

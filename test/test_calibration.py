@@ -15,9 +15,22 @@ import math
 from pathlib import Path
 import runpy
 
-from gyro_calibration.calibration import binned, channels_of, EffectsNotParted, fit_effects
-from gyro_calibration.dwells import Dwells, from_table, take
-from gyro_calibration.effects import (
+from gyro_calibration.calibration.dwells import Dwells, from_table, take
+from gyro_calibration.calibration.rate_table import (
+    binned,
+    channels_of,
+    EffectsNotParted,
+    fit_effects,
+)
+from gyro_calibration.calibration.scatter import (
+    _restricted_likelihood,
+    _surface,
+    find_scatter,
+    Scatter,
+    Whitener,
+)
+from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -28,15 +41,7 @@ from gyro_calibration.effects import (
     SINE_RESPONSE,
     STEADY,
 )
-from gyro_calibration.log import DataRefused, DEGREE, read_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import (
-    _restricted_likelihood,
-    _surface,
-    find_scatter,
-    Scatter,
-    Whitener,
-)
+from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from numpy.polynomial.polynomial import polyval2d
 import pytest

@@ -12,9 +12,9 @@
 
 import math
 
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model_file import read_model
-from gyro_calibration.motion import CALIBRATION, from_rates
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import CALIBRATION, from_rates
 from gyro_calibration.ros.calibration_session import (
     DISCOVERY,
     Drive,

@@ -12,9 +12,10 @@
 
 import math
 
-from gyro_calibration.log import DataRefused, DEGREE
-from gyro_calibration.motion import CALIBRATION, turns
-from gyro_calibration.noise import Noise
+from gyro_calibration.calibration.self_calibration import Limits, Reference
+from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.model.motion import CALIBRATION, turns
+from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.calibration_session import (
     calibrated,
     LONGEST,
@@ -26,7 +27,6 @@ from gyro_calibration.ros.calibration_session import (
     Run,
     TURNS,
 )
-from gyro_calibration.self_calibration import Limits, Reference
 import numpy as np
 import pytest
 

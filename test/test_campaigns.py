@@ -12,9 +12,9 @@
 from pathlib import Path
 import runpy
 
-from gyro_calibration.dwells import from_table, take
-from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.selection import select_effects
+from gyro_calibration.calibration.dwells import from_table, take
+from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.logs.log import DEGREE, read_log
 import numpy as np
 import pytest
 

@@ -13,8 +13,8 @@
 import re
 
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import QUANTITIES
+from gyro_calibration.logs.log import QUANTITIES
+from gyro_calibration.model.effects import CATALOGUE
 import pytest
 
 NAMES = re.findall(r'\w+', (

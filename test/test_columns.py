@@ -13,7 +13,7 @@
 import json
 import math
 
-from gyro_calibration.log import Log, log_from_table, LogError, part, read_log, unwrapped
+from gyro_calibration.logs.log import Log, log_from_table, LogError, part, read_log, unwrapped
 import numpy as np
 import pytest
 

@@ -21,9 +21,9 @@ from types import SimpleNamespace
 from gyro_calibration import cli as verbs
 from gyro_calibration.cli.main import main
 from gyro_calibration.driver.protocols import find
-from gyro_calibration.log import DEGREE, Log, read_log, write_log
-from gyro_calibration.model_file import read_model
-from gyro_calibration.motion import CALIBRATION
+from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import CALIBRATION
 import numpy as np
 import pytest
 from tqdm import tqdm
@@ -281,7 +281,7 @@ def test_the_demonstration_takes_off_most_of_the_heading_error_and_leaves_pictur
 def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not_for_ever(
         ros_domain, capsys, refusals):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    from gyro_calibration.demo import ATTEMPTS, calibrate, Refused
+    from gyro_calibration.cli.demo_run import ATTEMPTS, calibrate, Refused
     answers = iter([Refused('calibrate: the gyro slipped')] * refusals + ['done'])
 
     def call(*_):

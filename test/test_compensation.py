@@ -13,8 +13,15 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.compensation import compensate, covariance, quadratic_form, rate_sensitivity
-from gyro_calibration.effects import (
+from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
+from gyro_calibration.logs.log import CACHED, DEGREE
+from gyro_calibration.model.compensation import (
+    compensate,
+    covariance,
+    quadratic_form,
+    rate_sensitivity,
+)
+from gyro_calibration.model.effects import (
     BIAS,
     CATALOGUE,
     Channels,
@@ -22,10 +29,8 @@ from gyro_calibration.effects import (
     rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
 )
-from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
-from gyro_calibration.log import CACHED, DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration, Term, Tolerance
-from gyro_calibration.noise import Noise
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 

@@ -22,8 +22,8 @@ import signal
 import time
 
 from fake_gyro import FakeGyro, PACE
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model_file import read_model
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.model_file import read_model
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 import numpy as np
 import pytest

@@ -12,8 +12,8 @@
 
 import math
 
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
 import numpy as np
 import pytest
 

@@ -14,8 +14,8 @@ from gyro_calibration.diagnosis.curves import curves, what_is_left
 from gyro_calibration.diagnosis.field import field, work
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.log import Log
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 

@@ -18,8 +18,8 @@ import os
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.log import COLUMNS, DEGREE, Log, read_log, write_log
-from gyro_calibration.model_file import read_model
+from gyro_calibration.logs.log import COLUMNS, DEGREE, Log, read_log, write_log
+from gyro_calibration.model.model_file import read_model
 from hidden import hide
 import numpy as np
 import pytest

@@ -16,8 +16,8 @@ import shlex
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.driver.protocols import PROTOCOLS
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.model_file import POLYNOMIAL, read_model
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.model_file import POLYNOMIAL, read_model
 import pytest
 
 ROOT = Path(__file__).parents[1]

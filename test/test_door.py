@@ -12,12 +12,12 @@
 
 from dataclasses import replace
 
+from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.diagnosis.door import MOST_ROWS, prepared, refuse, rests
 from gyro_calibration.diagnosis.hygiene import inspect
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.table import diagnose_table
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 import numpy as np
 import pytest
 

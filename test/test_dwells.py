@@ -13,12 +13,12 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.dwells import dwells, find_dwells, from_table, join
-from gyro_calibration.dwells.averaging import moderated
-from gyro_calibration.dwells.samples import code_step
-from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.motion import turns
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.dwells import dwells, find_dwells, from_table, join
+from gyro_calibration.calibration.dwells.averaging import moderated
+from gyro_calibration.calibration.dwells.samples import code_step
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.model.motion import turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter

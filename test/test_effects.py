@@ -13,21 +13,21 @@
 from dataclasses import replace
 import math
 
-from gyro_calibration.compensation import compensate, rate_sensitivity
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.channels import History
+from gyro_calibration.model.compensation import compensate, rate_sensitivity
+from gyro_calibration.model.effects import (
     CATALOGUE,
     Channels,
     polynomial_from_matrix,
     polynomial_to_matrix,
     rate_temperature_polynomial,
 )
-from gyro_calibration.history import History
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.motion import CALIBRATION
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import respond, simulate
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import respond, simulate
 import numpy as np
 import pytest
 

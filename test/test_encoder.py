@@ -19,10 +19,10 @@ import math
 from pathlib import Path
 import runpy
 
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DataRefused, DEGREE, Log, read_log
-from gyro_calibration.motion import from_rates
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 

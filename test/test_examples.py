@@ -16,8 +16,8 @@ from pathlib import Path
 import subprocess
 import sys
 
-from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.model_file import read_model
+from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
 

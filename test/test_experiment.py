@@ -21,10 +21,10 @@ from gyro_calibration.diagnosis.field import field, Named
 from gyro_calibration.diagnosis.menu import menu, reach
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import alternatives, begin, searched
-from gyro_calibration.log import DEGREE, Log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.motion import from_rates
-from gyro_calibration.simulation import simulate
+from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.simulation import simulate
 from hidden.log import hide, record
 from hidden.motion import described
 from hidden.twins import twin, TWINS

@@ -13,7 +13,6 @@
 from dataclasses import replace
 
 from diagnosed import log_of
-from gyro_calibration.compensation import compensate
 from gyro_calibration.diagnosis.candidates import effect
 from gyro_calibration.diagnosis.extension import calibrated, extended, left_out
 from gyro_calibration.diagnosis.field import field, Named, work
@@ -22,13 +21,14 @@ from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import headline, is_inside
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DEGREE, Log, write_log
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.motion import turns
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
+from gyro_calibration.logs.log import DEGREE, Log, write_log
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import turns
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 from hidden import hide
 import numpy as np
 import pytest

@@ -19,7 +19,7 @@ import sys
 from types import SimpleNamespace
 
 from gyro_calibration.files import remove_leftovers, replacing, write_atomically
-from gyro_calibration.model_file import read_model
+from gyro_calibration.model.model_file import read_model
 from gyro_calibration.ros.calibration_session import REST
 import pytest
 from rig import rested

@@ -17,10 +17,10 @@ from diagnosed import log_of, model_of
 from gyro_calibration.diagnosis.field import field, filtered, work
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.effects import QUANTIZATION
-from gyro_calibration.log import Log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.effects import QUANTIZATION
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 from hidden import hide
 import numpy as np
 import pytest

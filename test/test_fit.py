@@ -14,9 +14,9 @@ import json
 from pathlib import Path
 import runpy
 
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import read_model
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
 

@@ -15,16 +15,16 @@ from pathlib import Path
 import runpy
 from time import process_time
 
-from gyro_calibration.assumptions import Assumptions
-from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.cli.main import main
-from gyro_calibration.compensation import covariance, rate_sensitivity
-from gyro_calibration.effects import BIAS
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import DEGREE, Log, read_log, write_log
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.tracking import HeadingTracker, Settings, track
+from gyro_calibration.heading.assumptions import Assumptions
+from gyro_calibration.heading.bias_table import BiasTable
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.tracker import HeadingTracker, Settings, track
+from gyro_calibration.logs.log import DEGREE, Log, read_log, write_log
+from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 from rig import BEGIN, Rig

@@ -14,21 +14,21 @@ from dataclasses import replace
 from functools import cache
 import math
 
-from gyro_calibration.compensation import quadratic_form
-from gyro_calibration.doubt import (
+from gyro_calibration.calibration.fit_quality import (
     allow_asymmetry,
     ASYMMETRY,
     look_slower,
     refuse_repeating,
     refuse_useless,
 )
-from gyro_calibration.heading import integrate
-from gyro_calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.log import DataRefused, DEGREE, read_log
-from gyro_calibration.motion import CALIBRATION, from_headings
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import calibrate_bias, Limits, self_calibrate
-from gyro_calibration.stamps import even_times
+from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
+from gyro_calibration.calibration.self_calibration import calibrate_bias, Limits, self_calibrate
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
+from gyro_calibration.logs.stamps import even_times
+from gyro_calibration.model.compensation import quadratic_form
+from gyro_calibration.model.motion import CALIBRATION, from_headings
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 

@@ -22,23 +22,23 @@ from pathlib import Path
 import runpy
 import time as clock
 
-from gyro_calibration.cli.main import main
-from gyro_calibration.likelihood import Fit, fit_likelihood, UNLIKELY
-from gyro_calibration.log import DataRefused, DEGREE
-from gyro_calibration.mishap import pieces, unit_error
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import write_model
-from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turns
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.hong_park import XV3500
-from gyro_calibration.self_calibration import (
+from gyro_calibration.calibration.likelihood import Fit, fit_likelihood, UNLIKELY
+from gyro_calibration.calibration.run_faults import pieces, unit_error
+from gyro_calibration.calibration.self_calibration import (
     check_rest,
     Limits,
     Reference,
     rest_after,
     self_calibrate,
 )
-from gyro_calibration.whole_turns import calibrate_turns
+from gyro_calibration.calibration.whole_turns import calibrate_turns
+from gyro_calibration.cli.main import main
+from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.motion import CALIBRATION, from_headings, from_rates, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.reproduction.hong_park import XV3500
 import numpy as np
 import pytest
 

@@ -14,10 +14,10 @@ from gyro_calibration.diagnosis.gain import change_over, gain
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import Log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 

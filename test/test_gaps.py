@@ -20,13 +20,13 @@ import math
 from pathlib import Path
 import runpy
 
-from gyro_calibration.gaps import Gaps, Intervals
-from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
-from gyro_calibration.log import DEGREE, Log, write_log
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.model_file import write_model
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.tracking import HeadingTracker, Settings, track
+from gyro_calibration.heading.gaps import Gaps, Intervals
+from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
+from gyro_calibration.heading.tracker import HeadingTracker, Settings, track
+from gyro_calibration.logs.log import DEGREE, Log, write_log
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 

@@ -12,19 +12,19 @@
 
 import math
 
-from gyro_calibration.compensation import compensate, covariance, rate_sensitivity
-from gyro_calibration.heading import (
+from gyro_calibration.heading.integration import (
     BlockIntegrator,
     filter_rates,
     integrate,
     Threshold,
     ThresholdFilter,
 )
-from gyro_calibration.log import CACHED, DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.motion import CALIBRATION, ROBOT
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.tracking import HeadingTracker, Settings
+from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.logs.log import CACHED, DEGREE
+from gyro_calibration.model.compensation import compensate, covariance, rate_sensitivity
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.motion import CALIBRATION, ROBOT
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 

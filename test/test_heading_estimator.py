@@ -19,16 +19,16 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import math
 
-from gyro_calibration.assumptions import assumed, Assumptions, sensitive, uncertain, Way
-from gyro_calibration.bias_table import BiasTable, Entry, Prior
-from gyro_calibration.compensation import covariance, rate_sensitivity
-from gyro_calibration.effects import BIAS, BIAS_TEMPERATURE, RATE_RAMP
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.heading.assumptions import assumed, Assumptions, sensitive, uncertain, Way
+from gyro_calibration.heading.bias_table import BiasTable, Entry, Prior
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.compensation import covariance, rate_sensitivity
+from gyro_calibration.model.effects import BIAS, BIAS_TEMPERATURE, RATE_RAMP
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.ros.health_monitor import changed
-from gyro_calibration.tracking import Settings
 import numpy as np
 import pytest
 

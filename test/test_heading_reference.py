@@ -17,9 +17,9 @@ from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import lines
-from gyro_calibration.effects import BIAS
-from gyro_calibration.log import DEGREE, Log
-from gyro_calibration.model import GyroModel, Term
+from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.gyro_model import GyroModel, Term
 from hidden.reference import hide_beside, Imperfect
 import numpy as np
 import pytest

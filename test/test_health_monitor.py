@@ -14,10 +14,10 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.allan import even_record, fit_noise
-from gyro_calibration.log import DEGREE, read_log
-from gyro_calibration.model import SelfCalibration
-from gyro_calibration.motion import ROBOT
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.logs.log import DEGREE, read_log
+from gyro_calibration.model.gyro_model import SelfCalibration
+from gyro_calibration.model.motion import ROBOT
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.ros.health_monitor import changed, examine, HealthMonitor, step_of, STRETCH
 import numpy as np
 import pytest

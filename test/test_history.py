@@ -12,8 +12,8 @@
 
 import time as clock
 
-from gyro_calibration.history import channels_of, History
-from gyro_calibration.log import Log
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.channels import channels_of, History
 import numpy as np
 import pytest
 

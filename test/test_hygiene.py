@@ -22,11 +22,11 @@ from gyro_calibration.diagnosis.factors import FACTORS, unit_of_offset, unit_of_
 from gyro_calibration.diagnosis.hygiene import encoder_step, inspect, LEVEL, update_interval
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.stuck import stuck_samples
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import COLUMNS, DataRefused, DEGREE, Log, read_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.stamps import number_stamps
+from gyro_calibration.logs.log import COLUMNS, DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise, simulate_noise
 from hidden.log import hide
 import numpy as np
 import pytest
@@ -304,7 +304,7 @@ def test_a_constant_rate_of_coarse_codes_is_no_limit(generator):
 
 
 def test_what_the_model_knows_is_no_finding(generator):
-    from gyro_calibration.effects import CATALOGUE
+    from gyro_calibration.model.effects import CATALOGUE
     log = swing(generator)
     output = np.clip(np.round(log.output / SIGMA) * SIGMA, -600 * SIGMA, 600 * SIGMA)
     terms = (Term(CATALOGUE['quantization'], (SIGMA,)),

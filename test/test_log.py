@@ -13,7 +13,7 @@
 import gzip
 import math
 
-from gyro_calibration.log import (
+from gyro_calibration.logs.log import (
     Log,
     LogError,
     read_log,
@@ -139,7 +139,7 @@ def test_a_device_or_a_folder_is_no_log(path, read):
 
 
 def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.log.GROWN', 1 << 16)
+    monkeypatch.setattr('gyro_calibration.logs.log.GROWN', 1 << 16)
     path = tmp_path / 'log.csv.gz'
     with gzip.open(path, 'wb') as file:
         file.write(b'gyro_dps\n')
@@ -149,7 +149,7 @@ def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeyp
 
 
 def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('gyro_calibration.log._WHOLE', 100)
+    monkeypatch.setattr('gyro_calibration.logs.log._WHOLE', 100)
     path = written(tmp_path,
                    'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
     with pytest.raises(LogError, match='more than 100 numbers.*; cut it into pieces'):

@@ -12,15 +12,15 @@
 
 from dataclasses import replace
 
-from gyro_calibration.compensation import covariance, quadratic_form
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.heading import integrate
-from gyro_calibration.history import channels_of
-from gyro_calibration.log import Log, read_log, write_log
-from gyro_calibration.log_compensation import compensate_log, LogCompensation, rows_of
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.simulation import respond
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation, rows_of
+from gyro_calibration.logs.log import Log, read_log, write_log
+from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.compensation import covariance, quadratic_form
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.simulation import respond
 import numpy as np
 import pytest
 

@@ -16,8 +16,8 @@ import subprocess
 import sys
 
 from gyro_calibration.cli.main import main
-from gyro_calibration.log import Log, read_log, read_log_blocks, write_log
-from gyro_calibration.motion import ROBOT
+from gyro_calibration.logs.log import Log, read_log, read_log_blocks, write_log
+from gyro_calibration.model.motion import ROBOT
 import numpy as np
 import pytest
 

@@ -13,8 +13,8 @@
 import io
 
 from gyro_calibration.driver.mcap_writer import McapWriter
-from gyro_calibration.messages import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
-from gyro_calibration.recording import read_recording
+from gyro_calibration.logs.cdr import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
+from gyro_calibration.logs.recording import read_recording
 import numpy as np
 import pytest
 

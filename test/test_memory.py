@@ -12,8 +12,8 @@
 
 import threading
 
-from gyro_calibration.bias_table import INTERVAL, Prior
-from gyro_calibration.model import SelfCalibration
+from gyro_calibration.heading.bias_table import INTERVAL, Prior
+from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.ros.state_store import StateStore
 import pytest
 

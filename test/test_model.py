@@ -16,8 +16,8 @@ import math
 import random
 import tracemalloc
 
-from gyro_calibration.effects import CATALOGUE, rate_temperature_polynomial
-from gyro_calibration.model import (
+from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
+from gyro_calibration.model.gyro_model import (
     GyroModel,
     same_effects,
     SelfCalibration,
@@ -25,8 +25,8 @@ from gyro_calibration.model import (
     Tolerance,
     with_self_calibration,
 )
-from gyro_calibration.model_file import ModelError, read_model, write_model
-from gyro_calibration.noise import Noise
+from gyro_calibration.model.model_file import ModelError, read_model, write_model
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 import yaml

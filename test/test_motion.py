@@ -12,8 +12,8 @@
 
 import math
 
-from gyro_calibration.log import DEGREE
-from gyro_calibration.motion import (
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.motion import (
     CALIBRATION,
     from_headings,
     from_rates,

@@ -12,7 +12,7 @@
 
 import math
 
-from gyro_calibration.noise import ALLAN_FLOOR, CALIBRATED, Noise, simulate_noise
+from gyro_calibration.model.noise import ALLAN_FLOOR, CALIBRATED, Noise, simulate_noise
 import numpy as np
 import pytest
 

@@ -12,8 +12,8 @@
 
 from gyro_calibration.diagnosis.figures import NoiseFigures
 from gyro_calibration.diagnosis.steps import _of_noise
-from gyro_calibration.model import GyroModel
-from gyro_calibration.noise import Noise
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import Noise
 import pytest
 
 FIGURES = NoiseFigures(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},

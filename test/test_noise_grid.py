@@ -12,7 +12,7 @@
 
 import math
 
-from gyro_calibration.noise_grid import (
+from gyro_calibration.calibration.noise_grid import (
     BandedNoise,
     heading_noise,
     noise_grid,

@@ -28,17 +28,17 @@ import subprocess
 import sys
 import tracemalloc
 
-from gyro_calibration.bias_table import BiasTable, Prior
 from gyro_calibration.files import explained, InputError, plain, reason, write_atomically
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import Log, LogError, read_log, write_log
-from gyro_calibration.model import GyroModel, SelfCalibration
-from gyro_calibration.model_file import ModelError, read_model, write_model
-from gyro_calibration.motion import MotionError, read_motion
-from gyro_calibration.noise import Noise
+from gyro_calibration.heading.bias_table import BiasTable, Prior
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.logs.log import Log, LogError, read_log, write_log
+from gyro_calibration.logs.ros_bag import Contents, read_messages
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.model_file import ModelError, read_model, write_model
+from gyro_calibration.model.motion import MotionError, read_motion
+from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.storage import Contents, read_messages
-from gyro_calibration.tracking import Settings
 import numpy as np
 import pytest
 
@@ -309,7 +309,7 @@ def test_a_calibration_that_is_not_used_is_told(model, calibration, hint, tmp_pa
                          [(-7200.0, True), (60.0, True), (3.0e7, False), (2.0e9, False)])
 def test_a_calibration_from_the_future_has_no_known_age(ahead, known):
     """Until the clock is right: a robot without a battery for it begins in the past."""
-    from gyro_calibration.assumptions import Assumptions
+    from gyro_calibration.heading.assumptions import Assumptions
     now, variance = 1.7e9, (1e-5) ** 2
     date = str(np.datetime64(round(now + ahead), 's')) + '+00:00'
     calibration = SelfCalibration(0.0, 0.01, ((1e-8, 0.0), (0.0, variance)), date)

@@ -13,17 +13,17 @@
 from dataclasses import replace
 from functools import cache
 
-from gyro_calibration.calibration import fit_effects
-from gyro_calibration.dwells import Dwells, take
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
-from gyro_calibration.log import DEGREE
-from gyro_calibration.picture import (
+from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.turn_error import predicted_rates, SLOWEST, turn_errors
+from gyro_calibration.cli.plots import (
     draw_error_surface,
     draw_headings,
     draw_residuals,
     draw_turn_errors,
 )
-from gyro_calibration.turn import predicted_rates, SLOWEST, turn_errors
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
 import numpy as np
 import pytest
 

@@ -14,13 +14,21 @@ from functools import cache
 import json
 import math
 
+from gyro_calibration.calibration.likelihood import fit_likelihood
+from gyro_calibration.calibration.motion_design import (
+    _Family,
+    Ability,
+    able,
+    best,
+    Forecast,
+    plain,
+    profile,
+)
+from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.plan import write_motion
-from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import DataRefused, DEGREE
-from gyro_calibration.motion import CALIBRATION, from_rates, read_motion, ROBOT, turns
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.plan import _Family, Ability, able, best, Forecast, plain, profile
-from gyro_calibration.self_calibration import self_calibrate
+from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.model.motion import CALIBRATION, from_rates, read_motion, ROBOT, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 import yaml

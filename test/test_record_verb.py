@@ -27,8 +27,8 @@ from gyro_calibration.cli import main as command_line
 from gyro_calibration.cli import record as record_verb
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find, Sample, Settings
-from gyro_calibration.log import read_log
-from gyro_calibration.recording import read_recording, Topics
+from gyro_calibration.logs.log import read_log
+from gyro_calibration.logs.recording import read_recording, Topics
 import numpy as np
 import pytest
 from recordings import rosbags

@@ -22,10 +22,10 @@ from gyro_calibration.driver.recorder import (
     McapRecorder,
     MessageLog,
 )
-from gyro_calibration.log import LogError, read_log
-from gyro_calibration.messages import IMU, TEMPERATURE
-from gyro_calibration.recording import read_recording, Topics
-from gyro_calibration.storage import Message
+from gyro_calibration.logs.cdr import IMU, TEMPERATURE
+from gyro_calibration.logs.log import LogError, read_log
+from gyro_calibration.logs.recording import read_recording, Topics
+from gyro_calibration.logs.ros_bag import Message
 import numpy as np
 import pytest
 from recordings import BEGIN, Messages, rosbags

@@ -12,8 +12,8 @@
 
 import math
 
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE, read_log
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.ros.calibration_session import ODOMETRY
 from gyro_calibration.ros.wheels import Velocity
 import numpy as np

@@ -20,10 +20,10 @@ import struct
 import sys
 import tracemalloc
 
-from gyro_calibration.log import LogError, read_log, write_log
-from gyro_calibration.messages import IMU, LAYOUTS, MessageError, parse, serialize, TEMPERATURE
-from gyro_calibration.recording import blocks_of, read_recording, Topics
-from gyro_calibration.storage import is_recording
+from gyro_calibration.logs.cdr import IMU, LAYOUTS, MessageError, parse, serialize, TEMPERATURE
+from gyro_calibration.logs.log import LogError, read_log, write_log
+from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
+from gyro_calibration.logs.ros_bag import is_recording
 import numpy as np
 import pytest
 from recordings import BEGIN, DELAY, file_of, KINDS, Messages, of_log, write
@@ -287,7 +287,7 @@ def test_a_chunk_is_never_larger_than_it_says(tmp_path, name):
 
 def test_a_compressed_file_may_not_grow_without_bound(tmp_path, monkeypatch):
     zstandard = pytest.importorskip('zstandard')
-    monkeypatch.setattr('gyro_calibration.storage.LARGEST', 1 << 23)
+    monkeypatch.setattr('gyro_calibration.logs.ros_bag.LARGEST', 1 << 23)
     (tmp_path / 'bomb.db3.zstd').write_bytes(zstandard.compress(bytes(1 << 26)))
     with pytest.raises(LogError, match='times its size'):
         read_recording(tmp_path / 'bomb.db3.zstd')

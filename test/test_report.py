@@ -36,10 +36,10 @@ from gyro_calibration.diagnosis.finding import (
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.units import chance, for_people, quantity
 from gyro_calibration.diagnosis.words import headline, lines
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 import pytest
 

@@ -19,9 +19,9 @@ from pathlib import Path
 
 from gyro_calibration.cli.main import main
 from gyro_calibration.cli.reproduce import page
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel
-from gyro_calibration.motion import CALIBRATION, ROBOT
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.motion import CALIBRATION, ROBOT
 from gyro_calibration.reproduction import bot_thoughts, hong_park, SOURCES
 from gyro_calibration.reproduction import ojeda_chung_borenstein as ojeda
 from gyro_calibration.reproduction.finding import Comparison

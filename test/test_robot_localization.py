@@ -15,7 +15,7 @@ import math
 from pathlib import Path
 import re
 
-from gyro_calibration.log import DEGREE
+from gyro_calibration.logs.log import DEGREE
 import pytest
 from rig import INTERVAL, rested, Robot
 import yaml

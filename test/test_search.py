@@ -26,8 +26,8 @@ from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin, evidence_of, searched
 from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import Log
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.effects import CATALOGUE
 from hidden import hide
 import numpy as np
 import pytest

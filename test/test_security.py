@@ -75,8 +75,8 @@ def test_no_file_makes_code_of_data():
 
 def test_what_is_imported_late_is_named_in_the_code():
     late = {path.name: path for path in FILES if 'importlib.import_module' in names(path)[1]}
-    assert set(late) <= {'storage.py', 'recorder_node.py'}
-    calls = [node for node in ast.walk(ast.parse(late['storage.py'].read_text()))
+    assert set(late) <= {'ros_bag.py', 'recorder_node.py'}
+    calls = [node for node in ast.walk(ast.parse(late['ros_bag.py'].read_text()))
              if isinstance(node, ast.Call)]
     asked = [call.args[0] for call in calls if ast.unparse(call.func) == '_library']
     assert asked and all(isinstance(name, ast.Constant) for name in asked)
@@ -93,7 +93,7 @@ def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
 
 def test_yaml_is_read_as_plain_data_at_one_place():
     assert {path.name for path in FILES if 'yaml.load' in names(path)[1]} <= {'settings_file.py'}
-    from gyro_calibration import settings_file
+    from gyro_calibration.model import settings_file
     assert 'yaml.load(text, _Loader)' in Path(settings_file.__file__).read_text()
     assert issubclass(settings_file._Loader, yaml.SafeLoader)
     assert not [tag for tag in settings_file._Loader.yaml_constructors if tag and 'python' in tag]

@@ -14,22 +14,22 @@ from dataclasses import replace
 from pathlib import Path
 import runpy
 
-from gyro_calibration.dwells import join
-from gyro_calibration.effects import (
-    BIAS_TEMPERATURE,
-    BIAS_TEMPERATURE_QUADRATIC,
-    CUBIC_NONLINEARITY,
-    SINE_RESPONSE,
-)
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.selection import (
+from gyro_calibration.calibration.dwells import join
+from gyro_calibration.calibration.selection import (
     FALSE_ALARM_RATE,
     HARDLY,
     PARTED,
     select_effects,
     TECHNOLOGIES,
 )
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import (
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CUBIC_NONLINEARITY,
+    SINE_RESPONSE,
+)
+from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 import pytest
 from scipy.stats import binom

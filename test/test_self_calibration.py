@@ -18,11 +18,7 @@ The methods reproduce the paper's numbers, and the fit finds the truth with its 
 from functools import cache
 import math
 
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import DataRefused, DEGREE, read_log
-from gyro_calibration.motion import CALIBRATION, from_headings, from_rates, turns
-from gyro_calibration.noise import ALLAN_FLOOR, Noise, simulate_noise
-from gyro_calibration.self_calibration import (
+from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
     fit_heading,
     fit_likelihood,
@@ -30,6 +26,10 @@ from gyro_calibration.self_calibration import (
     Limits,
     self_calibrate,
 )
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import DataRefused, DEGREE, read_log
+from gyro_calibration.model.motion import CALIBRATION, from_headings, from_rates, turns
+from gyro_calibration.model.noise import ALLAN_FLOOR, Noise, simulate_noise
 import numpy as np
 import pytest
 

@@ -15,7 +15,7 @@ import os
 import time
 
 from gyro_calibration.files import read_bytes
-from gyro_calibration.settings_file import read_settings, settings_text
+from gyro_calibration.model.settings_file import read_settings, settings_text
 import pytest
 
 LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n'

@@ -10,13 +10,13 @@
 
 """A simulated log is what the model says of the motion, and says so itself."""
 
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
-from gyro_calibration.history import channels_of
-from gyro_calibration.log import read_log, write_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import CALIBRATION, ROBOT
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import respond, simulate
+from gyro_calibration.logs.log import read_log, write_log
+from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import CALIBRATION, ROBOT
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import respond, simulate
 import numpy as np
 import pytest
 

@@ -15,10 +15,10 @@ import math
 import xml.etree.ElementTree as ElementTree
 
 from gyro_calibration.allan import allan_deviation
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulator_export import (
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulator_export import (
     exported,
     figures,
     gauss_markov,

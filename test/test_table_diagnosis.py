@@ -16,22 +16,22 @@ from pathlib import Path
 import re
 import runpy
 
-from gyro_calibration.calibration import fit_effects
+from gyro_calibration.calibration.dwells import join
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.scatter import rms, Scatter
 from gyro_calibration.diagnosis import dwell_rest
 from gyro_calibration.diagnosis import table as diagnosis
 from gyro_calibration.diagnosis.table import diagnose_table
-from gyro_calibration.dwells import join
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log
+from gyro_calibration.model.effects import (
     BIAS,
     CATALOGUE,
     rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
     STEADY,
 )
-from gyro_calibration.log import DataRefused, DEGREE, Log
-from gyro_calibration.model import GyroModel, same_effects, SelfCalibration, Term
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.scatter import rms, Scatter
+from gyro_calibration.model.gyro_model import GyroModel, same_effects, SelfCalibration, Term
+from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 import pytest
 from scipy.stats import binom

@@ -12,12 +12,12 @@
 
 import math
 
-from gyro_calibration.drift import begin, HEADING, smoothed, Turn
-from gyro_calibration.heading import integrate, Threshold
-from gyro_calibration.log import DEGREE
-from gyro_calibration.motion import from_rates, turns
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.tracking import HeadingTracker, Settings, track
+from gyro_calibration.heading.integration import integrate, Threshold
+from gyro_calibration.heading.kalman import begin, HEADING, smoothed, Turn
+from gyro_calibration.heading.tracker import HeadingTracker, Settings, track
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.motion import from_rates, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 import pytest
 

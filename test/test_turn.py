@@ -17,22 +17,22 @@ import json
 import math
 import sys
 
-from gyro_calibration.calibration import fit_effects
-from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, dwells, take
-from gyro_calibration.effects import (
+from gyro_calibration.calibration.dwells import Dwells, dwells, take
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.turn_error import predicted_rates, size, turn_errors
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import (
     BIAS,
     rate_temperature_polynomial,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
 )
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import DataRefused, DEGREE, Log, read_log, write_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import from_rates
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
-from gyro_calibration.turn import predicted_rates, size, turn_errors
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import from_rates
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 import pytest
 

@@ -20,18 +20,18 @@ import json
 import math
 import os
 
-from gyro_calibration.assumptions import Assumptions
-from gyro_calibration.bias_table import BiasTable
-from gyro_calibration.compensation import compensate
-from gyro_calibration.effects import CATALOGUE, Channels, rate_temperature_polynomial
-from gyro_calibration.heading import filter_rates, Threshold, ThresholdFilter
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import DEGREE, Log, write_log
-from gyro_calibration.log_compensation import compensate_log, LogCompensation
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.heading.assumptions import Assumptions
+from gyro_calibration.heading.bias_table import BiasTable
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
+from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation
+from gyro_calibration.heading.tracker import HeadingTracker, Settings
+from gyro_calibration.logs.log import DEGREE, Log, write_log
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import CATALOGUE, Channels, rate_temperature_polynomial
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.ros.health_monitor import HealthMonitor
-from gyro_calibration.tracking import HeadingTracker, Settings
 import numpy as np
 import pytest
 

@@ -20,15 +20,15 @@ The log is simulated here, so that the truth is known. With files of your own:
 
 import sys
 
-from gyro_calibration.compensation import covariance
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
-from gyro_calibration.heading import BlockIntegrator, integrate, Threshold
-from gyro_calibration.log import DEGREE, write_log
-from gyro_calibration.log_compensation import LogCompensation
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import ROBOT
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
+from gyro_calibration.heading.integration import BlockIntegrator, integrate, Threshold
+from gyro_calibration.heading.log_compensation import LogCompensation
+from gyro_calibration.logs.log import DEGREE, write_log
+from gyro_calibration.model.compensation import covariance
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import ROBOT
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)

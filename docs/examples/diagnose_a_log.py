@@ -24,15 +24,15 @@ import sys
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import lines
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
-from gyro_calibration.heading import integrate
-from gyro_calibration.log import DEGREE
-from gyro_calibration.log_compensation import compensate_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import write_model
-from gyro_calibration.motion import turns
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.motion import turns
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 
 NOISE = Noise(angle_random_walk=1.5e-4)

@@ -20,13 +20,13 @@ The table is simulated here, so that the truth is known. With one of your own:
 
 import sys
 
-from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import dwells
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE
-from gyro_calibration.log import DEGREE, Log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import write_model
-from gyro_calibration.selection import select_effects
+from gyro_calibration.calibration.dwells import dwells
+from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.logs.log import DEGREE, Log
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import write_model
 import numpy as np
 
 #: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor

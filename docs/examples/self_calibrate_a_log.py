@@ -20,14 +20,14 @@ The log is simulated here, so that the truth is known. With a log of your own:
 
 import sys
 
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import DataRefused
-from gyro_calibration.model import GyroModel, Term, with_self_calibration
-from gyro_calibration.model_file import write_model
-from gyro_calibration.motion import CALIBRATION
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import record, self_calibrate
-from gyro_calibration.simulation import simulate
+from gyro_calibration.calibration.self_calibration import record, self_calibrate
+from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term, with_self_calibration
+from gyro_calibration.model.model_file import write_model
+from gyro_calibration.model.motion import CALIBRATION
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 
 NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)

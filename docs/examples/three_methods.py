@@ -20,12 +20,12 @@ The numbers are those of docs/self_calibration.md.
 from collections.abc import Callable
 import sys
 
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import CALIBRATION, from_headings, Motion
-from gyro_calibration.noise import Noise, simulate_noise
-from gyro_calibration.self_calibration import METHODS
+from gyro_calibration.calibration.self_calibration import METHODS
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion
+from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
 from scipy.signal import lfilter
 

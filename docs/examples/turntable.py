@@ -20,15 +20,15 @@ Both logs are simulated here, so that the truth is known. With logs of your own:
 
 from dataclasses import replace
 
-from gyro_calibration.calibration import fit_effects
-from gyro_calibration.dwells import dwells
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.encoder import calibrate_encoder
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.motion import turns
-from gyro_calibration.noise import Noise
-from gyro_calibration.simulation import simulate
+from gyro_calibration.calibration.dwells import dwells
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import turns
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 
 TRUE_GYRO = GyroModel((Term(BIAS, (0.2 * DEGREE,)), Term(SCALE_FACTOR_ERROR, (0.013,))),

@@ -21,10 +21,10 @@ own gyro in their place.
 import math
 import sys
 
-from gyro_calibration.effects import polynomial_from_matrix, polynomial_to_matrix
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.noise import Noise
+from gyro_calibration.model.effects import polynomial_from_matrix, polynomial_to_matrix
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.noise import Noise
 
 DEGREE = math.radians(1.0)
 MATRIX = [[1e-10, 2e-9, 3e-7, -2e-5],  # T²: its factors of w³, w², w and 1

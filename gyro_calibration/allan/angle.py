@@ -12,8 +12,8 @@
 
 from __future__ import annotations
 
-from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.stamps import Integers
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.stamps import Integers
 import numpy as np
 from numpy.typing import NDArray
 

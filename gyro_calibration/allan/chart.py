@@ -18,8 +18,8 @@ import math
 
 from gyro_calibration.allan.angle import angle_of, Integers, lost_before, refuse_few, Truths, whole
 from gyro_calibration.allan.freedom import chi_squared_bounds, degrees_of_freedom
-from gyro_calibration.log import Array, DataRefused, Progress
-from gyro_calibration.noise import ALLAN_FLOOR
+from gyro_calibration.logs.log import Array, DataRefused, Progress
+from gyro_calibration.model.noise import ALLAN_FLOOR
 import numpy as np
 
 #: Samples in a block: its few arrays stay in the cache for all averaging times.

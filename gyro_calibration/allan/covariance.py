@@ -27,7 +27,7 @@ from gyro_calibration.allan.parts import (
     RAMP_PLACE,
     RATE_WALK_PLACE,
 )
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 
 #: Second difference.

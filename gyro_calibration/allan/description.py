@@ -19,7 +19,7 @@ from functools import cached_property
 from gyro_calibration.allan.freedom import chi_squared_bounds
 from gyro_calibration.allan.octaves import Octaves
 from gyro_calibration.allan.parts import BEND_PLACE, RAMP_PLACE
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import chdtrc

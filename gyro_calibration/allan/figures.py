@@ -28,8 +28,8 @@ from gyro_calibration.allan.parts import (
     RATE_WALK_PLACE,
 )
 from gyro_calibration.allan.ranking import rank, Ranking
-from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: -2 ln likelihood above its least at the ends of an interval of 95 %: that of chi squared.

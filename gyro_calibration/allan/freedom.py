@@ -23,7 +23,7 @@ from gyro_calibration.allan.parts import (
     QUANTIZATION,
     RATE_RANDOM_WALK,
 )
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.special import chdtri
 

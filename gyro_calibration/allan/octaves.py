@@ -19,7 +19,7 @@ import itertools
 from gyro_calibration.allan.chart import AllanChart
 from gyro_calibration.allan.covariance import covariance_form
 from gyro_calibration.allan.parts import BEND_PLACE, PARTS, QUANTIZATION
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.allan.angle import Integers
-from gyro_calibration.log import Array
-from gyro_calibration.noise import ALLAN_FLOOR
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.noise import ALLAN_FLOOR
 import numpy as np
 
 

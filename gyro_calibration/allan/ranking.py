@@ -19,7 +19,7 @@ import itertools
 from gyro_calibration.allan.description import describe, Description, RIVAL
 from gyro_calibration.allan.octaves import Octaves
 from gyro_calibration.allan.parts import ANGLE_WALK_PLACE, BEND_PLACE, PARTS, QUANTIZATION_PLACE
-from gyro_calibration.log import DataRefused
+from gyro_calibration.logs.log import DataRefused
 
 #: Shares by which the Allan deviations may differ from the sum of the parts; the smallest one that
 #: suffices is taken.

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 from gyro_calibration.allan.angle import gaps, LOST_SHARE, refuse_few
 from gyro_calibration.allan.rest import leave_out_wild_samples, refuse_dead, refuse_motion
-from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.stamps import number_stamps, Stamps
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.stamps import number_stamps, Stamps
 import numpy as np
 
 #: Share of a record that may be lost.

@@ -24,9 +24,9 @@ from gyro_calibration.allan.angle import (
     Truths,
     whole,
 )
-from gyro_calibration.likelihood import CHANCE
-from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.stamps import LONG, Stamps
+from gyro_calibration.calibration.likelihood import CHANCE
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.stamps import LONG, Stamps
 import numpy as np
 from scipy.signal import medfilt
 

@@ -27,6 +27,7 @@ from gyro_calibration.allan import (
     NoiseFit,
     Record,
 )
+from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -39,10 +40,9 @@ from gyro_calibration.cli.verb import (
     verb,
     with_origin,
 )
-from gyro_calibration.log import DataRefused, DEGREE
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.picture import draw_allan
+from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import read_model, write_model
 import numpy as np
 
 #: Symbol -> unit that people use, and how many of it are one in SI.

@@ -19,8 +19,6 @@ from datetime import datetime, timezone
 import math
 from typing import Any
 
-from gyro_calibration.assumptions import Assumptions
-from gyro_calibration.bias_table import BiasTable
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -31,15 +29,22 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
 )
-from gyro_calibration.compensation import covariance, quadratic_form
-from gyro_calibration.gaps import Intervals
-from gyro_calibration.heading import BlockIntegrator, Threshold
-from gyro_calibration.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
-from gyro_calibration.log_compensation import LogCompensation, none_plausible, plausible, rows_of
-from gyro_calibration.model import GyroModel, with_self_calibration
-from gyro_calibration.model_file import read_model
-from gyro_calibration.tracking import in_hindsight, Settings
+from gyro_calibration.heading.assumptions import Assumptions
+from gyro_calibration.heading.bias_table import BiasTable
+from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
+from gyro_calibration.heading.integration import BlockIntegrator, Threshold
+from gyro_calibration.heading.log_compensation import (
+    LogCompensation,
+    none_plausible,
+    plausible,
+    rows_of,
+)
+from gyro_calibration.heading.tracker import in_hindsight, Settings
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
+from gyro_calibration.model.compensation import covariance, quadratic_form
+from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
+from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 

@@ -31,7 +31,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 def _demo(given: argparse.Namespace) -> Answer:
     try:
-        from gyro_calibration.demo import run_demo
+        from gyro_calibration.cli.demo_run import run_demo
     except ImportError as error:
         raise UsageError(f'the demo needs ROS 2 and matplotlib ({error}); source ROS 2, or '
                          'install gyro_calibration[ros,plot]') from None

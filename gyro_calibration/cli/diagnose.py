@@ -37,9 +37,9 @@ from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import write_atomically
-from gyro_calibration.log import Log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import model_text, read_model
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import model_text, read_model
 import numpy as np
 from tqdm import tqdm
 

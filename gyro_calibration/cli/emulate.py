@@ -36,7 +36,7 @@ from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.files import plain
-from gyro_calibration.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 import numpy as np
 
 

@@ -18,8 +18,8 @@ from typing import Any
 
 from gyro_calibration.cli.verb import Answer, degrees_celsius, positive, UsageError, verb
 from gyro_calibration.files import write_atomically
-from gyro_calibration.model_file import read_model
-from gyro_calibration.simulator_export import exported, figures, SIMULATORS
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.simulator_export import exported, figures, SIMULATORS
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:

@@ -19,8 +19,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration import picture
-from gyro_calibration.calibration import fit_effects
+from gyro_calibration.calibration.dwells import Dwells, dwells, join, take
+from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
+from gyro_calibration.cli import plots
 from gyro_calibration.cli.fit_answer import (
     bin_lines,
     choice_lines,
@@ -47,13 +50,10 @@ from gyro_calibration.cli.verb import (
     UsageError,
     verb,
 )
-from gyro_calibration.dwells import Dwells, dwells, join, take
-from gyro_calibration.effects import Effect, rate_temperature_polynomial, STEADY
-from gyro_calibration.encoder import calibrate_encoder, EncoderCalibration
-from gyro_calibration.log import Log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import write_model
-from gyro_calibration.selection import select_effects, Selection, TECHNOLOGIES
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.effects import Effect, rate_temperature_polynomial, STEADY
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import write_model
 import numpy as np
 
 METHODS = ('dwells', 'likelihood', 'course', 'rate')
@@ -158,10 +158,10 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     fit = selection.calibration
     model = _written(given, fit.model)
     if given.picture:
-        picture.draw_residuals(given.picture, fit)
+        plots.draw_residuals(given.picture, fit)
     if given.surface:
-        picture.draw_error_surface(given.surface, model, model.rate_range,
-                                   model.temperature_range, take(table, fit.scatter.kept))
+        plots.draw_error_surface(given.surface, model, model.rate_range,
+                                 model.temperature_range, take(table, fit.scatter.kept))
     matrix = matrix_of(model)
     data = {'out': given.out, 'method': 'dwells', **dwell_data(selection),
             'effects': value_data(model), **model_data(model), 'matrix_dps': matrix,
@@ -191,7 +191,7 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)
     if given.picture:
-        picture.draw_headings(given.picture, *_headings(log, found))
+        plots.draw_headings(given.picture, *_headings(log, found))
     data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
             **model_data(model), **heading_data(found), 'remarks': list(found.remarks)}
     lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',

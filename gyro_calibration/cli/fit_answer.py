@@ -17,15 +17,15 @@ import math
 import textwrap
 from typing import Any
 
-from gyro_calibration.calibration import Bin, binned, Calibration
-from gyro_calibration.dwells import listed
-from gyro_calibration.effects import Parameter, polynomial_to_matrix
-from gyro_calibration.encoder import EncoderCalibration
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import POLYNOMIAL
-from gyro_calibration.scatter import FEWEST_SWEEPS
-from gyro_calibration.selection import Choice, Selection, Twins
+from gyro_calibration.calibration.dwells import listed
+from gyro_calibration.calibration.encoder import EncoderCalibration
+from gyro_calibration.calibration.rate_table import Bin, binned, Calibration
+from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
+from gyro_calibration.calibration.selection import Choice, Selection, Twins
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.effects import Parameter, polynomial_to_matrix
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import POLYNOMIAL
 import numpy as np
 
 #: A heading that is further off after calibration, rad, is worth a word.

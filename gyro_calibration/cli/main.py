@@ -29,7 +29,7 @@ from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
 from gyro_calibration.cli.verb import Answer, say, UsageError
 from gyro_calibration.files import explained, InputError, plain, reason
-from gyro_calibration.log import DataRefused
+from gyro_calibration.logs.log import DataRefused
 import numpy as np
 
 DONE, NO_ANSWER, WRONG_USE = 0, 1, 2

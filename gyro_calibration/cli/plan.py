@@ -17,15 +17,23 @@ from dataclasses import asdict
 import reprlib
 from typing import Any
 
+from gyro_calibration.calibration.motion_design import (
+    Ability,
+    able,
+    best,
+    Forecast,
+    plain,
+    Plan,
+    Prediction,
+)
 from gyro_calibration.cli.verb import Answer, bar, positive, UsageError, verb, whole
 from gyro_calibration.files import reason, write_atomically
-from gyro_calibration.log import DEGREE
-from gyro_calibration.model_file import read_model
-from gyro_calibration.motion import CALIBRATION, Motion, NAMED, read_motion
-from gyro_calibration.noise import Noise
-from gyro_calibration.plan import Ability, able, best, Forecast, plain, Plan, Prediction
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import CALIBRATION, Motion, NAMED, read_motion
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.settings_file import read_settings
 from gyro_calibration.reproduction.hong_park import XV3500
-from gyro_calibration.settings_file import read_settings
 import numpy as np
 
 #: Name of a limit in a file -> its name in `Ability`, its unit, and the range of its numbers.

@@ -38,9 +38,9 @@ from gyro_calibration.driver.recorder import (
 )
 from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.files import plain
-from gyro_calibration.log import DataRefused, DEGREE
-from gyro_calibration.messages import NSEC_PER_SEC
-from gyro_calibration.storage import Message
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
+from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.logs.ros_bag import Message
 from tqdm import tqdm
 
 Recorder = CsvRecorder | McapRecorder

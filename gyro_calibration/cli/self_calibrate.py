@@ -18,6 +18,18 @@ from datetime import datetime, timezone
 import math
 from typing import Any
 
+from gyro_calibration.calibration.likelihood import Fit
+from gyro_calibration.calibration.self_calibration import (
+    check_rest,
+    METHODS,
+    record,
+    Reference,
+    rest_after,
+    RestCheck,
+    self_calibrate,
+    usual_reference,
+)
+from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING, Turns
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -29,23 +41,11 @@ from gyro_calibration.cli.verb import (
     verb,
     with_origin,
 )
-from gyro_calibration.likelihood import Fit
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.log_compensation import compensate_log, none_plausible, plausible
-from gyro_calibration.model import GyroModel, SelfCalibration, with_self_calibration
-from gyro_calibration.model_file import read_model, write_model
-from gyro_calibration.motion import from_headings, from_rates, Motion, read_motion
-from gyro_calibration.self_calibration import (
-    check_rest,
-    METHODS,
-    record,
-    Reference,
-    rest_after,
-    RestCheck,
-    self_calibrate,
-    usual_reference,
-)
-from gyro_calibration.whole_turns import calibrate_turns, MARKING, Turns
+from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import from_headings, from_rates, Motion, read_motion
 import numpy as np
 
 #: What --turns takes for a count that the gyro itself is to find.

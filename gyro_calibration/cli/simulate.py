@@ -27,10 +27,10 @@ from gyro_calibration.cli.verb import (
     verb,
     whole,
 )
-from gyro_calibration.log import Log, write_log
-from gyro_calibration.model_file import read_model
-from gyro_calibration.motion import NAMED, read_motion
-from gyro_calibration.simulation import simulate
+from gyro_calibration.logs.log import Log, write_log
+from gyro_calibration.model.model_file import read_model
+from gyro_calibration.model.motion import NAMED, read_motion
+from gyro_calibration.model.simulation import simulate
 import numpy as np
 
 #: Samples of a simulation, which takes 100 bytes for each.

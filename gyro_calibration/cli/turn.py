@@ -19,6 +19,18 @@ import io
 import math
 from typing import Any, TypeAlias
 
+from gyro_calibration.calibration.dwells import Dwells, dwells, listed, take
+from gyro_calibration.calibration.scatter import not_outlying
+from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.calibration.turn_error import (
+    predicted_rates,
+    Size,
+    size,
+    SLOWEST,
+    turn_errors,
+    TurnErrors,
+)
+from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -29,18 +41,13 @@ from gyro_calibration.cli.verb import (
     read,
     verb,
 )
-from gyro_calibration.compensation import compensate
-from gyro_calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.files import write_atomically
-from gyro_calibration.log import Array, DEGREE, Log, Mask
-from gyro_calibration.log_compensation import compensate_log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.model_file import read_model
-from gyro_calibration.picture import draw_turn_errors
-from gyro_calibration.scatter import not_outlying
-from gyro_calibration.selection import select_effects
-from gyro_calibration.storage import files_of
-from gyro_calibration.turn import predicted_rates, Size, size, SLOWEST, turn_errors, TurnErrors
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
+from gyro_calibration.logs.ros_bag import files_of
+from gyro_calibration.model.compensation import compensate
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import read_model
 import numpy as np
 
 TURN = 2.0 * math.pi

@@ -26,9 +26,9 @@ import sys
 from typing import Any
 
 from gyro_calibration import __version__
-from gyro_calibration.columns import AXES
 from gyro_calibration.files import InputError, LARGEST, opened, plain
-from gyro_calibration.log import (
+from gyro_calibration.logs.columns import AXES
+from gyro_calibration.logs.log import (
     Array,
     DataRefused,
     DEGREE,
@@ -38,9 +38,9 @@ from gyro_calibration.log import (
     read_log_blocks,
     unwrapped,
 )
-from gyro_calibration.model import GyroModel
-from gyro_calibration.recording import blocks_of, read_recording, Topics
-from gyro_calibration.storage import files_of, is_recording
+from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
+from gyro_calibration.logs.ros_bag import files_of, is_recording
+from gyro_calibration.model.gyro_model import GyroModel
 from tqdm import tqdm
 
 

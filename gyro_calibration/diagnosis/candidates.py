@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 
 #: A dead zone is looked for where an encoder makes so many steps a second or more.

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE
 
 #: Either of these serves as a reference.
 REFERENCES = ('reference_rate', 'reference_heading')

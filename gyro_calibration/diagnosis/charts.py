@@ -18,7 +18,7 @@ import math
 
 from gyro_calibration.diagnosis.markup import element, joined, Markup
 from gyro_calibration.diagnosis.units import number, raised
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 
 #: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.

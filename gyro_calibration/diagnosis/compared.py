@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.log import Array, Log, Mask
-from gyro_calibration.model import GyroModel
+from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
 from scipy.signal import savgol_filter

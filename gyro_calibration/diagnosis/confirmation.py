@@ -34,8 +34,8 @@ from gyro_calibration.diagnosis.regression import (
     Whitened,
     whitened,
 )
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher

@@ -20,8 +20,8 @@ from gyro_calibration.diagnosis.finding import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.outcome import joined, Outcome
 from gyro_calibration.diagnosis.replay import Replay, white_deviation
 from gyro_calibration.diagnosis.spectrum import transform
-from gyro_calibration.log import Array
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 

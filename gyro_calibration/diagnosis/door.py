@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import replace
 import math
 
+from gyro_calibration.calibration.dwells.samples import between_values, output_of, where_lost
 from gyro_calibration.diagnosis.codes import codes_of
 from gyro_calibration.diagnosis.compared import (
     bridged,
@@ -24,9 +25,8 @@ from gyro_calibration.diagnosis.compared import (
     white_noise,
 )
 from gyro_calibration.diagnosis.finding import Gate
-from gyro_calibration.dwells.samples import between_values, output_of, where_lost
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.model import GyroModel
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: Least samples and seconds of a log in time, rows of a rate table, and part of a log with values.

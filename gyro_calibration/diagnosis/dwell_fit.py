@@ -23,10 +23,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
+from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.rate_table import (
+    Calibration,
+    channels_of,
+    columns_of,
+    fit_effects,
+)
+from gyro_calibration.calibration.scatter import Scatter, Uncertainty, Whitener
+from gyro_calibration.calibration.selection import part_twins, supported_effects, TECHNOLOGIES
 from gyro_calibration.diagnosis.extension import origins_before, wider
-from gyro_calibration.dwells import Dwells, take
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -37,10 +45,7 @@ from gyro_calibration.effects import (
     SINE_RESPONSE,
     STEADY,
 )
-from gyro_calibration.log import Array, DataRefused
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.scatter import Scatter, Uncertainty, Whitener
-from gyro_calibration.selection import part_twins, supported_effects, TECHNOLOGIES
+from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
 from scipy.linalg import block_diag
 

@@ -15,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import math
 
+from gyro_calibration.calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.calibration.scatter import FEWEST_SWEEPS, parts_of, Scatter, summed
 from gyro_calibration.diagnosis.dwell_fit import simulated
 from gyro_calibration.diagnosis.finding import Curve, Gain
 from gyro_calibration.diagnosis.gain import change_over, WINDOW
-from gyro_calibration.dwells import Dwells, Numbers, take
-from gyro_calibration.log import Array, DataRefused, Mask
-from gyro_calibration.model import GyroModel
-from gyro_calibration.scatter import FEWEST_SWEEPS, parts_of, Scatter, summed
+from gyro_calibration.logs.log import Array, DataRefused, Mask
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.

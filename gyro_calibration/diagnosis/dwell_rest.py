@@ -23,11 +23,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from gyro_calibration.calibration import Calibration, columns_of
+from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.rate_table import Calibration, columns_of
+from gyro_calibration.calibration.scatter import (
+    parts_of,
+    SMALLEST_TEMPERATURE_SPREAD,
+    Uncertainty,
+    Whitener,
+)
 from gyro_calibration.diagnosis.finding import Unexplained
-from gyro_calibration.dwells import Dwells, take
-from gyro_calibration.log import Array
-from gyro_calibration.scatter import parts_of, SMALLEST_TEMPERATURE_SPREAD, Uncertainty, Whitener
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.stats import f as fisher

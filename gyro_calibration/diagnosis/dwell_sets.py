@@ -16,11 +16,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration import Calibration, channels_of, columns_of
+from gyro_calibration.calibration.dwells import take
+from gyro_calibration.calibration.rate_table import Calibration, channels_of, columns_of
+from gyro_calibration.calibration.scatter import Whitener
+from gyro_calibration.calibration.selection import PARTED, separation, swapped_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.dwell_fit import tried
-from gyro_calibration.dwells import take
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -31,9 +34,6 @@ from gyro_calibration.effects import (
     SINE_RESPONSE,
     STEADY,
 )
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.scatter import Whitener
-from gyro_calibration.selection import PARTED, separation, swapped_effects
 import numpy as np
 
 #: Of bias and scale factor, what dwells in one pose on one table never rule out.

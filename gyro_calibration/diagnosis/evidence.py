@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from numpy.typing import NDArray
 

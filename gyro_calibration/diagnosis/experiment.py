@@ -32,7 +32,7 @@ from gyro_calibration.diagnosis.menu import Conditions, menu, reach
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import angles, Shape
 from gyro_calibration.diagnosis.units import number
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 
 #: Sigmas that part two causes even if the fitted values are somewhat off; more are not needed.

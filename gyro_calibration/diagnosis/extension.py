@@ -15,12 +15,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
+from gyro_calibration.calibration.self_calibration import Limits
 from gyro_calibration.diagnosis.field import Named, seen
 from gyro_calibration.diagnosis.figures import NAMES
 from gyro_calibration.diagnosis.finding import Finding
 from gyro_calibration.diagnosis.hygiene import Hygiene
 from gyro_calibration.diagnosis.outcome import Outcome
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     BIAS_TEMPERATURE_QUADRATIC,
@@ -28,10 +30,8 @@ from gyro_calibration.effects import (
     Effect,
     SCALE_FACTOR_ERROR,
 )
-from gyro_calibration.log import Array
-from gyro_calibration.model import GyroModel, same_effects, Term
-from gyro_calibration.noise import Noise
-from gyro_calibration.self_calibration import Limits
+from gyro_calibration.model.gyro_model import GyroModel, same_effects, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: What must be known of a scale factor error for it to be believed.

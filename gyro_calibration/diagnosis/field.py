@@ -38,8 +38,8 @@ from gyro_calibration.diagnosis.spectrum import (
     noise_grid,
     Shape,
 )
-from gyro_calibration.effects import CATALOGUE
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 
 #: The longest interval, s, over which a smoothed residual is averaged; and how often the levels of

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 from gyro_calibration.diagnosis.field import Work
 from gyro_calibration.diagnosis.spectrum import angles, differentiated
-from gyro_calibration.log import Array
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2

@@ -16,9 +16,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gyro_calibration.log import Array
-from gyro_calibration.model import GyroModel
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import Noise
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
 

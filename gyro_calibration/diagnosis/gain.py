@@ -20,7 +20,7 @@ from gyro_calibration.diagnosis.finding import Change, Gain
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import relaid, Search, searched
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from scipy.stats import t as student
 

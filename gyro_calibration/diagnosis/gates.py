@@ -27,8 +27,8 @@ import math
 from gyro_calibration.diagnosis.compared import bridged, scale_of
 from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding, Gate
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.model import GyroModel
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 
 #: Spans that a log is cut into, and the lags that are tried, in spans, either way.

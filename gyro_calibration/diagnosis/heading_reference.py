@@ -42,11 +42,11 @@ from gyro_calibration.diagnosis.regression import (
     spans_of,
     whitened,
 )
-from gyro_calibration.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
-from gyro_calibration.log import Array, DEGREE, Log
-from gyro_calibration.log_compensation import compensate_log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import t as student
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from gyro_calibration.calibration.dwells.samples import output_of
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.codes import Codes, codes_of, dead_band, Limit, limit_of
 from gyro_calibration.diagnosis.compared import (
@@ -39,10 +40,9 @@ from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
 from gyro_calibration.diagnosis.finding import Estimate, Finding
 from gyro_calibration.diagnosis.stuck import Stuck, stuck_samples
 from gyro_calibration.diagnosis.wild import Wild, wild_samples
-from gyro_calibration.dwells.samples import output_of
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.model import GyroModel
-from gyro_calibration.stamps import number_stamps, Stamps
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.stamps import number_stamps, Stamps
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
 

@@ -23,7 +23,7 @@ from itertools import accumulate
 import math
 
 from gyro_calibration.diagnosis.replay import Replay, replay
-from gyro_calibration.log import Array, DEGREE, Log
+from gyro_calibration.logs.log import Array, DEGREE, Log
 import numpy as np
 
 #: Points of a plan: enough for quick motion over minutes, and few enough to try many plans.

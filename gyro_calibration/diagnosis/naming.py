@@ -21,7 +21,7 @@ from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
 from gyro_calibration.diagnosis.outcome import joined, Outcome, Value
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.search import evidence_of, MOST_SLIPS, price_of_freedom, Search
-from gyro_calibration.effects import CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.stats import norm
 

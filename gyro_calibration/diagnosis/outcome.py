@@ -27,7 +27,7 @@ from gyro_calibration.diagnosis.field import (
 )
 from gyro_calibration.diagnosis.probes import is_named
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.linalg import block_diag
 

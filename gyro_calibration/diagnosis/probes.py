@@ -23,7 +23,7 @@ from itertools import combinations
 
 from gyro_calibration.diagnosis.candidates import Candidate, constant
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.interpolate import BSpline
 

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 
+from gyro_calibration.calibration.dwells.samples import where_lost
 from gyro_calibration.diagnosis.compared import bridged, white_noise
 from gyro_calibration.diagnosis.finding import Reference
 from gyro_calibration.diagnosis.hygiene import encoder_step
-from gyro_calibration.dwells.samples import where_lost
-from gyro_calibration.log import Array, DEGREE, Log
+from gyro_calibration.logs.log import Array, DEGREE, Log
 import numpy as np
 
 KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro', 'rest')

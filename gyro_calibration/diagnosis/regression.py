@@ -32,12 +32,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
+from gyro_calibration.calibration.noise_grid import (
+    GridFit,
+    heading_noise,
+    noise_grid,
+    SharedNoise,
+    wander,
+)
 from gyro_calibration.diagnosis.compared import bridged, white_noise
 from gyro_calibration.diagnosis.reference import integral_of
-from gyro_calibration.effects import CATALOGUE, Channels
-from gyro_calibration.history import channels_of
-from gyro_calibration.log import Array, DEGREE, Log
-from gyro_calibration.noise_grid import GridFit, heading_noise, noise_grid, SharedNoise, wander
+from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter

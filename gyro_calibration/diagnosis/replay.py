@@ -18,11 +18,11 @@ import math
 
 from gyro_calibration.diagnosis.door import evened, FEWEST, prepared
 from gyro_calibration.diagnosis.spectrum import angles, differentiated, inverse, level, transform
-from gyro_calibration.effects import Channels
-from gyro_calibration.history import channels_of
-from gyro_calibration.log import Array, DataRefused, Log, Mask
-from gyro_calibration.model import GyroModel
-from gyro_calibration.stamps import number_stamps
+from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
+from gyro_calibration.logs.stamps import number_stamps
+from gyro_calibration.model.channels import channels_of
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len

@@ -51,9 +51,9 @@ from gyro_calibration.diagnosis.words import (
     todo,
     unknown,
 )
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.model_file import model_text
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.model_file import model_text
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: Of a curve, so many points are drawn at most, four to a part: its ends and its extremes stay.

@@ -61,7 +61,7 @@ from gyro_calibration.diagnosis.field import (
 from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
-from gyro_calibration.log import Array, DataRefused
+from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate

@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.log import Array
+from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.fft import dct, idct
 

@@ -59,10 +59,10 @@ from gyro_calibration.diagnosis.search import (
     searched,
 )
 from gyro_calibration.diagnosis.units import amount
-from gyro_calibration.effects import QUANTIZATION
-from gyro_calibration.log import Log
-from gyro_calibration.model import GyroModel
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Log
+from gyro_calibration.model.effects import QUANTIZATION
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import chi2, norm
 

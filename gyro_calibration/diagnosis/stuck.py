@@ -18,7 +18,7 @@ import math
 
 from gyro_calibration.diagnosis.codes import Codes, DeadBand, doubt_of, steps_about
 from gyro_calibration.diagnosis.compared import Compared
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats

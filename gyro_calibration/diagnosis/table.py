@@ -16,7 +16,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration import Calibration, channels_of, columns_of, fit_effects
+from gyro_calibration.calibration.dwells import Dwells, from_table, listed, take
+from gyro_calibration.calibration.rate_table import (
+    Calibration,
+    channels_of,
+    columns_of,
+    fit_effects,
+)
+from gyro_calibration.calibration.scatter import (
+    freedom_beside_surface,
+    rms,
+    SMALLEST_TEMPERATURE_SPREAD,
+    Uncertainty,
+    Whitener,
+)
+from gyro_calibration.calibration.selection import supported_effects, swapped_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.door import refuse
 from gyro_calibration.diagnosis.dwell_fit import (
@@ -38,25 +52,16 @@ from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gai
 from gyro_calibration.diagnosis.gain import WINDOW
 from gyro_calibration.diagnosis.hygiene import decided, inspect
 from gyro_calibration.diagnosis.units import amount
-from gyro_calibration.dwells import Dwells, from_table, listed, take
-from gyro_calibration.effects import (
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
+from gyro_calibration.model.effects import (
     CUBIC_NONLINEARITY,
     Effect,
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
     STEADY,
 )
-from gyro_calibration.log import Array, DataRefused, DEGREE, Log
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise
-from gyro_calibration.scatter import (
-    freedom_beside_surface,
-    rms,
-    SMALLEST_TEMPERATURE_SPREAD,
-    Uncertainty,
-    Whitener,
-)
-from gyro_calibration.selection import supported_effects, swapped_effects
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import norm

@@ -17,7 +17,7 @@ import math
 import re
 
 from gyro_calibration.diagnosis.finding import Estimate
-from gyro_calibration.log import DEGREE
+from gyro_calibration.logs.log import DEGREE
 
 _HOUR = 3600.0
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gyro_calibration.diagnosis.compared import bridged, Compared
-from gyro_calibration.log import Array, Mask
+from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats

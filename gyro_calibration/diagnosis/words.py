@@ -18,7 +18,7 @@ import unicodedata
 
 from gyro_calibration.diagnosis.finding import Change, Diagnosis, Finding, Unexplained
 from gyro_calibration.diagnosis.units import amount, chance, number, Quantity, quantity
-from gyro_calibration.model import same_effects, Term
+from gyro_calibration.model.gyro_model import same_effects, Term
 
 #: Lines for a terminal are not longer.
 _WIDTH = 120

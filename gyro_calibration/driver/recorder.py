@@ -35,9 +35,8 @@ from gyro_calibration import __version__
 from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import MessageClock
-from gyro_calibration.gaps import Intervals
-from gyro_calibration.log import LogError
-from gyro_calibration.messages import (
+from gyro_calibration.heading.gaps import Intervals
+from gyro_calibration.logs.cdr import (
     DEFINITIONS,
     FORCE_COVARIANCE,
     FORCE_Z,
@@ -56,8 +55,9 @@ from gyro_calibration.messages import (
     TEMPERATURE,
     TWIST,
 )
-from gyro_calibration.recording import wrong_kind
-from gyro_calibration.storage import ABOUT, MCAP_END, Message
+from gyro_calibration.logs.log import LogError
+from gyro_calibration.logs.recording import wrong_kind
+from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, Message
 import numpy as np
 
 KINDS = '.csv', '.csv.gz', '.mcap'

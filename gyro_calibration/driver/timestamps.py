@@ -40,7 +40,7 @@ import math
 import time
 
 from gyro_calibration.driver.protocols import Sample
-from gyro_calibration.messages import NSEC_PER_SEC
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 
 _Point = tuple[float, float]
 

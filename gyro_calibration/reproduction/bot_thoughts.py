@@ -19,18 +19,18 @@ from __future__ import annotations
 
 import math
 
-from gyro_calibration.heading import integrate
-from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import Array, DEGREE, Progress
-from gyro_calibration.motion import CALIBRATION, from_headings, Motion, turns
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.likelihood import fit_likelihood
+from gyro_calibration.calibration.self_calibration import fit_rate
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion, turns
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
     from_own_figures,
     Reproduction,
 )
-from gyro_calibration.self_calibration import fit_rate
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import linregress

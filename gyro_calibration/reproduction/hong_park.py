@@ -20,20 +20,20 @@ from __future__ import annotations
 
 import math
 
-from gyro_calibration.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.heading import filter_rates, integrate, Threshold
-from gyro_calibration.likelihood import fit_likelihood
-from gyro_calibration.log import Array, DEGREE, Progress
-from gyro_calibration.model import GyroModel, SelfCalibration, Term
-from gyro_calibration.motion import CALIBRATION, from_rates, Motion, ROBOT
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.calibration.likelihood import fit_likelihood
+from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, record
+from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, ROBOT
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
     from_own_figures,
     Reproduction,
 )
-from gyro_calibration.self_calibration import fit_heading, fit_rate, record
 import numpy as np
 
 TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for indoor mobile '

@@ -21,9 +21,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 import math
 
-from gyro_calibration.calibration import fit_effects, Scatter
-from gyro_calibration.dwells import Dwells
-from gyro_calibration.effects import (
+from gyro_calibration.calibration.dwells import Dwells
+from gyro_calibration.calibration.rate_table import fit_effects, Scatter
+from gyro_calibration.logs.log import Array, DEGREE, Progress
+from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
     Effect,
@@ -32,9 +33,8 @@ from gyro_calibration.effects import (
     SCALE_FACTOR_TEMPERATURE,
     SINE_RESPONSE,
 )
-from gyro_calibration.log import Array, DEGREE, Progress
-from gyro_calibration.model import GyroModel, Term
-from gyro_calibration.noise import Noise, simulate_noise
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,

@@ -28,23 +28,7 @@ import os
 from pathlib import Path
 from types import SimpleNamespace
 
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import Array, DataRefused, DEGREE
-from gyro_calibration.model import SelfCalibration
-from gyro_calibration.motion import (
-    CALIBRATION,
-    from_headings,
-    from_rates,
-    Motion,
-    MotionError,
-    read_motion,
-)
-from gyro_calibration.noise import Noise
-from gyro_calibration.ros.clock import Clock
-from gyro_calibration.ros.health_monitor import changed, HealthMonitor
-from gyro_calibration.ros.state_store import StateStore
-from gyro_calibration.ros.wheels import Velocity
-from gyro_calibration.self_calibration import (
+from gyro_calibration.calibration.self_calibration import (
     calibrate_bias,
     check_rest,
     Limits,
@@ -54,7 +38,23 @@ from gyro_calibration.self_calibration import (
     self_calibrate,
     SETTLED,
 )
-from gyro_calibration.whole_turns import calibrate_turns
+from gyro_calibration.calibration.whole_turns import calibrate_turns
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.gyro_model import SelfCalibration
+from gyro_calibration.model.motion import (
+    CALIBRATION,
+    from_headings,
+    from_rates,
+    Motion,
+    MotionError,
+    read_motion,
+)
+from gyro_calibration.model.noise import Noise
+from gyro_calibration.ros.clock import Clock
+from gyro_calibration.ros.health_monitor import changed, HealthMonitor
+from gyro_calibration.ros.state_store import StateStore
+from gyro_calibration.ros.wheels import Velocity
 import numpy as np
 
 PROFILE, ODOMETRY, TURNS, REST = 'profile', 'odometry', 'turns', 'rest'

@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 
-from gyro_calibration.heading_estimator import HeadingEstimator
-from gyro_calibration.log import DEGREE
+from gyro_calibration.heading.heading_estimator import HeadingEstimator
+from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import BLIND, Run, STANDING_TIME
 from gyro_calibration.ros.clock import Clock
 from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN

@@ -28,7 +28,7 @@ from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.decimation import Decimation, Mean
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 from gyro_calibration.driver.timestamps import NodeTime, read_together, steady
-from gyro_calibration.messages import NSEC_PER_SEC
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
 from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
 from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport

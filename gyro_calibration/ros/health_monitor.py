@@ -24,9 +24,9 @@ from dataclasses import dataclass, field
 import math
 
 from gyro_calibration.files import LARGEST
-from gyro_calibration.log import Array, DEGREE
-from gyro_calibration.model import SelfCalibration
-from gyro_calibration.noise import Noise
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.gyro_model import SelfCalibration
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import chdtr, chdtrc
 

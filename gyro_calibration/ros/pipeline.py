@@ -27,14 +27,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
-from gyro_calibration.assumptions import Assumptions
-from gyro_calibration.bias_table import Prior
 from gyro_calibration.driver.timestamps import HostClock, read_together
-from gyro_calibration.heading import Threshold
-from gyro_calibration.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
-from gyro_calibration.log import DEGREE
-from gyro_calibration.messages import NSEC_PER_SEC
-from gyro_calibration.noise import Noise
+from gyro_calibration.heading.assumptions import Assumptions
+from gyro_calibration.heading.bias_table import Prior
+from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
+from gyro_calibration.heading.integration import Threshold
+from gyro_calibration.heading.tracker import Settings
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
+from gyro_calibration.logs.log import DEGREE
+from gyro_calibration.model.noise import Noise
 from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
 from gyro_calibration.ros.clock import Clock, RosTime
@@ -42,7 +43,6 @@ from gyro_calibration.ros.health_monitor import HealthMonitor
 from gyro_calibration.ros.parameters import Parameter
 from gyro_calibration.ros.state_store import StateStore
 from gyro_calibration.ros.wheels import COMMAND, ODOMETRY, Velocity, Wheels
-from gyro_calibration.tracking import Settings
 
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),

@@ -28,10 +28,10 @@ import time
 from typing import Any
 
 from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.log import LogError
-from gyro_calibration.messages import NSEC_PER_SEC
+from gyro_calibration.logs.cdr import NSEC_PER_SEC
+from gyro_calibration.logs.log import LogError
+from gyro_calibration.logs.ros_bag import Message
 from gyro_calibration.ros.runner import call_every
-from gyro_calibration.storage import Message
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node

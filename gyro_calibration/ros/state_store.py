@@ -15,10 +15,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gyro_calibration.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
 from gyro_calibration.files import plain, reason, remedy, remove_leftovers, version
-from gyro_calibration.model import GyroModel, same_effects, SelfCalibration, with_self_calibration
-from gyro_calibration.model_file import ModelError, ModelMissing, read_model, write_model
+from gyro_calibration.heading.bias_table import BiasTable, Prior, read_bias_table, write_bias_table
+from gyro_calibration.model.gyro_model import (
+    GyroModel,
+    same_effects,
+    SelfCalibration,
+    with_self_calibration,
+)
+from gyro_calibration.model.model_file import ModelError, ModelMissing, read_model, write_model
 
 
 class StateStore:

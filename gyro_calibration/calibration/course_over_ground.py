@@ -1,0 +1,310 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Calibrate against a course over ground: the direction of travel by satellites.
+
+A course is no heading. It is off by the side slip, smoothed, late or early against the gyro, lost
+below some speed, and for seconds at a time much worse than usual. The gyro's own noise is small
+beside that, so the course is regressed on the gyro, over spans of some seconds::
+
+    Δcourse = p Δ(integral of the output) - q Δt + d Δrate + c Δacceleration + noise
+    s = 1 / p - 1,  b = q / p
+
+``d`` is what is left of the delay and what side slip adds in proportion to the rate; ``c`` is
+what smoothing does. The noise sizes are those of `noise_grid`; each point of the course has a
+variance of its own, by how far the course is off around it.
+
+What a drive leaves open is decided by a prior: scale factor error and bias are small numbers, of a
+size that is not known (`PriorSize`) but at most what the technology of the gyro allows.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.calibration.likelihood import encoder_step, Fit, robust_residual
+from gyro_calibration.calibration.noise_grid import (
+    GridFit,
+    heading_noise,
+    noise_grid,
+    PriorSize,
+    wander,
+)
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.motion import Motion
+import numpy as np
+
+#: Largest standard deviations of scale factor error and bias, rad/s, by technology.
+PRIORS = {
+    'mems': (0.02, 1.0 * DEGREE),
+    'open_loop_fog': (0.005, 0.02 * DEGREE),
+    'closed_loop_fog': (0.001, 0.002 * DEGREE),
+}
+#: Length of a span, s; smoothing over a second then leaves the scale to a percent of its error.
+SPAN = 2.0
+#: How late or early the stamps of a gyro may be against satellites, s.
+LARGEST_TIME_OFFSET = 1.5
+#: A reference that is lost for this part of the time, or noisier than this from span to span, rad,
+#: is taken for a course; one in steps of more than this, rad, for an encoder.
+LOST, NOISY, ROUNDED = 0.003, 0.25 * DEGREE, 2e-4
+#: Fewer spans do not show the noise of a course.
+FEWEST_SPANS = 10
+#: Standard deviations of what is left of the delay, s, and of what smoothing does, s².
+DELAY, SMOOTHING = 0.2, 0.1
+#: A course that is bad is so for about this long, s; stretches of this length count as one.
+BURST, STRETCH = 5.0, 15.0
+#: The gyro's noises that are possible, rad/√s and rad/s/√s, and cosines for its wander.
+WHITE, WALK, COSINES = (1e-5, 1e-2), (1e-7, 1e-4), 8
+#: A gyro that follows leaves less of the course than this, rad, whatever the side slip.
+FOLLOWED = 3.0 * DEGREE
+
+
+@dataclass(frozen=True)
+class _Spans:
+    """
+    Means over spans in which the course is known.
+
+    Attributes
+    ----------
+    time : s, shape (n,)
+    course : rad, shape (n,)
+    turned : integral of the output, rad, shape (n,)
+    rate, acceleration : of the gyro, rad/s and rad/s², shape (n,)
+
+    """
+
+    time: Array
+    course: Array
+    turned: Array
+    rate: Array
+    acceleration: Array
+
+
+class _Drive:
+    """Gyro and course, brought together at any time offset."""
+
+    def __init__(self, time: Array, rate: Array, motion: Motion):
+        """Average the course over spans that are at least half known."""
+        self._time, self._integral = time, integrate(time, rate)
+        number = np.floor(motion.time / SPAN).astype(np.intp)
+        count = np.bincount(number)
+        usual = float(np.median(count[count > 0]))
+        self._kept = (count >= 0.5 * usual)[number]
+        number = np.unique(number[self._kept], return_inverse=True)[1]
+        self._begins = np.flatnonzero(np.diff(number, prepend=-1))
+        self._size = np.diff(np.append(self._begins, len(number)))
+        self._at = motion.time[self._kept]
+        self.course = self._mean(motion.heading[self._kept])
+        self.time = self._mean(self._at)
+
+    def _mean(self, values: Array) -> Array:
+        return np.add.reduceat(values, self._begins) / self._size
+
+    def turned(self, offset: float) -> Array:
+        """Return the mean integral of the output in each span, rad, the gyro being late, s."""
+        return self._mean(np.interp(self._at + offset, self._time, self._integral))
+
+    def spans(self, offset: float) -> _Spans:
+        """Return the spans for a time offset that the samples cover."""
+        base = 0.5
+        inside = (self.time + offset - base - 0.5 * SPAN >= self._time[0]) & (
+            self.time + offset + base + 0.5 * SPAN <= self._time[-1]
+        )
+        middle, later, earlier = (
+            self.turned(offset + shift)[inside] for shift in (0, base, -base)
+        )
+        return _Spans(
+            self.time[inside],
+            self.course[inside],
+            middle,
+            (later - earlier) / (2.0 * base),
+            (later - 2.0 * middle + earlier) / base**2,
+        )
+
+    def coarse_offset(self, largest: float) -> float:
+        """Return the offset at which course less integral is straight for most of the time."""
+        offsets = np.arange(-round(largest / 0.05), round(largest / 0.05) + 1) * 0.05
+        line = np.column_stack([np.ones(len(self.time)), self.time])
+        misfits = [
+            float(np.mean(np.abs(robust_residual(line, self.course - self.turned(offset), 3))))
+            for offset in offsets
+        ]
+        return float(offsets[int(np.argmin(misfits))])
+
+
+def fit_course(
+    time: Array,
+    rate: Array,
+    motion: Motion,
+    technology: str = 'mems',
+    largest_time_offset: float = LARGEST_TIME_OFFSET,
+) -> Fit:
+    """
+    Fit scale factor error, bias and time offset to a drive.
+
+    Parameters
+    ----------
+    time : s since the course began, shape (n,)
+    rate : output of the gyro, rad/s, shape (n,)
+    motion : the courses that are known
+    technology : of the gyro, one of `PRIORS`
+    largest_time_offset : how late or early the gyro's stamps may be, s
+
+    Raises
+    ------
+    DataRefused : the course is known for too short a time, or the gyro does not follow it
+
+    """
+    drive = _Drive(time, rate, motion)
+    offset = drive.coarse_offset(largest_time_offset)
+    spans = drive.spans(offset)
+    if len(spans.time) < FEWEST_SPANS:
+        raise DataRefused(
+            f'the course is known for {len(spans.time) * SPAN:.0f} s, wanted at least '
+            f'{FEWEST_SPANS * SPAN:.0f} s: drive for longer, faster than a walk'
+        )
+    _refuse_other_motion(spans)
+    points: Array = np.ones(len(spans.time))
+    for _ in range(2):
+        points = _burst_variance(spans, _point_errors(spans, points))
+    found = _regression(spans, points, technology)
+    scale, drift, late = found.values[:3]
+    jacobian = np.array([[-1.0 / scale**2, 0.0], [-drift / scale**2, 1.0 / scale]])
+    covariance = jacobian @ _covariance(found, spans) @ jacobian.T
+    influence = found.influence[:, :2] @ jacobian.T
+    return Fit(
+        float(1.0 / scale - 1.0),
+        float(drift / scale),
+        covariance,
+        offset - float(late),
+        found.size('angle_random_walk'),
+        found.size('reference'),
+        time_offset_deviation=float(found.deviations[2]),
+        influence=np.column_stack([influence, spans.time[1:]]),
+    )
+
+
+def is_course(time: Array, rate: Array, motion: Motion) -> bool:
+    """
+    Tell whether a reference is a course over ground: lost now and then, or noisy, and no encoder.
+
+    It is lost below some speed, where there is no direction of travel. An encoder shows by its
+    step; smaller ones are what a file is rounded to.
+
+    Parameters
+    ----------
+    time, rate : of the gyro, s since the reference began and rad/s, shape (n,)
+    motion : by the reference
+
+    """
+    if encoder_step(motion.heading) > ROUNDED:
+        return False
+    interval = np.diff(np.concatenate([[time[0]], motion.time, [time[-1]]]))
+    lost = float(np.sum(interval[interval > 5.0 * np.median(interval)]))
+    if lost > LOST * float(time[-1] - time[0]):
+        return True
+    drive = _Drive(time, rate, motion)
+    spans = drive.spans(drive.coarse_offset(LARGEST_TIME_OFFSET))
+    if len(spans.time) < FEWEST_SPANS:
+        return False
+    residual = robust_residual(_columns(spans), np.diff(spans.course), 10)
+    return float(np.median(np.abs(residual))) > 0.6745 * math.sqrt(2.0) * NOISY
+
+
+def _columns(spans: _Spans) -> Array:
+    """Return what p, q, d and c add to the increments of the course, shape (n - 1, 4)."""
+    return np.diff(
+        np.column_stack([spans.turned, -spans.time, spans.rate, spans.acceleration]), axis=0
+    )
+
+
+def _regression(spans: _Spans, points: Array, technology: str) -> GridFit:
+    largest_scale, largest_bias = PRIORS[technology]
+    columns, increments = _columns(spans), np.diff(spans.course)
+    cosines, wanders = wander(spans.time, None, WALK, COSINES)
+    noise = heading_noise(spans.time, spans.rate, points, angle_random_walk=WHITE)
+    return noise_grid(
+        increments,
+        columns,
+        noise,
+        cosines,
+        wanders,
+        np.array([1.0, 0.0, 0.0, 0.0]),
+        np.array([largest_scale, largest_bias, DELAY, SMOOTHING]),
+        wandering=1,
+        prior_sizes=(
+            PriorSize('scale_factor_error', 0, (1e-2 * largest_scale, largest_scale)),
+            PriorSize('bias', 1, (1e-3 * largest_bias, largest_bias)),
+        ),
+    )
+
+
+def _point_errors(spans: _Spans, points: Array) -> Array:
+    """Return how far each point of the course is off a fit in which large errors count less."""
+    columns = np.column_stack([spans.time, spans.rate, np.ones(len(spans.time))])
+    weights = 1.0 / np.sqrt(points)[:, None]
+    error = spans.course - spans.turned
+    scale = np.abs(columns).max(axis=0) + 1e-12
+    values = np.linalg.lstsq(columns / scale * weights, error * weights[:, 0], rcond=1e-10)[0]
+    return error - columns / scale @ values
+
+
+def _burst_variance(spans: _Spans, error: Array) -> Array:
+    """Return the variance of each point relative to the usual one, by the errors around it."""
+    around = np.abs(spans.time[:, None] - spans.time) <= 0.5 * BURST
+    square = around @ error**2 / around.sum(axis=1)
+    return np.maximum(square / max(float(np.median(square)), 1e-12), 1.0)
+
+
+def _refuse_other_motion(spans: _Spans) -> None:
+    """Refuse a gyro that leaves as much of the course's turns as it takes away."""
+    left, there = (
+        _curved(spans.time, each) for each in (spans.course - spans.turned, spans.course)
+    )
+    if left > max(FOLLOWED, 0.5 * there):
+        raise DataRefused(
+            f'within {STRETCH:.0f} s the course varies by {there / DEGREE:.1f} deg, and less the '
+            f'gyro by {left / DEGREE:.1f} deg (medians): the gyro does not follow. See whether '
+            'they belong to one drive, whether axis, sign and units are right, and whether the '
+            'gyro is alive'
+        )
+
+
+def _curved(time: Array, heading: Array) -> float:
+    """Return how far a heading is off a line within stretches, rad, as a median."""
+    number = np.floor((time - time[0]) / STRETCH).astype(np.intp)
+    off = [np.empty(0)]
+    for each in np.unique(number):
+        inside = number == each
+        if inside.sum() > 3:
+            line = np.polyfit(time[inside], heading[inside], 1)
+            off.append(np.abs(heading[inside] - np.polyval(line, time[inside])))
+    joined = np.concatenate(off)
+    return float(np.median(joined)) if len(joined) else 0.0
+
+
+def _stretch_sums(values: Array, spans: _Spans) -> Array:
+    """Return the sums of values of the spans over stretches of the drive."""
+    number = np.floor((spans.time[1:] - spans.time[0]) / STRETCH).astype(np.intp)
+    return np.array([np.bincount(number, column) for column in np.atleast_2d(values.T)]).squeeze()
+
+
+def _covariance(found: GridFit, spans: _Spans) -> Array:
+    """Return the covariance of (p, q): by the noise, or by the scatter of stretches if larger."""
+    covariance = found.covariance[:2, :2]
+    sums = _stretch_sums(found.influence[:, :2], spans)
+    stretches = max(sums.shape[1], 2)
+    scatter = np.diag(sums @ sums.T) * stretches / (stretches - 1.0)
+    larger = np.sqrt(np.maximum(scatter / np.diag(covariance), 1.0))
+    return covariance * np.outer(larger, larger)

@@ -1,0 +1,97 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Settling: cut the response of the gyro to ramps off the ends of dwells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gyro_calibration.calibration.dwells.samples import duration, Numbers, Samples
+from gyro_calibration.calibration.dwells.steadiness import Steadiness
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+#: Dwells that are further apart than this have no common ramp, s.
+_APART = 5.0
+
+
+def settled(samples: Samples, dwells: Sequence[Numbers],
+            limits: Steadiness) -> tuple[list[Numbers], str]:
+    """Cut the margin or the longer response to a ramp off both ends of dwells; return a remark."""
+    time, error = samples.time, samples.error
+    change = np.diff([np.median(samples.output[rows]) for rows in dwells])
+    apart = np.array([time[later[0]] - time[rows[-1]] for rows, later in zip(dwells, dwells[1:])])
+    change = np.where(apart < _APART, change, 0.0)
+    mirrored = [(len(time) - 1 - rows)[::-1] for rows in dwells[:-1]]
+    after = max(limits.margin, _settling(time, error, dwells[1:], change, limits.settling))
+    before = max(limits.margin,
+                 _settling(-time[::-1], error[::-1], mirrored, -change, limits.settling))
+    kept = [rows[(time[rows] >= time[rows[0]] + after) & (time[rows] <= time[rows[-1]] - before)]
+            for rows in dwells]
+    return kept, f'{after:.2f} s after each ramp and {before:.2f} s before the next are cut away'
+
+
+def _settling(time: Array, error: Array, dwells: Sequence[Numbers], change: Array,
+              longest: float) -> float:
+    """Return for how long after a ramp the output has not settled, s."""
+    durations = np.array([duration(time, rows) for rows in dwells])
+    if not len(durations):
+        return 0.0
+    interval = max(0.05, float(np.median(np.diff(time))))
+    bins = int(min(np.quantile(durations, 0.25), 3.0 * longest) / interval)
+    edges = np.arange(bins + 1) * interval
+    used = durations >= edges[-1]
+    if not change[used].any():
+        return 0.0
+    means = np.array([_binned(time[rows] - time[rows[0]], error[rows], edges)
+                      for rows, wanted in zip(dwells, used) if wanted])
+    answer = _answer(means, change[used])
+    # single bins, and means of four
+    return max(_last_seen(answer, width) for width in (1, 4)) * interval
+
+
+def _binned(time: Array, values: Array, edges: Array) -> Array:
+    """Return the mean of the values in each bin, with gaps bridged by lines."""
+    return np.diff(np.interp(edges, time, integrate(time, values))) / np.diff(edges)
+
+
+def _answer(means: Array, change: Array) -> Array:
+    """
+    Return the response to a unit of change in each bin, from means of shape (dwells, bins).
+
+    A linear response (a filter, a delay) is in proportion to the change of rate, so all dwells
+    together show a response that is below the noise of each.
+
+    """
+    late = means[:, means.shape[1] // 2:].mean(axis=1, keepdims=True)
+    return change @ (means - late) / (change @ change)
+
+
+def _last_seen(answer: Array, width: int) -> int:
+    """
+    Return the number of bins until the response stays within four standard deviations of noise.
+
+    It is averaged over `width` bins and looked for in the first third. The noise is the scatter of
+    the response in the last half.
+
+    """
+    if len(answer) < 8 * width:
+        return 0
+    smooth = uniform_filter1d(answer, width, mode='nearest')
+    # A response of 20 ppm of the change is not worth a cut, even without noise.
+    spread = max(float(smooth[len(smooth) // 2:].std()), 2e-5)
+    last = -1
+    for place in np.flatnonzero(np.abs(smooth[:len(smooth) // 3]) > 4.0 * spread):
+        # After ten quiet bins it is over; what comes later is chance.
+        last = int(place) if place - last <= 10 else last
+    return last + 1 + width // 2 if last >= 0 else 0

@@ -1,0 +1,87 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Steadiness: what a stretch of a log must keep to be a dwell, and where a rate keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.calibration.dwells.samples import count, runs
+from gyro_calibration.logs.log import Array, DEGREE
+import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
+
+
+@dataclass(frozen=True)
+class Steadiness:
+    """
+    What a stretch of a log must keep to be a dwell.
+
+    Attributes
+    ----------
+    duration : least duration after all cuts, s
+    margin : least cut at both ends, s; a time offset between gyro and reference stays out of the
+        means
+    rate : largest deviation of the reference, smoothed over the margin, from its middle, rad/s;
+        less where it is quieter
+    relative : part of the rate that is added to that, 1
+    heading : largest deviation of a reference heading from a straight line, besides its steps,
+        rad; less where it is straighter
+    gap : in longer gaps the reference is taken as unknown, s
+    settling : longest settling time of a gyro, s
+    temperature : a dwell that warms by more than this is divided, K
+    wild : a sample this many robust standard deviations from its neighbours, and from the middle
+        of the dwell, is left out
+    share : least share of the log in dwells, 1; a log that swings looks steady now and then
+
+    """
+
+    duration: float = 1.5
+    margin: float = 0.25
+    rate: float = 0.5 * DEGREE
+    relative: float = 0.005
+    heading: float = 0.5 * DEGREE
+    gap: float = 1.0
+    settling: float = 3.0
+    temperature: float = 1.0
+    wild: float = 6.0
+    share: float = 0.05
+
+
+def steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
+    """Return the stretches whose reference rate is steady."""
+    width = max(3, count(time, limits.margin))
+    # A single outlier of the reference must not break a dwell.
+    smooth = uniform_filter1d(median_filter(rate, 5, mode='nearest'), width, mode='nearest')
+    stray = (maximum_filter1d(smooth, width, mode='nearest')
+             - minimum_filter1d(smooth, width, mode='nearest'))
+    allowed = float(np.clip(5.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
+    calm = stray <= allowed + limits.relative * np.abs(smooth)
+    # The windows of both filters reach over the end of a ramp; half of that is given back, so that
+    # the margin stays.
+    calm = maximum_filter1d(calm, 2 * (width // 2) + 1)
+    calm[1:] &= np.diff(time) <= limits.gap
+    return [slice(run.start + part.start, run.start + part.stop) for run in runs(calm)
+            for part in _level(uniform_filter1d(smooth[run], 4 * width, mode='nearest'),
+                               allowed, limits.relative)]
+
+
+def _level(rate: Array, allowed: float, relative: float) -> Iterator[slice]:
+    """Divide a stretch where its rate drifts: parts of a slow ramp are too short for dwells."""
+    start, low, high = 0, math.inf, -math.inf
+    for place, value in enumerate(rate.tolist()):
+        low, high = min(low, value), max(high, value)
+        if high - low > 2.0 * (allowed + relative * abs(value)):
+            yield slice(start, place)
+            start, low, high = place, value, value
+    yield slice(start, len(rate))

@@ -1,0 +1,126 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Straightness: where a reference heading is a straight line in time, but for encoder steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import math
+
+from gyro_calibration.calibration.dwells.samples import code_step, duration, length, Numbers, slope
+from gyro_calibration.calibration.dwells.steadiness import Steadiness
+from gyro_calibration.logs.log import Array, DEGREE
+import numpy as np
+
+#: Duration of the blocks in which the heading is averaged, s.
+_BLOCK = 0.1
+
+
+def straight(time: Array, heading: Array, limits: Steadiness) -> list[slice]:
+    """Return the stretches whose reference heading is straight."""
+    step = code_step(heading)
+    edges, times, headings = _blocks(time, heading)
+    tolerance = step + _crookedness(headings, limits.heading)
+    cones = [cone for cone in _cones(times, headings, 2.0 * tolerance, limits.gap)
+             if duration(times, cone) >= 0.5 * limits.duration]
+    parts = _apart(_walked(times, headings, cone, tolerance, step) for cone in cones)
+    whole = [slice(int(edges[part.start]), int(edges[part.stop]))
+             for part in parts if length(part) > 4]
+    return [part for part in whole if _holds_its_slope(time[part], heading[part], step, limits)]
+
+
+def _blocks(time: Array, heading: Array) -> tuple[Numbers, Array, Array]:
+    """Return where blocks begin and the last one ends, and their mean times and headings."""
+    first = np.unique(np.floor((time - time[0]) / _BLOCK), return_index=True)[1]
+    edges = np.append(first, len(time))
+    times, headings = (np.add.reduceat(values, first) / np.diff(edges)
+                       for values in (time, heading))
+    return edges, times, headings
+
+
+def _crookedness(heading: Array, most: float) -> float:
+    """Return three times the median deviation from a straight line within 1 s, rad, clipped."""
+    # A vibration of the table cannot be seen over a whole number of its periods, so several
+    # lengths are used.
+    reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
+    strays = [np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
+              for reach in reaches]
+    stray = max((float(np.median(each)) for each in strays), default=math.inf)
+    return float(np.clip(3.0 * stray, 0.02 * DEGREE, most))
+
+
+def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[slice]:
+    """Divide a heading into the longest stretches that a line through their first point fits."""
+    start, low, high = 0, -math.inf, math.inf
+    times, headings = time.tolist(), heading.tolist()
+    for place in range(1, len(times)):
+        since = times[place] - times[start]
+        rise = headings[place] - headings[start]
+        low, high = max(low, (rise - tolerance) / since), min(high, (rise + tolerance) / since)
+        if low > high or times[place] - times[place - 1] > gap:
+            yield slice(start, place)
+            start, low, high = place, -math.inf, math.inf
+    yield slice(start, len(times))
+
+
+def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: float) -> slice:
+    """Fit a line to the middle of a stretch, extend it while it holds, and cut the ramps off."""
+    fifth = length(cone) // 5
+    middle = slice(cone.start + fifth, cone.stop - fifth)
+    # At most by its own length at both ends, so that the work is not quadratic in the log.
+    first, last = max(0, cone.start - length(cone)), min(len(time), cone.stop + length(cone))
+    line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
+        time[first:last] - time[middle].mean())
+    stray = np.abs(heading[first:last] - line)
+    beyond = np.flatnonzero(stray > tolerance)
+    before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
+    begin = (0 if not len(before) else
+             int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step))
+    end = (len(stray) if not len(after) else
+           int(after[0]) - _step_back(stray[after[0]:], tolerance, step))
+    return slice(first + begin, first + max(begin, end))
+
+
+def _step_back(stray: Array, tolerance: float, step: float) -> int:
+    """
+    Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
+
+    On a ramp the heading deviates with the square of time, so the ratio of two deviations gives
+    its beginning; a short ramp began later.
+
+    """
+    reach = round(0.5 / _BLOCK)
+    if len(stray) <= reach:
+        return 0
+    ratio = math.sqrt(max(1.0, stray[reach] / (tolerance + 0.5 * step)))
+    return math.ceil(min(3.0 / _BLOCK, reach / (ratio - 1.0) if ratio > 1.0 else math.inf))
+
+
+def _apart(parts: Iterable[slice]) -> list[slice]:
+    """Keep the longer of two stretches that overlap: its line is more accurate."""
+    kept: list[slice] = []
+    for part in parts:
+        if kept and part.start < kept[-1].stop and length(part) > length(kept[-1]):
+            kept.pop()
+        if not kept or part.start >= kept[-1].stop:
+            kept.append(part)
+    return kept
+
+
+def _holds_its_slope(time: Array, heading: Array, step: float, limits: Steadiness) -> bool:
+    """Return whether the quarters of a stretch have one slope, unlike those of a slow swing."""
+    quarters = [quarter for quarter in np.array_split(np.arange(len(time)), 4) if len(quarter) > 2]
+    if not quarters:
+        return True
+    slopes = np.array([slope(time[quarter], heading[quarter]) for quarter in quarters])
+    blur = 8.0 * step / (time[-1] - time[0])
+    return bool(np.ptp(slopes)
+                <= 2.0 * (limits.rate + limits.relative * np.abs(slopes).max()) + blur)

@@ -1,0 +1,169 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Stretches: which rows of a log in time are dwells.
+
+The reference is steady there. Ramps, the settling after them, outliers and repeated samples are
+left out.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+import math
+from typing import NamedTuple
+
+from gyro_calibration.calibration.dwells.cleaning import clean, left_out
+from gyro_calibration.calibration.dwells.samples import (
+    duration,
+    FEWEST,
+    missing,
+    Numbers,
+    Samples,
+    slope,
+    usable,
+)
+from gyro_calibration.calibration.dwells.settling import settled
+from gyro_calibration.calibration.dwells.steadiness import Steadiness, steady
+from gyro_calibration.calibration.dwells.straightness import straight
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
+import numpy as np
+
+#: Number of parts of a dwell between which its warming is taken.
+_PARTS = 12
+
+
+class Stretches(NamedTuple):
+    """The rows of each dwell, and what was left out."""
+
+    samples: Samples
+    rows: list[Numbers]
+    remarks: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """Return the time in dwells, s."""
+        return float(sum(duration(self.samples.time, rows) for rows in self.rows))
+
+    @property
+    def share(self) -> float:
+        """Return the part of the log that is in dwells."""
+        return self.duration / float(self.samples.time[-1] - self.samples.time[0])
+
+
+def find_stretches(log: Log, limits: Steadiness) -> Stretches:
+    """
+    Find the dwells by the reference rate, or by the reference heading where more of it is steady.
+
+    Raises
+    ------
+    DataRefused : output or reference are missing, or the reference is never steady for long enough
+
+    """
+    by_rate, by_heading = replace(log, reference_heading=None), replace(log, reference_rate=None)
+    if not _known(log.reference_rate):
+        found = _found(by_heading, limits)
+    elif not _known(log.reference_heading):
+        found = _found(by_rate, limits)
+    else:
+        # A rate that was made of a coarse encoder's steps is seldom steady; the heading behind it
+        # may be straight.
+        found, other = _found(by_rate, limits), _found(by_heading, limits)
+        found = found if found.duration > 0.9 * other.duration else other
+    if found.share < limits.share:
+        raise DataRefused(_not_steady(found, limits))
+    return found._replace(remarks=(*found.remarks, *_little(found.share)))
+
+
+def _known(reference: Array | None) -> bool:
+    return reference is not None and bool(np.isfinite(reference).any())
+
+
+def _not_steady(found: Stretches, limits: Steadiness) -> str:
+    line = ('' if found.samples.heading is None
+            else f' and straight to {limits.heading / DEGREE:g} deg')
+    return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{line}, for '
+            f'{limits.duration:g} s at a time beside the settling, in {100.0 * found.share:.0f} % '
+            'of the log; hold each rate for longer, or use the heading itself with '
+            '--method likelihood')
+
+
+def _little(share: float) -> Iterator[str]:
+    if share <= 0.25:
+        yield (f'only {100.0 * share:.0f} % of the time is in dwells; --method likelihood uses '
+               'all of it, where there is a heading')
+
+
+def _found(log: Log, limits: Steadiness) -> Stretches:
+    """Find the dwells in a log with one reference."""
+    samples, lost = usable(log)
+    parts = [part for part in _calm(samples, limits)
+             if duration(samples.time, part) > limits.duration]
+    samples = samples._replace(scale=_scale(samples, parts))
+    cleaned = [clean(samples, part, limits.wild) for part in parts]
+    whole, cut = settled(samples, [part.rows for part in cleaned], limits)
+    whole, divided = _divided(samples, whole, limits)
+    rows = [part for part in whole
+            if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
+    short = _short(len(whole) - len(rows), limits.duration)
+    return Stretches(samples, rows, (*lost, *short, cut, *divided,
+                                     *left_out(samples, rows, cleaned),
+                                     *missing(log, samples, rows)))
+
+
+def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
+    if samples.rate is not None:
+        return steady(samples.time, samples.rate, limits)
+    assert samples.heading is not None
+    return straight(samples.time, samples.heading, limits)
+
+
+def _scale(samples: Samples, parts: list[slice]) -> float:
+    """Return the rough ratio of output to reference; it may be negative or in other units."""
+    rate = np.array([_rate(samples, part) for part in parts])
+    output = np.array([np.median(samples.output[part]) for part in parts])
+    # Rests alone do not determine it.
+    return slope(rate, output) if len(rate) > 1 and np.ptp(rate) > 1.0 * DEGREE else 1.0
+
+
+def _rate(samples: Samples, part: slice) -> float:
+    if samples.rate is not None:
+        return float(samples.rate[part].mean())
+    assert samples.heading is not None
+    return slope(samples.time[part], samples.heading[part])
+
+
+def _divided(samples: Samples, dwells: list[Numbers],
+             limits: Steadiness) -> tuple[list[Numbers], list[str]]:
+    """Divide the dwells along which the temperature changes, so that its slope can be seen."""
+    if samples.temperature is None:
+        return dwells, []
+    pieces = [_pieces(samples.time[rows], samples.temperature[rows], limits) for rows in dwells]
+    parts = [part for rows, number in zip(dwells, pieces) for part in np.array_split(rows, number)]
+    more = len(parts) - len(dwells)
+    remark = (f'dwells that warmed or cooled by more than {limits.temperature:g} K are divided, '
+              f'which makes {more} more')
+    return parts, [remark] if more else []
+
+
+def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
+    if len(temperature) < 2 * _PARTS:
+        return 1
+    change = float(np.ptp([part.mean() for part in np.array_split(temperature, _PARTS)]))
+    return max(1, min(math.ceil(change / limits.temperature),
+                      int((time[-1] - time[0]) / limits.duration)))
+
+
+def _short(number: int, least: float) -> Iterator[str]:
+    if number:
+        yield f'steady stretches shorter than {least:g} s beside the settling, left out: {number}'

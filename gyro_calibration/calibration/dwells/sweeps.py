@@ -1,0 +1,67 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Sweeps: which dwells belong to one pass through the rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gyro_calibration.calibration.dwells.samples import Numbers
+from gyro_calibration.logs.log import Array, DEGREE
+import numpy as np
+
+#: If the median sweep has fewer dwells than this, the order is taken as chance.
+_SHORTEST = 4
+#: Blocks of consecutive dwells, where the order shows no sweeps.
+_BLOCKS = 9
+
+
+def numbered(names: Sequence[str]) -> Numbers:
+    """Give sweeps that have names their numbers, in the order in which they come."""
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return np.array([numbers[name] for name in names])
+
+
+def sweeps(rate: Array) -> Numbers:
+    """
+    Return the number of the sweep of each dwell, by the order of the rates, shape (n,).
+
+    Tables go through the rates in one direction, or through their sizes with changing sign, with
+    or without a rest between them. Where the order shows no sweeps, blocks of consecutive dwells
+    are taken for sweeps: they are as far apart in time.
+
+    """
+    turning = np.abs(rate) > max(1e-3 * np.abs(rate).max(), 0.01 * DEGREE)
+    for used in (np.full(len(rate), True), turning) if turning.any() else ():
+        for value in (rate, np.abs(rate)):
+            sweep = np.zeros(len(rate), dtype=int)
+            sweep[used] = _passes(value[used])
+            # A rest belongs to the dwell before it.
+            sweep = np.maximum.accumulate(np.where(used, sweep, 0))
+            lengths = np.bincount(sweep[used])
+            if len(lengths) > 1 and np.median(lengths) >= _SHORTEST:
+                return sweep
+    return np.arange(len(rate)) * min(_BLOCKS, len(rate)) // len(rate)
+
+
+def _passes(value: Array) -> Numbers:
+    """Give passes through values their numbers; one begins where the direction turns back."""
+    change = np.diff(value)
+    # Rates that were found differ slightly in size if their sign is opposite.
+    steps = np.where(np.abs(change) > 0.005 * np.abs(value).max(), np.sign(change), 0.0)
+    numbers = np.zeros(len(value), dtype=int)
+    direction = 0.0
+    for place, step in enumerate(steps, 1):
+        turned = step * direction < 0.0
+        numbers[place] = numbers[place - 1] + turned
+        # The jump back to the start of the next pass does not show its direction.
+        direction = 0.0 if turned else direction or step
+    return numbers

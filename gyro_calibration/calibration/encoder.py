@@ -1,0 +1,436 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Calibrate a gyro against an encoder: scale factor error, bias and the residual heading.
+
+The input is a log in time with a reference heading. There are two methods: the likelihood of the
+headings, and the regression of the encoder's rate on the gyro, sample by sample.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+
+from gyro_calibration.calibration.course_over_ground import fit_course, is_course, PRIORS
+from gyro_calibration.calibration.fit_quality import DRIVE
+from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
+from gyro_calibration.calibration.run_faults import refuse_dead
+from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.stamps import lost_samples
+from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.motion import from_headings, Motion
+from gyro_calibration.model.noise import ALLAN_FLOOR, Noise
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.fft import dct
+
+#: Of a log, s: three years, or stamps in another unit.
+LONGEST = 1e8
+
+
+@dataclass(frozen=True)
+class Residual:
+    """
+    Heading of the gyro less that of the reference, over a whole log.
+
+    Attributes
+    ----------
+    heading : rad, shape (n,); its mean is 0, as the gyro's first heading is not known
+
+    """
+
+    heading: Array
+
+    @property
+    def rms(self) -> float:
+        """Return the root of the mean square, rad."""
+        return math.sqrt(float(np.mean(self.heading ** 2)))
+
+    @property
+    def largest(self) -> float:
+        """Return the largest error either way, rad."""
+        return float(np.abs(self.heading).max())
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    How a heading drifts after the fit.
+
+    Attributes
+    ----------
+    time, rate : middles of the intervals between pieces of the log, s, and the drift of the
+        heading there, rad/s, shape (m,)
+    angle_random_walk : rad/√s, over times longer than a piece
+    mean : standard deviation of the mean bias over the log, rad/s
+    wander : standard deviation of the mean bias less the bias at the beginning, rad/s
+
+    """
+
+    time: Array
+    rate: Array
+    angle_random_walk: float
+    mean: float
+    wander: float
+
+
+@dataclass(frozen=True)
+class EncoderCalibration:
+    """
+    The calibration of a gyro by a log with a reference heading.
+
+    Attributes
+    ----------
+    model : scale factor error and bias with their covariance, valid ranges and temperature
+    method : one of `METHODS`
+    fit : the same with noise and time offset, as found
+    drift : of the bias after the fit; the wander is part of the bias's standard deviation
+    time : of the reference's samples, s, shape (n,)
+    before, after : the residual heading without calibration and with it
+    lost_samples : number missing between the stamps, where these are regular enough to tell
+    remarks : what to know, one sentence each
+
+    """
+
+    model: GyroModel
+    method: str
+    fit: Fit
+    drift: Drift
+    time: Array
+    before: Residual
+    after: Residual
+    lost_samples: int
+    remarks: tuple[str, ...]
+
+
+def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None = None,
+                      limits: Limits | None = None,
+                      technology: str = 'mems') -> EncoderCalibration:
+    """
+    Find scale factor error and bias from a log with a reference heading.
+
+    Parameters
+    ----------
+    log : with time, output and reference heading; samples without a number count as lost
+    method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
+        encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
+    noise : of the gyro, if it is known; goes into the model
+    limits : what is believed
+    technology : of the gyro, one of `course_over_ground.PRIORS`; with 'course' its prior decides
+        what a drive leaves open
+
+    Raises
+    ------
+    DataRefused : with the reason and the remedy
+
+    """
+    limits = limits or Limits(time_offset=LARGEST_TIME_OFFSET)
+    time, output, motion = _pair(log)
+    method = method or ('course' if is_course(time, output, motion) else 'likelihood')
+    if method == 'course':
+        return _on_course(log, time, output, motion, noise, technology)
+    _refuse_motion(motion, limits)
+    refuse_dead(output)
+    fit = METHODS[method](time, output, motion, limits)
+    refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
+    drift = _drift(motion.time, _after(time, output, motion, fit).heading, noise or Noise())
+    _refuse_useless(fit.bias, drift.mean, limits.heading)
+    fit = _drawn(replace(fit, covariance=_covariance(fit, drift)), drift.mean, technology)
+    _refuse_uncertain(fit, limits)
+    before, after = (_residual(time - np.nan_to_num(fit.time_offset), output, motion),
+                     _after(time, output, motion, fit))
+    model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
+    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time),
+                              _remarks(fit, method))
+
+
+def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Noise | None,
+               technology: str) -> EncoderCalibration:
+    """Calibrate against a course over ground."""
+    _refuse_length(motion)
+    refuse_dead(output)
+    fit = fit_course(time, output, motion, technology)
+    before, after = (_residual(time - fit.time_offset, output, motion),
+                     _after(time, output, motion, fit))
+    drift = _drift(motion.time, after.heading, noise or Noise())
+    model = _model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
+    remark = ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
+              f'as of a gyro of the technology {technology} (--technology); '
+              'the intervals hold that')
+    return EncoderCalibration(model, 'course', fit, drift, motion.time, before, after, _lost(time),
+                              (remark,))
+
+
+#: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
+LARGEST_TIME_OFFSET = 0.25
+#: Standard deviation of what is assumed of the gyro's lag, s²: that of a filter of 20 ms.
+LAG = 2e-4
+
+
+def _pair(log: Log) -> tuple[Array, Array, Motion]:
+    """Return time and output of the gyro, and the reference motion, without lost samples."""
+    if log.time is None or log.output is None or log.reference_heading is None:
+        raise DataRefused('the log holds no reference heading over time: '
+                          'it needs the columns time_s, gyro_dps and reference_heading_deg')
+    refuse_wrapped(log)
+    heard, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
+    for known, name in ((heard, 'gyro'), (seen, 'reference')):
+        if known.sum() < max(100, 0.1 * len(log)):
+            raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
+                              'at least a tenth and 100 are needed: '
+                              'mend its line and record again')
+    start = log.time[seen][0]
+    return (log.time[heard] - start, log.output[heard],
+            from_headings(log.time[seen], log.reference_heading[seen]))
+
+
+def _refuse_length(motion: Motion) -> None:
+    if motion.duration < 10.0:
+        raise DataRefused(f'the log lasts {motion.duration:.1f} s; at least 10 s are needed: '
+                          'record longer')
+    if motion.duration > LONGEST:
+        raise DataRefused(f'the log lasts {motion.duration:.3g} s by its stamps; '
+                          'see whether time_s is in s, or give --rate')
+
+
+def _refuse_motion(motion: Motion, limits: Limits) -> None:
+    _refuse_length(motion)
+    points = np.arange(0.0, motion.duration, 0.5)
+    spread = float(np.std(np.diff(motion.heading_at(points)) / 0.5))
+    if spread < limits.rate_spread:
+        mean = motion.heading[-1] / motion.duration
+        raise DataRefused(f'the reference turns at one speed, {mean / DEGREE:.1f} deg/s '
+                          f'(it varies by {spread / DEGREE:.2f} deg/s), so scale and bias cannot '
+                          'be parted: turn in both senses, or at another speed too, '
+                          'or with a rest')
+
+
+def _refuse_uncertain(fit: Fit, limits: Limits) -> None:
+    deviation = math.sqrt(fit.covariance[0, 0])
+    if deviation > limits.scale_standard_deviation:
+        raise DataRefused(f'the scale factor error is known to {100 * deviation:.1f} % only, '
+                          f'wanted {100 * limits.scale_standard_deviation:g} %: '
+                          'turn further, faster, or more often')
+
+
+def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
+    """
+    Refuse a log whose bias is within chance and could make a heading worse.
+
+    It is refused where its standard deviation, rad/s, in `DRIVE` s exceeds the limit, rad.
+
+    """
+    if deviation * DRIVE > limit and bias ** 2 < 2.0 * deviation ** 2:
+        raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
+                          f'{deviation / DEGREE:.3f} deg/s, which says nothing: without it '
+                          'a heading is as good. Turn more slowly, with rests, or for longer')
+
+
+def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -> Fit:
+    return fit_likelihood(time, output, motion, limits.time_offset, LAG)
+
+
+def _by_rate(time: Array, output: Array, motion: Motion, _: Limits) -> Fit:
+    """Fit by the rate of the encoder; the stamps are taken as exact."""
+    inside = (time >= 0.0) & (time <= motion.duration)
+    time, output = time[inside], output[inside]
+    fit = fit_rate(time, output, motion)
+    scale, offset = (1.0 / (1.0 + fit.scale_factor_error),
+                     -fit.bias / (1.0 + fit.scale_factor_error))
+    columns = np.column_stack([output, np.ones(len(output))])
+    scores = columns * (columns @ (scale, offset) - motion.rate_at(time))[:, None]
+    jacobian = np.array([[-1.0, 0.0], [offset, -scale]]) / scale ** 2
+    influence = -scores @ np.linalg.inv(columns.T @ columns) @ jacobian.T
+    return replace(fit, influence=np.column_stack([influence, time]), time_offset=math.nan)
+
+
+METHODS = {'likelihood': _by_likelihood, 'rate': _by_rate}
+
+
+def _pieces(time: Array) -> NDArray[np.intp]:
+    """Return the piece of the log of each time: 8 to 64 pieces, of 5 s or more if above 8."""
+    since = (time - time[0]) / (time[-1] - time[0])
+    count = int(np.clip((time[-1] - time[0]) / 5.0, 8, 64))
+    return np.minimum(since * count, count - 1).astype(np.intp)
+
+
+def _drift(time: Array, error: Array, noise: Noise) -> Drift:
+    """
+    Find how the bias wanders, by restricted likelihood of the mean drifts between pieces of a log.
+
+    What repeats itself with a motion within a piece does not show. The sizes of the noises are not
+    known, so all of a grid count, weighted by their likelihood.
+
+    """
+    piece = _pieces(time)
+    known = np.flatnonzero(np.bincount(piece))
+    if len(known) < 6:
+        raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of '
+                          'the log; at least 6 are needed: mend its line and record again')
+    middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known]
+                       for values in (time, error))
+    rate = np.diff(heading) / np.diff(middle)
+    duration = float(time[-1] - time[0])
+    walk, mean, wander = _likely_noise(rate, duration / len(rate))
+    figured = (2.0 / math.pi * noise.bias_instability ** 2
+               + noise.rate_random_walk ** 2 * duration / 3.0)
+    return Drift(0.5 * (middle[1:] + middle[:-1]), rate, math.sqrt(walk), math.sqrt(mean),
+                 math.sqrt(max(wander, figured)))
+
+
+def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
+    """
+    Return N², rad²/s, and the variances of the mean by noise and by wander, (rad/s)².
+
+    The input is the mean rates between pieces of some length, s. Their cosine transform has
+    independent values, each with a variance that is known but for one factor, given three ratios:
+    those of rate noise, of noise of the headings, and of flicker or rate random walk.
+
+    """
+    power = dct(rate, norm='ortho')[1:] ** 2
+    shapes, means, wanders, odds = _shapes(len(rate), length)
+    variances = np.mean(power / shapes, axis=1)
+    likelihoods = -0.5 * (len(power) * np.log(variances) + np.log(shapes).sum(axis=1))
+    weights = odds * np.exp(likelihoods - likelihoods.max())
+    variances = variances * weights / weights.sum()
+    student = len(power) / (len(power) - 2.0)
+    return (float(variances.sum() * length), float(student * variances @ means),
+            float(student * variances @ wanders))
+
+
+#: Odds of a random walk against flicker, where the drifts do not determine it: with 1, intervals
+#: are too narrow for a random walk.
+_ODDS = 3.0
+
+
+def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
+    """
+    Return possible variances of the transformed rates and of their mean, in units of N² / length.
+
+    The rates are those between `count` pieces, after the cosine transform. Flicker B² and rate
+    random walk K² are given by the averaging time at which the Allan deviation shows them above N.
+    They begin with the log: the mean over it has the variance 2 / pi B² or K² duration / 3.
+
+    Returns
+    -------
+    of the values but the first, shape (n, count - 1); of the mean by noise, and by wander, shape
+    (n,) each; and odds, shape (n,)
+
+    """
+    frequency, duration = math.pi * np.arange(1, count) / count, count * length
+    cosine, crossing = (np.cos(frequency),
+                        np.geomspace(0.01 * length, 1000.0 * duration, 30)[:, None])
+    flicker, walk = length / (ALLAN_FLOOR ** 2 * crossing), 3.0 * length / crossing ** 2
+    wander = np.vstack([flicker / frequency, walk * length / frequency ** 2])
+    wander_of_mean = np.vstack([2.0 / math.pi * flicker, walk * duration / 3.0])
+    ratio = np.geomspace(1e-3, 1e3, 13)[:, None, None]
+    shapes = (2.0 + cosine) / 3.0 + ratio * 2.0 * (1.0 - cosine) + wander
+    means = 1.0 / count + 2.0 * ratio / count ** 2 + 0.0 * wander_of_mean
+    odds = np.tile(np.repeat([1.0, _ODDS], len(crossing)), len(ratio))
+    return (shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(),
+            odds)
+
+
+def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
+    """
+    Return the fit with a bias that is drawn towards zero as far as the log leaves it open.
+
+    The prior is normal about zero; its standard deviation is not known, of any size up to that of
+    the technology. A bias of many standard deviations stays; one that the log hardly shows would
+    only harm a heading. The wander of the bias is not an uncertainty of its mean: it does not draw
+    the bias, and stays in the covariance.
+
+    Parameters
+    ----------
+    fit : with its covariance
+    deviation : of the mean bias over the log, rad/s
+    technology : of the gyro, one of `PRIORS`
+
+    """
+    variance, largest = deviation ** 2, max(PRIORS[technology][1], 3.0 * abs(fit.bias))
+    sizes = (np.geomspace(0.01, 1.0, 40) * largest) ** 2
+    logarithms = 0.5 * np.log(sizes) - 0.5 * (np.log(sizes + variance)
+                                              + fit.bias ** 2 / (sizes + variance))
+    weights = np.exp(logarithms - logarithms.max())
+    weights /= weights.sum()
+    kept = sizes / (sizes + variance)
+    share = float(weights @ kept)
+    left = share * variance + fit.bias ** 2 * float(weights @ (kept - share) ** 2)
+    gain = fit.covariance[:, 1] / fit.covariance[1, 1]
+    s, b = (fit.scale_factor_error, fit.bias) + gain * (share - 1.0) * fit.bias
+    return replace(fit, scale_factor_error=float(s), bias=float(b),
+                   covariance=fit.covariance + (left - variance) * np.outer(gain, gain))
+
+
+def _covariance(fit: Fit, drift: Drift) -> Array:
+    """
+    Return the covariance of (s, b) by the scatter between pieces, with the drift's bias variance.
+
+    What repeats itself with the motion is not noise of the fit, and what is slower than a piece
+    shows in part only.
+
+    """
+    piece = _pieces(fit.influence[:, 2])
+    sums = np.array([np.bincount(piece, values) for values in fit.influence[:, :2].T])
+    student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1)
+               / stats.norm.ppf(0.975)) ** 2
+    scatter = student * sums @ sums.T
+    deviations = np.sqrt(np.diag(scatter))
+    known = np.array([deviations[0], math.hypot(drift.mean, drift.wander)])
+    return scatter * np.outer(known / deviations, known / deviations)
+
+
+def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> GyroModel:
+    model = GyroModel((Term(BIAS, (fit.bias,)),
+                       Term(SCALE_FACTOR_ERROR, (fit.scale_factor_error,))),
+                      fit.covariance[::-1, ::-1], (float(output.min()), float(output.max())),
+                      noise=noise)
+    if temperature is None:
+        return model
+    return replace(model, temperature_range=(float(temperature.min()), float(temperature.max())),
+                   reference_temperature=float(temperature.mean()))
+
+
+def _after(time: Array, output: Array, motion: Motion, fit: Fit) -> Residual:
+    """Return the residual of the output corrected by a fit."""
+    return _residual(time - np.nan_to_num(fit.time_offset),
+                     (output - fit.bias) / (1.0 + fit.scale_factor_error), motion)
+
+
+def _residual(time: Array, rate: Array, motion: Motion) -> Residual:
+    error = np.interp(motion.time, time, integrate(time, rate)) - motion.heading
+    return Residual(error - error.mean())
+
+
+def _lost(time: Array) -> int:
+    """Return the number of samples missing between the stamps; 0 where these are irregular."""
+    lost = lost_samples(time)
+    return 0 if lost is None else int(lost.sum())
+
+
+def _remarks(fit: Fit, method: str) -> tuple[str, ...]:
+    s = fit.scale_factor_error
+    wrong = -s / (1.0 + s)
+    scale = (f'a reference that shows {abs(100 * wrong):.2f} % too '
+             f'{"much" if wrong > 0.0 else "little"}, {360.0 * (1.0 + wrong):.2f} for 360 deg, '
+             f'would look just like this scale factor error of {100 * s:+.2f} %: '
+             'check it over whole turns closed on a mark')
+    if method == 'likelihood':
+        return (scale,)
+    return scale, ('the regression of rates knows no time offset, and takes noise of the gyro for '
+                   'scale: its scale factor error is too large by more than is stated; '
+                   'compare it with the method likelihood')

@@ -1,0 +1,649 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The likelihood of a gyro's output, given its heading: scale factor error, bias, delay and lag.
+
+Everything is computed on increments between blocks of up to half a second: rates integrated by the
+trapezoid rule against the reference.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.model.motion import Motion
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """
+    Whether what a fit leaves is what the known noise explains.
+
+    Attributes
+    ----------
+    chi_square : sum of squares of the residual over the variance that is known
+    freedom : degrees of freedom
+    probability : of as much, or more, by chance
+    noise_ratio : noise that adds up in the heading, over what is known of it; noise that repeats
+        or averages out is not included
+
+    """
+
+    chi_square: float
+    freedom: int
+    probability: float
+    noise_ratio: float
+
+    def __str__(self) -> str:
+        """Return a sentence for people."""
+        told = ('what the noise explains' if self.probability > UNLIKELY else
+                'more than the noise explains: the robot follows the profile less well than the '
+                'gyro measures, or shakes')
+        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with {self.freedom} '
+                f'degrees of freedom, probability {self.probability:.2g}; '
+                f'noise {self.noise_ratio:.2f} times what is known)')
+
+
+#: Below this probability the message says that the residual is more than the noise explains.
+UNLIKELY = 1e-3
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    The result of a fit.
+
+    Attributes
+    ----------
+    scale_factor_error, bias : s, 1, and b, rad/s
+    covariance : of (s, b), shape (2, 2); nan where the method gives none
+    time_offset : how late the gyro is against the profile, s
+    angle_random_walk, reference_noise : as the run shows them, rad/√s and rad in one reading
+    residual : how far the unlikeliest stretch turned otherwise than the profile, rad, and how
+        unlikely that is, in standard deviations
+    time_offset_deviation : standard deviation of the time offset, s
+    influence : the effect of the noise of each block on (s, b), shape (n, 2), and the times of the
+        blocks, s, shape (n,), as one array (n, 3)
+    stretch : that stretch, from and to, s
+    start_heading, start_heading_deviation : true heading where gyro and reference begin, from the
+        reference's first heading, and its standard deviation, rad; nan against a profile, which
+        defines its own start
+    squares, freedom : sum of squares of the residual, in units of white noise of 1 rad/√s, and its
+        degrees of freedom
+    goodness : whether that is what the noise explains; None where the noise is not known
+    repeating : error of the heading that repeats with the motion, rad, where it spoiled the bias
+        of the blocks
+
+    """
+
+    scale_factor_error: float
+    bias: float
+    covariance: Array
+    time_offset: float = 0.0
+    angle_random_walk: float = math.nan
+    reference_noise: float = math.nan
+    residual: tuple[float, float] = (0.0, 0.0)
+    time_offset_deviation: float = math.nan
+    influence: Array = field(default_factory=lambda: np.empty((0, 3)))
+    stretch: tuple[float, float] = (0.0, 0.0)
+    start_heading: float = math.nan
+    start_heading_deviation: float = math.nan
+    squares: float = math.nan
+    freedom: int = 0
+    goodness: Goodness | None = None
+    repeating: float = 0.0
+
+
+#: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a
+#: robot's life.
+CHANCE = 7.0
+
+
+@dataclass(frozen=True)
+class _Points:
+    """
+    Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
+
+    The variances are known up to one factor. An error that several points share has a column of
+    ones and zeros, shape (n, k), and a standard deviation, rad.
+
+    """
+
+    time: Array
+    heading: Array
+    variance: Array
+    shared: Array
+    shared_deviation: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Increments:
+    """
+    How far the gyro and the reference turned between blocks, each a mean over some points.
+
+    Attributes
+    ----------
+    columns : reference increments, rad; intervals, s; the change by a time offset, rad/s; by a
+        lag, rad/s²; by errors that several points share, rad; shape (n, 4 + k)
+    prior, expected : prior standard deviations and means of the values, shape (4 + k,)
+    turned : increments of the gyro's integral, rad, shape (n,)
+    walk, neighbours : variance of the increments of a random walk, and covariance of each with the
+        one before, s, shape (n,)
+    reference : variance of the reference in each block, up to one factor, shape (n + 1,)
+    time : of the blocks, s, shape (n + 1,)
+    since : from the first point to the first block: its heading, the time, the shared errors in
+        that block, then the turn of the gyro
+
+    """
+
+    columns: Array
+    prior: Array
+    expected: Array
+    turned: Array
+    walk: Array
+    neighbours: Array
+    reference: Array
+    time: Array
+    since: Array
+
+
+#: Longest block, s. Errors within it (vibration, backlash, an eccentric encoder) are no random
+#: walk and must not be taken for one.
+BLOCK = 0.5
+#: Prior standard deviations: of the error of the delay that is being found, s, and of the lag, s².
+DELAY_DEVIATION, LAG_DEVIATION = 0.1, 0.1
+
+
+#: Two offsets fit alike if one leaves at most so many times what the other does.
+_ALIKE = 1.5
+
+
+#: Rate and acceleration are taken over this time, s, or an interval if longer, to either side:
+#: over less they are those of the noise alone.
+_SMOOTH = 0.01
+
+
+class _Pairing:
+    """A run and a motion, aligned at any time offset and lag."""
+
+    def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
+        self._time, self._rate = time, rate
+        self._prior = np.array([math.inf, math.inf, DELAY_DEVIATION, lag])
+        self._integral = integrate(time, rate)
+        self._base = max(float(np.median(np.diff(time))), _SMOOTH)
+        self.sampled = motion.rate is None
+        self._block = block_length(motion)
+        self._points = _points(motion, self._block)
+
+    def increments(self, offset: float, lag: float = 0.0) -> _Increments:
+        """
+        Return the increments if the gyro is `offset` s late, part of it by a first-order lag.
+
+        The time constant of the lag has the square 2 `lag`. The output of such a lag plus its rate
+        times the constant is the input, but for a delay.
+
+        """
+        points, constant = self._points, math.sqrt(2.0 * lag)
+        at = points.time + offset - constant
+        kept = (at >= self._time[0]) & (at <= self._time[-1])
+        time, weight = points.time[kept], 1.0 / points.variance[kept]
+        if len(time) < 2:
+            return _Increments(np.empty((0, 4)), *np.empty((8, 0)))
+        begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block + 1e-6),
+                                        prepend=-1.0))
+        precision = np.add.reduceat(weight, begins)
+        weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
+        known = np.column_stack([points.heading[kept], time, *self._heard(at[kept], constant),
+                                 points.shared[kept]])
+        means = np.add.reduceat(weight[:, None] * known, begins)
+        columns = np.diff(np.delete(means, 4, axis=1), axis=0)
+        prior = np.append(self._prior, np.full(points.shared.shape[1], points.shared_deviation))
+        expected = np.zeros(len(prior))
+        expected[3] = -lag
+        walk = _random_walk(time, weight, begins)
+        since = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
+                                [means[0, 4] - known[0, 4]]])
+        return _Increments(columns, prior, expected, np.diff(means[:, 4]), *walk, 1.0 / precision,
+                           means[:, 1], since)
+
+    def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
+        """
+        Return rate, acceleration and integral of the rate, linear between the samples.
+
+        The lag is taken off the rate and the integral.
+
+        """
+        base = self._base
+        integral, later, earlier = (self._turned(at + shift) for shift in (0.0, base, -base))
+        rate, acceleration = (0.5 * (later - earlier) / base,
+                              (later - 2.0 * integral + earlier) / base ** 2)
+        return rate + constant * acceleration, acceleration, integral + constant * rate
+
+    def _turned(self, at: Array) -> Array:
+        inside = np.clip(at, self._time[0], self._time[-1])
+        index = np.searchsorted(self._time, inside, side='right') - 1
+        rate = np.interp(inside, self._time, self._rate)
+        within = (self._integral[index]
+                  + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
+        return within + (at - inside) * rate
+
+    def coarse_offset(self, largest: float) -> float:
+        """
+        Return the offset, s, at which most increments fit.
+
+        A slip counts only by the blocks that it is in. A motion that repeats itself fits about
+        alike at several offsets: the smallest of these is returned.
+
+        """
+        # a profile is smoother than what was measured
+        step = 0.02 if self.sampled else 0.04
+        offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
+        misfits = np.array([self._misfit(offset) for offset in offsets])
+        beside = np.pad(misfits, 1, constant_values=math.inf)
+        bottoms = offsets[(misfits <= np.minimum(beside[:-2], beside[2:]))
+                          & (misfits <= 6.0 * misfits.min())]
+        if len(bottoms) < 2 or math.isinf(misfits.min()):
+            return float(offsets[misfits.argmin()])
+        fine = np.arange(-5, 6) * 0.002
+        deepest = [min((self._misfit(offset), offset) for offset in bottom + fine)
+                   for bottom in bottoms]
+        alike = [offset for misfit, offset in deepest if misfit <= _ALIKE * min(deepest)[0]]
+        return float(min(alike, key=abs))
+
+    def _misfit(self, offset: float) -> float:
+        data = self.increments(offset)
+        if len(data.turned) < 10:
+            return math.inf
+        return float(np.mean(np.abs(robust_residual(data.columns[:, :2], data.turned, 3))))
+
+
+def block_length(motion: Motion) -> float:
+    """Return the length of a block, s, over which the heading varies little."""
+    block = min(BLOCK, motion.duration / 40.0)
+    time = np.arange(0.0, motion.duration, block / 64.0)
+    heading = motion.heading_at(time[:len(time) // 64 * 64]).reshape(-1, 64)
+    whole, within = np.var(heading), [np.var(heading.reshape(-1, size), axis=1).mean()
+                                      for size in (64, 32, 16, 8, 4)]
+    halvings = int(np.argmax(np.append(np.array(within) < 0.05 * whole, True)))
+    return block / 2.0 ** halvings
+
+
+def _points(motion: Motion, block: float) -> _Points:
+    """Return where a motion is known: at its samples, or for an encoder where it steps."""
+    if motion.rate is not None:
+        time = np.arange(0.0, motion.duration + 1e-9, 0.01)
+        return _Points(time, motion.heading_at(time), np.ones(len(time)), np.empty((len(time), 0)))
+    step = encoder_step(motion.heading)
+    if not step:
+        return _Points(motion.time, motion.heading, np.ones(len(motion.time)),
+                       np.empty((len(motion.time), 0)))
+    crossings, stands = _crossings(motion, step), _stands(motion, step, block)
+    order = np.argsort(np.append(crossings.time, stands.time), kind='stable')
+    time, heading, variance, shared = (
+        np.concatenate([getattr(points, name) for points in (crossings, stands)])[order]
+        for name in ('time', 'heading', 'variance', 'shared'))
+    return _Points(time, heading, variance, shared, step / math.sqrt(12.0))
+
+
+def _crossings(motion: Motion, step: float) -> _Points:
+    """
+    Return the middles between lasting readings one step apart, with variances in units of theirs.
+
+    A constant reading has a constant error of up to half a step; where it changes by one step, the
+    heading is the edge between the two, but for the turn between the samples.
+
+    """
+    moved = np.abs(np.diff(motion.heading))
+    index = np.flatnonzero(moved > 0.5 * step)
+    time, heading = (0.5 * (values[index] + values[index + 1])
+                     for values in (motion.time, motion.heading))
+    speed = np.abs(np.diff(heading) / np.diff(time))
+    turned = (np.maximum(np.append(speed, 0.0), np.append(0.0, speed)[:len(time)])
+              if len(time) else time)
+    turned = np.where(moved[index] > 1.5 * step, 1.0,
+                      np.clip(turned * np.diff(motion.time)[index] / step, _SHARPEST, 1.0))
+    # none counts more than the median one: a reference is seldom as good as its slowest steps
+    turned = np.maximum(turned, np.median(turned)) if len(time) else turned
+    alone = np.diff(index, prepend=-1, append=len(moved)) == 1
+    edges = (moved[index] < 1.5 * step) & ~(alone[1:] & alone[:-1])
+    return _Points(time[edges], heading[edges], turned[edges] ** 2,
+                   np.zeros((int(edges.sum()), 2)))
+
+
+#: Least standard deviation of a heading where an encoder steps, in units of that of a reading.
+_SHARPEST = 0.05
+
+
+def _stands(motion: Motion, step: float, block: float) -> _Points:
+    """
+    Return the readings that last longer than a block, single ones, and the first and last.
+
+    All samples of one that lasts count as one reading. At the first and the last the gyro rests if
+    they last much longer than the readings beside them; then their samples share one error.
+
+    """
+    run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
+    begins = np.flatnonzero(np.diff(run, prepend=-1))
+    ends = np.append(begins[1:], len(run)) - 1
+    lasts = motion.time[ends] - motion.time[begins]
+    stays = (lasts > block) | (ends == begins)
+    stays[[0, -1]] = True
+    rests = np.zeros((len(begins), 2))
+    if len(begins) > 2:
+        rests[0, 0], rests[-1, 1] = (lasts[end] > max(block, 2.0 * lasts[beside])
+                                     for end, beside in ((0, 1), (-1, -2)))
+    variance = np.where(rests.any(axis=1), 1.0, np.bincount(run))
+    kept = stays[run]
+    return _Points(motion.time[kept], motion.heading[kept], variance[run[kept]], rests[run[kept]])
+
+
+def _random_walk(time: Array, weight: Array, begins: NDArray[np.intp]) -> tuple[Array, Array]:
+    """
+    Return the variance of increments by a random walk, and the covariance of neighbours, s, (n,).
+
+    The random walk has unit variance a second, the increments are between weighted means of
+    blocks. With A the weights summed up to each point, the mean of a block is its last value less
+    the sum of A times the steps, and its first value plus the sum of (1 - A) times the steps.
+
+    """
+    interval = np.diff(time, append=time[-1])
+    until = np.cumsum(weight)
+    until -= np.repeat(until[begins] - weight[begins], np.diff(begins, append=len(time)))
+    last = np.append(begins[1:], len(time)) - 1
+    gap = interval[last]
+    within = interval.copy()
+    within[last] = 0.0
+    before, after, both = (np.add.reduceat(product * within, begins)
+                           for product in (until ** 2, (1 - until) ** 2, until * (1 - until)))
+    return before[:-1] + gap[:-1] + after[1:], both[:-1]
+
+
+def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
+    """Return the residual of a fit in which large residuals count by their size (Huber)."""
+    weights = np.ones(len(turned))
+    for _ in range(passes):
+        weighted = weights[:, None] * columns
+        residual = turned - columns @ np.linalg.lstsq(weighted.T @ columns, weighted.T @ turned,
+                                                      rcond=1e-14)[0]
+        size = np.abs(residual)
+        weights = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-12))
+    return residual
+
+
+def encoder_step(heading: Array) -> float:
+    """Return the step of an encoder's heading, rad, or 0 if the heading has no such step."""
+    steps = np.abs(np.diff(heading))
+    moved = steps[steps > 1e-9]
+    if not len(moved):
+        return 0.0
+    step = float(np.median(moved[moved < 1.5 * moved.min()]))
+    return step if np.abs(moved / step - np.round(moved / step)).max() < 0.2 else 0.0
+
+
+class _Covariance:
+    """Covariance of the increments, up to one factor, by rate and reference noise; banded."""
+
+    def __init__(self, data: _Increments, ratio: float):
+        band = np.zeros((2, len(data.turned)))
+        self._reference = ratio * data.reference
+        band[0, 1:] = data.neighbours[1:] - self._reference[1:-1]
+        band[1] = data.walk + self._reference[1:] + self._reference[:-1]
+        self.ratio = ratio
+        self._factor = cholesky_banded(band)
+        self.log_determinant = 2.0 * float(np.log(self._factor[1]).sum())
+
+    def solve(self, vector: Array) -> Array:
+        """Return the inverse times a vector or matrix."""
+        return cho_solve_banded((self._factor, False), vector)
+
+    def whiten(self, vector: Array) -> Array:
+        """Return the vector as independent values of one variance."""
+        lower = np.array([self._factor[1], np.append(self._factor[0, 1:], 0.0)])
+        return solve_banded((1, 0), lower, vector)
+
+    def reference_error(self, residual: Array) -> Array:
+        """Return the expected contribution of the noise of the headings to the residual."""
+        solved = np.concatenate([[0.0], self.solve(residual), [0.0]])
+        return np.diff(self._reference * -np.diff(solved))
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Values of (1 + s, b, error of the time offset, lag, ...), with covariance and likelihood."""
+
+    values: Array
+    covariance: Array
+    residual: Array
+    rate_variance: float
+    log_likelihood: float
+    noise: _Covariance
+    influence: Array
+
+
+#: Variance of a block's reference noise over what the rate noise adds from block to block.
+_RATIOS = np.geomspace(1e-3, 1e5, 25)
+
+
+def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Estimate:
+    """Solve the weighted normal equations, with the restricted likelihood of the noise."""
+    freedom = len(data.turned) - len(data.prior) - 1  # the values, and the ratio of the noises
+    weighted = noise.solve(instrument)
+    matrix, vector = weighted.T @ data.columns, weighted.T @ data.turned
+    rate_variance = 0.0
+    for _ in range(3):
+        regular = matrix + np.diag(rate_variance / data.prior ** 2)
+        values = np.linalg.lstsq(
+            regular, vector + rate_variance * data.expected / data.prior ** 2, rcond=1e-14)[0]
+        residual = data.turned - data.columns @ values
+        rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
+    inverse = np.linalg.pinv(regular, rcond=1e-14)
+    # the variance is estimated too, so the values have Student's distribution, which is wider
+    covariance = freedom / (freedom - 2) * rate_variance * inverse
+    log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
+    return _Estimate(values, covariance, residual, rate_variance,
+                     -0.5 * (freedom * math.log(rate_variance) + log_determinants), noise,
+                     residual[:, None] * (weighted @ inverse[:2].T))
+
+
+def _estimates(data: _Increments) -> tuple[list[_Estimate], Array]:
+    """Return the estimates for every ratio of the two noises, and weights with the sum 1."""
+    unit = float(np.median(data.walk) / np.median(data.reference))
+    estimates = [_estimate(data, _Covariance(data, unit * ratio), data.columns)
+                 for ratio in _RATIOS]
+    log_likelihoods = np.array([estimate.log_likelihood for estimate in estimates])
+    weights = np.exp(log_likelihoods - log_likelihoods.max())
+    return estimates, weights / weights.sum()
+
+
+def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
+    """Estimate again, with the reference heading smoothed by the gyro as the instrument."""
+    for _ in range(3):
+        instrument = data.columns.copy()
+        instrument[:, 0] += (estimate.noise.reference_error(estimate.residual)
+                             / _away_from_zero(estimate.values[0]))
+        estimate = _estimate(data, estimate.noise, instrument)
+    return estimate
+
+
+def _away_from_zero(scale: float) -> float:
+    """Return the scale, limited to at least 0.001 either way, for a dead gyro."""
+    return math.copysign(max(abs(float(scale)), 1e-3), scale)
+
+
+def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
+                   lag: float = LAG_DEVIATION) -> Fit:
+    """
+    Fit scale factor error, bias and time offset by likelihood.
+
+    Rates are integrated by the trapezoid rule and compared with the reference heading increment by
+    increment. The increments have noise of the rate (a random walk of the heading) and of the
+    reference heading (an encoder's step), so that neighbours are correlated; the ratio of the two
+    is found by restricted likelihood. A measured heading is smoothed by the gyro's output before
+    it serves as the regressor, which makes this the errors-in-variables likelihood.
+
+    A robot follows its profile late and smoothly, so delay and lag are fitted too: without them, a
+    first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
+    a profile of rates, which a robot only follows; against headings, which were measured on the
+    robot itself, it is small and taken to second order.
+
+    Parameters
+    ----------
+    time : s since the start of the motion, shape (n,)
+    rate : output of the gyro, rad/s, shape (n,)
+    motion : what the gyro was put through
+    largest_time_offset : how late or early the gyro's stamps may be against the motion, s
+    lag : prior standard deviation of the lag, s²; a sine does not separate it from the scale
+
+    Raises
+    ------
+    DataRefused : gyro and motion hardly overlap
+
+    """
+    pairing = _Pairing(time, rate, motion, lag)
+    offset, found_lag = pairing.coarse_offset(
+        largest_time_offset + (0.0 if pairing.sampled else FOLLOWING)), 0.0
+    for _ in range(8):
+        data = pairing.increments(offset, found_lag)
+        if len(data.turned) < 10:
+            raise DataRefused('the samples cover less than ten blocks of the profile: '
+                              'record the whole motion')
+        estimates, weights = _estimates(data)
+        estimate = estimates[weights.argmax()]
+        if pairing.sampled:
+            estimate = _errors_in_variables(data, estimate)
+        late = float(np.clip(estimate.values[2], -0.02, 0.02))
+        lagging = 0.0 if pairing.sampled else max(float(estimate.values[3]), -found_lag)
+        if abs(late) < 1e-9 and abs(lagging) < 1e-9:
+            break
+        offset, found_lag = offset - late, found_lag + lagging
+    covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
+        np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
+    scale, bias = estimate.values[:2]
+    residual, stretch = _worst_stretch(estimate.noise, data, pairing.sampled)
+    return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset,
+               math.sqrt(estimate.rate_variance),
+               math.sqrt(estimate.rate_variance * estimate.noise.ratio)
+               / abs(_away_from_zero(scale)), residual, math.sqrt(covariance[2, 2]),
+               np.column_stack([estimate.influence, data.time[1:]]), stretch,
+               *(_start_heading(data, estimate) if pairing.sampled else (math.nan, math.nan)),
+               *_squares(data, estimate, pairing.sampled))
+
+
+#: A robot that follows its profile with a lag is later than at its start by up to this, s.
+FOLLOWING = 0.25
+
+
+def _squares(data: _Increments, estimate: _Estimate, sampled: bool) -> tuple[float, int]:
+    """Return weighted sum of squares and degrees of freedom; a profile itself has no noise."""
+    if not sampled:
+        estimate = _estimate(data, _Covariance(data, 0.0), data.columns)
+    used = len(data.prior) + sampled  # the ratio of the noises is found too
+    return (float(estimate.residual @ estimate.noise.solve(estimate.residual)),
+            len(data.turned) - used)
+
+
+def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
+    """
+    Return the true heading where gyro and reference begin, and its standard deviation, rad.
+
+    It is relative to the reference's first heading. The expected noise of the first block's
+    heading, given all that follows, is subtracted, and then the gyro's turn before that block.
+
+    """
+    heading, since, shared, turned = (data.since[0], data.since[1], data.since[2:-1],
+                                      data.since[-1])
+    scale, bias = _away_from_zero(estimate.values[0]), estimate.values[1]
+    prior, first = estimate.noise.ratio * data.reference[0], np.eye(len(data.turned))[0]
+    error = prior * float(estimate.noise.solve(estimate.residual)[0])
+    weighted = estimate.noise.solve(data.columns)
+    left = (float(estimate.noise.solve(first)[0])
+            - weighted[0] @ np.linalg.pinv(weighted.T @ data.columns, rcond=1e-14) @ weighted[0])
+    variance = (estimate.rate_variance * (max(prior - prior ** 2 * left, 0.0) + since / 3.0)
+                + since ** 2 * estimate.covariance[1, 1])
+    variance += shared @ estimate.covariance[4:, 4:] @ shared
+    start = heading + (shared @ estimate.values[4:] - error - turned + bias * since) / scale
+    return float(start), math.sqrt(variance) / abs(scale)
+
+
+def _worst_stretch(noise: _Covariance, data: _Increments,
+                   sampled: bool) -> tuple[tuple[float, float], tuple[float, float]]:
+    """
+    Return excess turn of the unlikeliest stretch, rad, its standard deviations, and its times, s.
+
+    The values are fitted together with the excess turn of each stretch, so that a slip does not
+    hide itself, and the size of chance is taken from a robust fit.
+
+    """
+    robust = noise.whiten(robust_residual(data.columns[:, :4], data.turned, 20))
+    chance = max(float(np.median(np.abs(robust))) / 0.6745
+                 * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
+    edges = np.unique(np.linspace(0, len(robust), min(len(robust), _EDGES) + 1).astype(int))
+    interval = data.columns[:, 1]
+    steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
+    first, last, rate, squares, left = unlikeliest(
+        noise.whiten(data.columns), noise.whiten(steps), noise.whiten(data.turned))
+    if sampled:
+        # noise that comes with turning alone, such as slip of wheels, exceeds its robust size
+        chance = max(chance, math.sqrt(max(left, 0.0) / (len(robust) - 4.0)))
+    begin, end = edges[first], edges[last]
+    turned = abs(rate) * float(interval[begin:end].sum())
+    return (turned, math.sqrt(squares) / chance), (float(data.time[begin]), float(data.time[end]))
+
+
+#: Largest number of places of a run at which a stretch begins or ends.
+_EDGES = 150
+
+
+def unlikeliest(columns: Array, steps: Array,
+                turned: Array) -> tuple[int, int, float, float, float]:
+    """
+    Return the stretch that improves a fit most, its excess rate, rad/s, and the gain in squares.
+
+    Parameters
+    ----------
+    columns : of the fit, white, shape (n, k)
+    steps : the addition of a turn of 1 rad/s from each edge on, white, shape (n, m); the last edge
+        is the end
+    turned : what is fitted, white, shape (n,)
+
+    Returns
+    -------
+    from which edge, to which edge, rate, squares, and the squares that are left then
+
+    """
+    left, singular, _ = np.linalg.svd(
+        columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    left = left[:, singular > 1e-7]
+    apart = steps - left @ (left.T @ steps)
+    sums, products, whole = apart.T @ turned, apart.T @ apart, steps.T @ steps
+    differences = sums[:, None] - sums
+    norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
+                     for matrix in (products, whole))
+    # not one that scale and bias explain nearly as well, nor one of no length
+    told = np.triu(norms > _APART * wholes, 1)
+    gains = np.where(told, differences ** 2 / np.where(told, norms, 1.0), 0.0)
+    first, last = np.unravel_index(int(gains.argmax()), gains.shape)
+    rate, gain = (float(differences[first, last] / max(norms[first, last], 1e-300)),
+                  float(gains[first, last]))
+    return (int(first), int(last), rate, gain,
+            float(turned @ turned - np.sum((left.T @ turned) ** 2)) - gain)
+
+
+#: Part of a stretch that the columns of a fit must leave, so that the two are distinguishable;
+#: with less left, a stretch turns far by chance.
+_APART = 0.2

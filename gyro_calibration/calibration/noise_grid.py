@@ -1,0 +1,581 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+One likelihood for linear regressions whose noise has several parts of unknown size.
+
+The model of ``n`` observations is::
+
+    observed = columns @ values + shared_columns @ u + e
+
+* ``values``, shape (m,), are estimated. Each has a flat prior, or a normal prior with a stated
+  mean and standard deviation.
+* ``e`` has the covariance ``sum(size_k**2 * banded_k)``; each ``banded_k`` is tridiagonal
+  (`BandedNoise`).
+* ``u``, shape (q,), has independent elements with variances ``sum(size_j**2 * variance_j)``
+  (`SharedNoise`). It describes what many observations have in common: a bias that wanders
+  (`wander`), or the bias of one sweep of a rate table.
+
+The sizes are not known. For each point of a grid over them the restricted likelihood (REML:
+``values`` with a flat prior and ``u`` are integrated out) is computed, with ``V`` the covariance
+of ``e`` and ``P`` the prior precision of ``(values, u)``::
+
+    log L = -1/2 [log|V| + log|A| - log|P|+ + y'V⁻¹y - c'A⁻¹c],    A = X'V⁻¹X + P,    c = X'V⁻¹y
+
+where ``|P|+`` is the product of the precisions that are not zero. Estimates and their covariance
+are averaged over the grid, so that the intervals of the values hold what is unknown of the noise
+(law of total variance). The prior of each size is flat in its logarithm within the range given.
+The grid is refined three times, around what is likely.
+
+Headings at points ``t_0 ... t_n`` become increments over the spans between them (`heading_noise`).
+A gap of the reference is a long span, nothing else. The parts of the noise of such increments:
+
+=================  =========  ==================================================================
+name               unit       noise
+=================  =========  ==================================================================
+angle_random_walk  rad/√s     gyro, white: variance in proportion to the length of the span
+reference          rad        reference, white from point to point; neighbouring spans share one
+motion             s          the same, in proportion to the rate at the point: side slip, jitter
+turned             √rad       either, variance in proportion to the angle turned in the span
+bias_instability   rad/s      gyro, flicker of the two-sided spectrum B²/ω (`wander`)
+rate_random_walk   rad/s/√s   gyro, random walk of the two-sided spectrum K²/ω² (`wander`)
+=================  =========  ==================================================================
+
+Example, for headings of a gyro's integral and of a reference, rad, at the same times, s::
+
+    increments = np.diff(integral)
+    # the values: 1 + scale factor error, and bias in rad/s
+    columns = np.column_stack([np.diff(reference), np.diff(time)])
+    noise = heading_noise(time, rate)
+    found = noise_grid(increments, columns, noise, *wander(time), noisy_column=0, wandering=1)
+    found.values, found.covariance, found.size('reference'), found.whiten(columns)
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+import math
+
+from gyro_calibration.logs.log import Array
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.linalg.lapack import dpttrf, dpttrs
+
+#: Points of the grid a size: first over its whole range, and in each further pass around what is
+#: likely.
+POINTS, PASSES = 5, 4
+#: Cosines that describe a wandering bias; what is faster is hardly told from white noise.
+COSINES = 24
+
+
+@dataclass(frozen=True)
+class BandedNoise:
+    """
+    A part of the noise whose covariance is ``size**2`` times a tridiagonal matrix.
+
+    Attributes
+    ----------
+    name : of the size
+    diagonal : shape (n,)
+    neighbours : of each observation with the one before it, shape (n,); the first is not looked
+        at. None where they are independent
+    range : smallest and largest size that is possible; equal where the size is known
+
+    """
+
+    name: str
+    diagonal: Array
+    neighbours: Array | None
+    range: tuple[float, float]  # noqa: A003
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """
+    A part of the variances of the shared values ``u``: ``size**2`` times `variance`.
+
+    Attributes
+    ----------
+    name : of the size
+    variance : shape (q,)
+    range : smallest and largest size that is possible; equal where the size is known
+    unseen : variance that the observations have in common, so that it looks like one of the
+        values, in units of size²
+
+    """
+
+    name: str
+    variance: Array
+    range: tuple[float, float]  # noqa: A003
+    unseen: float = 0.0
+
+
+@dataclass(frozen=True)
+class PriorSize:
+    """
+    A value whose normal prior has a standard deviation of unknown size.
+
+    What the data show weakly is then drawn towards the mean of its prior, and what they show
+    clearly is not.
+
+    Attributes
+    ----------
+    name : of the size
+    value : number of the value
+    range : smallest and largest standard deviation, in the unit of the value
+
+    """
+
+    name: str
+    value: int
+    range: tuple[float, float]  # noqa: A003
+
+
+@dataclass(frozen=True)
+class GridFit:
+    """
+    What a regression found, averaged over the sizes of the noise.
+
+    Attributes
+    ----------
+    values : estimates, shape (m,)
+    covariance : of the values, shape (m, m), with what is unknown of the noise
+    sizes : for each size its name, its estimate (mean of the logarithm), and the limits that hold
+        95 %
+    likely : the size of each part at the point of the grid with the largest likelihood, by name
+    log_likelihood : there, with the values of flat prior integrated out; for models with the same
+        columns of flat prior
+    evidence : logarithm of the mean likelihood over the grid, to compare models with the same
+        columns of flat prior
+    residual : observed - columns @ values - shared_columns @ u at the likeliest point, shape (n,)
+    shared : estimates of u at the likeliest point, shape (q,)
+    shared_covariance : of u at the likeliest point, shape (q, q)
+    influence : what the error of each observation adds to the values at the likeliest point, shape
+        (n, m); sums over stretches of a log give a covariance that does not rely on the noise
+        model
+
+    """
+
+    values: Array
+    covariance: Array
+    sizes: Mapping[str, tuple[float, float, float]]
+    likely: Mapping[str, float]
+    log_likelihood: float
+    evidence: float
+    residual: Array
+    shared: Array
+    shared_covariance: Array
+    influence: Array
+    _noise: Tridiagonal
+
+    @property
+    def deviations(self) -> Array:
+        """Return the standard deviations of the values, shape (m,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def size(self, name: str) -> float:
+        """Return the estimate of the size of one part of the noise."""
+        return self.sizes[name][0]
+
+    def whiten(self, columns: Array) -> Array:
+        """Return columns, shape (n,) or (n, k), with independent banded noise of variance 1."""
+        return self._noise.whiten(columns)
+
+    def solve(self, columns: Array) -> Array:
+        """Return the inverse of the covariance of the likeliest banded noise, times columns."""
+        return self._noise.solve(columns)
+
+
+class Tridiagonal:
+    """A positive definite tridiagonal matrix, factored as L D L'."""
+
+    def __init__(self, diagonal: Array, neighbours: Array):
+        """Factor it; raise `numpy.linalg.LinAlgError` where it is not positive definite."""
+        self._d, self._e, info = dpttrf(diagonal, neighbours[1:])
+        if info:
+            raise np.linalg.LinAlgError('the covariance is not positive definite')
+        self.log_determinant = float(np.log(self._d).sum())
+
+    def solve(self, columns: Array) -> Array:
+        """Return the inverse times columns, shape (n,) or (n, k)."""
+        solved: Array = dpttrs(self._d, self._e, columns.reshape(len(columns), -1))[0]
+        return solved.reshape(columns.shape)
+
+    def whiten(self, columns: Array) -> Array:
+        """Return D^(-1/2) L⁻¹ times columns, shape (n,) or (n, k)."""
+        whitened = solve_banded(
+            (1, 0), np.array([np.ones(len(self._d)), np.append(self._e, 0.0)]), columns
+        )
+        return (whitened.T / np.sqrt(self._d)).T
+
+
+def heading_noise(
+    time: Array,
+    rate: Array,
+    point_variance: Array | None = None,
+    turned: bool = False,
+    unit: float = math.radians(1.0),
+    angle_random_walk: tuple[float, float] | None = None,
+) -> list[BandedNoise]:
+    """
+    Return the parts of the noise of increments between headings.
+
+    Parameters
+    ----------
+    time : of the points, s, shape (n + 1,)
+    rate : at the points, rad/s, shape (n + 1,)
+    point_variance : of the reference at each point, relative to the others, shape (n + 1,); larger
+        where a point is an outlier
+    turned : whether noise in proportion to the angle turned is looked for
+    unit : typical size of the noise of the reference, rad; sizes from 1e-4 to 10 times it are
+        possible
+    angle_random_walk : smallest and largest N that is possible, rad/√s, where a log at rest, a
+        data sheet or the differences between samples bound it; equal ends where it is known
+
+    """
+    points = np.ones(len(time)) if point_variance is None else point_variance
+    interval, size = np.diff(time), math.sqrt(float(np.mean(rate**2))) + 1e-12
+    parts = [
+        BandedNoise(
+            'angle_random_walk', interval, None, angle_random_walk or (1e-4 * unit, 1e1 * unit)
+        ),
+        BandedNoise('reference', *_differenced(points), (1e-4 * unit, 1e1 * unit)),
+        BandedNoise(
+            'motion', *_differenced(points * rate**2), (1e-3 * unit / size, 1e1 * unit / size)
+        ),
+    ]
+    if turned:
+        angle = np.abs(0.5 * (rate[1:] + rate[:-1]) * interval)
+        parts.append(BandedNoise('turned', angle, None, (1e-3 * unit, 1e1 * unit)))
+    return parts
+
+
+def _differenced(variance: Array) -> tuple[Array, Array]:
+    """Return variances of differences between points, and covariances with the one before."""
+    return variance[1:] + variance[:-1], -variance[:-1]
+
+
+def wander(
+    time: Array,
+    bias_instability: tuple[float, float] | None = (1e-7, 1e-3),
+    rate_random_walk: tuple[float, float] | None = (1e-8, 1e-4),
+    cosines: int = COSINES,
+) -> tuple[Array, list[SharedNoise]]:
+    """
+    Return what a wandering bias adds to increments between points, and the parts of its noise.
+
+    About its mean over the log a bias is the sum of ``u_j cos(ω_j (t - t_0))`` with ``ω_j = π j /
+    T``. The variance of ``u_j`` is ``2 / T`` times the two-sided spectrum at ``ω_j``, ``B²/ω`` and
+    ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
+    values of the regression is the mean over the log. How far that is from the bias where the log
+    began has the variance ``2/π B²`` and ``K² T / 3``, which no log shows: `noise_grid` adds it to
+    the variance of the value that is told to wander.
+
+    Parameters
+    ----------
+    time : of the points, s, shape (n + 1,)
+    bias_instability : range of B, rad/s, or None without flicker
+    rate_random_walk : range of K, rad/s/√s, or None without rate random walk
+    cosines : as many, but at most half as many as spans
+
+    Returns
+    -------
+    columns, s, shape (n, q); and the parts of the noise
+
+    """
+    duration = float(time[-1] - time[0])
+    omega = math.pi * np.arange(1, max(min(cosines, (len(time) - 1) // 2), 1) + 1) / duration
+    columns = np.diff(np.sin(omega * (time - time[0])[:, None]) / omega, axis=0)
+    parts = [
+        SharedNoise(name, 2.0 / duration / omega**power, limits, mean)
+        for name, power, mean, limits in (
+            ('bias_instability', 1, 2.0 / math.pi, bias_instability),
+            ('rate_random_walk', 2, duration / 3.0, rate_random_walk),
+        )
+        if limits is not None
+    ]
+    return columns, parts
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """All columns together, shape (n, m + q), and the prior precision of the first m."""
+
+    observed: Array
+    columns: Array
+    values: int
+    precision: Array
+    banded: Sequence[BandedNoise]
+    shared: Sequence[SharedNoise]
+    priors: Sequence[PriorSize]
+
+    @property
+    def parts(self) -> list[BandedNoise | SharedNoise | PriorSize]:
+        """Return all that has a size."""
+        return [*self.banded, *self.shared, *self.priors]
+
+    def noise(self, sizes: Iterable[float]) -> Tridiagonal:
+        """Return the covariance of the banded noise."""
+        diagonal, neighbours = np.zeros((2, len(self.observed)))
+        for size, part in zip(sizes, self.banded):
+            diagonal += size**2 * part.diagonal
+            if part.neighbours is not None:
+                neighbours += size**2 * part.neighbours
+        return Tridiagonal(diagonal, neighbours)
+
+    def precisions(self, sizes: Array) -> Array:
+        """Return prior precisions, shape (k, m + q), for sizes of shape (k, parts)."""
+        fixed = np.tile(self.precision, (len(sizes), 1))
+        for prior, size in zip(self.priors, sizes[:, len(self.shared):].T):
+            fixed[:, prior.value] = 1.0 / size**2
+        if not self.shared:
+            return fixed
+        variance = sizes[:, : len(self.shared)] ** 2 @ np.array(
+            [part.variance for part in self.shared]
+        )
+        return np.concatenate([fixed, 1.0 / np.maximum(variance, 1e-300)], axis=1)
+
+    def solved(self, noise: Tridiagonal, precisions: Array) -> tuple[Array, Array, Array]:
+        """
+        Solve for one banded noise, and k variances of the shared values.
+
+        Returns
+        -------
+        log likelihoods, shape (k,); values, shape (k, m + q); inverse normal matrices
+
+        """
+        weighted = noise.solve(np.column_stack([self.columns, self.observed]))
+        gram = self.columns.T @ weighted
+        # scaled, for the columns have different units
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(gram[:, :-1]) + precisions, 1e-300))
+        normal = (
+            (gram[:, :-1] + precisions[:, :, None] * np.eye(len(gram)))
+            * scale[:, :, None]
+            * scale[:, None, :]
+        )
+        inverse = (
+            np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+            if self.values and np.linalg.cond(normal[0]) > 1e12
+            else np.linalg.inv(normal)
+        )
+        log_determinant = np.linalg.slogdet(normal)[1] - 2.0 * np.log(scale).sum(axis=1)
+        inverse = inverse * scale[:, :, None] * scale[:, None, :]
+        values = inverse @ gram[:, -1]
+        squares = self.observed @ weighted[:, -1] - values @ gram[:, -1]
+        proper = np.log(np.where(precisions > 0.0, precisions, 1.0)).sum(axis=1)
+        return -0.5 * (noise.log_determinant + log_determinant - proper + squares), values, inverse
+
+
+def noise_grid(
+    observed: Array,
+    columns: Array,
+    banded: Sequence[BandedNoise],
+    shared_columns: Array | None = None,
+    shared: Sequence[SharedNoise] = (),
+    prior_mean: Array | None = None,
+    prior_deviation: Array | None = None,
+    noisy_column: int | None = None,
+    wandering: int | None = None,
+    prior_sizes: Sequence[PriorSize] = (),
+) -> GridFit:
+    """
+    Estimate values by a likelihood over a grid of the sizes of the noise.
+
+    Parameters
+    ----------
+    observed : shape (n,)
+    columns : of the values, shape (n, m)
+    banded : parts of the noise; their sum must be positive definite
+    shared_columns : of the shared values, shape (n, q)
+    shared : parts of their variances
+    prior_mean, prior_deviation : of the values, shape (m,); infinite deviation for a flat prior
+    noisy_column : number of a column that holds the increments of the reference, whose noise are
+        the parts 'reference' and 'motion'. Its estimate would be too small by the share of the
+        noise in it; it is estimated with the column smoothed by what is observed as the instrument
+        (errors in variables). None where no column is noisy
+    prior_sizes : values with a prior of unknown size
+    wandering : number of the value whose variance holds what the shared noise has `unseen`; None
+        where there is none
+
+    Raises
+    ------
+    ValueError : there are not more observations than values
+
+    """
+    count = columns.shape[1]
+    if len(observed) <= count:
+        raise ValueError(
+            f'{len(observed)} observations do not determine {count} values and their noise'
+        )
+    mean = np.zeros(count) if prior_mean is None else prior_mean
+    precision = np.zeros(count) if prior_deviation is None else 1.0 / np.square(prior_deviation)
+    together = columns if shared_columns is None else np.column_stack([columns, shared_columns])
+    regression = _Regression(
+        observed - columns @ mean, together, count, precision, banded, shared, prior_sizes
+    )
+    axes = [_axis(part.range) for part in regression.parts]
+    for remaining in reversed(range(PASSES)):
+        grid = _on_grid(regression, axes)
+        weights = np.exp(grid.log_likelihood - grid.log_likelihood.max())
+        weights /= weights.sum()
+        if remaining:
+            axes = [
+                _refined(axis, grid.sizes[:, place], weights) for place, axis in enumerate(axes)
+            ]
+    if wandering is not None:
+        of_shared = grid.sizes[:, len(banded): len(banded) + len(shared)]
+        grid.covariance[:, wandering, wandering] += of_shared**2 @ np.array(
+            [part.unseen for part in shared]
+        )
+    return _averaged(regression, grid, weights, mean, noisy_column)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Sizes, shape (k, parts), log likelihoods, values, shape (k, m), and their covariances."""
+
+    sizes: Array
+    log_likelihood: Array
+    values: Array
+    covariance: Array
+
+
+def _axis(limits: tuple[float, float]) -> Array:
+    return np.array(limits[:1]) if limits[0] == limits[1] else np.geomspace(*limits, POINTS)
+
+
+def _refined(axis: Array, sizes: Array, weights: Array) -> Array:
+    """Return an axis where the sizes are likely, at least to the middle between old points."""
+    if len(axis) == 1:
+        return axis
+    logarithms, step = np.log(sizes), math.log(axis[1] / axis[0])
+    middle = float(weights @ logarithms)
+    spread = math.sqrt(float(weights @ (logarithms - middle) ** 2))
+    half = max(2.5 * spread, 0.6 * step)
+    low, high = (
+        min(max(end, math.log(axis[0])), math.log(axis[-1]))
+        for end in (middle - half, middle + half)
+    )
+    return np.exp(np.linspace(low, high, len(axis)))
+
+
+def _on_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
+    banded, count = len(regression.banded), regression.values
+    inner = np.array(list(product(*axes[banded:])))  # one empty row where nothing is shared
+    precisions = regression.precisions(inner)
+    found = []
+    for sizes in product(*axes[:banded]):
+        log_likelihood, values, inverse = regression.solved(regression.noise(sizes), precisions)
+        found.append(
+            (
+                np.column_stack([np.tile(sizes, (len(inner), 1)), inner]),
+                log_likelihood,
+                values[:, :count],
+                inverse[:, :count, :count],
+            )
+        )
+    return _Grid(*(np.concatenate(each) for each in zip(*found)))
+
+
+def _averaged(
+    regression: _Regression, grid: _Grid, weights: Array, mean: Array, noisy_column: int | None
+) -> GridFit:
+    values = weights @ grid.values
+    apart = grid.values - values
+    covariance = np.tensordot(weights, grid.covariance, 1) + (apart * weights[:, None]).T @ apart
+    best = int(grid.log_likelihood.argmax())
+    banded, count = len(regression.banded), regression.values
+    noise = regression.noise(grid.sizes[best, :banded])
+    precisions = regression.precisions(grid.sizes[best: best + 1, banded:])
+    _, (all_values,), (inverse,) = regression.solved(noise, precisions)
+    names = [part.name for part in regression.parts]
+    likely = dict(zip(names, grid.sizes[best].tolist()))
+    if noisy_column is not None:
+        corrected = _errors_in_variables(
+            regression, noise, precisions[0], likely, all_values, mean, noisy_column
+        )
+        values = values + (corrected - all_values)[:count]
+        all_values = corrected
+    residual = regression.observed - regression.columns @ all_values
+    of_values = regression.observed - regression.columns[:, :count] @ all_values[:count]
+    influence = noise.solve(regression.columns) @ inverse[:, :count] * of_values[:, None]
+    return GridFit(
+        values + mean,
+        covariance,
+        {name: _limits(grid.sizes[:, place], weights) for place, name in enumerate(names)},
+        likely,
+        float(grid.log_likelihood[best]),
+        float(
+            np.log(np.mean(np.exp(grid.log_likelihood - grid.log_likelihood[best])))
+            + grid.log_likelihood[best]
+        ),
+        residual,
+        all_values[count:],
+        inverse[count:, count:],
+        influence,
+        noise,
+    )
+
+
+def _limits(sizes: Array, weights: Array) -> tuple[float, float, float]:
+    """Return the mean of the logarithm as a size, and the limits that hold 95 %."""
+    order = np.argsort(sizes, kind='stable')
+    below = np.cumsum(weights[order]) - 0.5 * weights[order]
+    low, high = np.interp([0.025, 0.975], below, np.log(sizes[order]))
+    return math.exp(float(weights @ np.log(sizes))), math.exp(low), math.exp(high)
+
+
+def _errors_in_variables(
+    regression: _Regression,
+    noise: Tridiagonal,
+    precision: Array,
+    likely: Mapping[str, float],
+    values: Array,
+    mean: Array,
+    place: int,
+) -> Array:
+    """Return the values with a noisy column smoothed by what is observed as the instrument."""
+    parts = [
+        (likely[part.name] ** 2, part)
+        for part in regression.banded
+        if part.name in ('reference', 'motion')
+    ]
+    for _ in range(3):
+        scale = values[place] + mean[place]
+        solved = noise.solve(regression.observed - regression.columns @ values)
+        error = np.zeros(len(solved))
+        for variance, part in parts:
+            error += variance * _times(part, solved)
+        instrument = regression.columns.copy()
+        instrument[:, place] += error / math.copysign(max(abs(scale), 1e-3), scale)
+        weighted = noise.solve(instrument)
+        normal = weighted.T @ regression.columns + np.diag(precision)
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(normal)), 1e-300))
+        values = (
+            sizes
+            * np.linalg.lstsq(
+                normal * np.outer(sizes, sizes),
+                sizes * (weighted.T @ regression.observed),
+                rcond=1e-13,
+            )[0]
+        )
+    return values
+
+
+def _times(part: BandedNoise, vector: Array) -> Array:
+    """Return the matrix of a part times a vector."""
+    found = part.diagonal * vector
+    if part.neighbours is not None:
+        found[1:] += part.neighbours[1:] * vector[:-1]
+        found[:-1] += part.neighbours[1:] * vector[1:]
+    return found

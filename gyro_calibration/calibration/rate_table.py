@@ -1,0 +1,440 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""From dwells to a gyro's model: values of effects, covariance and errors of left-out sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+import math
+
+from gyro_calibration.calibration.dwells import Dwells, take
+from gyro_calibration.calibration.scatter import (
+    find_scatter,
+    parts_of,
+    rms,
+    Scatter,
+    SMALLEST_TEMPERATURE_SPREAD,
+    summed,
+    Uncertainty,
+    Whitener,
+)
+from gyro_calibration.calibration.tolerance import tolerance_of
+from gyro_calibration.logs.log import Array, DataRefused, Mask
+from gyro_calibration.model.effects import Channels, Effect, Parameter
+from gyro_calibration.model.gyro_model import GyroModel, Term
+import numpy as np
+from scipy.linalg import solve_triangular
+
+#: Beyond this condition number of the columns, each of length one, the effects are not separable.
+LARGEST_CONDITION = 1e3
+
+
+class EffectsNotParted(DataRefused):
+    """
+    Some effects look alike in these data.
+
+    Attributes
+    ----------
+    effects : the names of those that look alike
+
+    """
+
+    def __init__(self, message: str, effects: Sequence[str]):
+        super().__init__(message)
+        self.effects = tuple(effects)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """
+    A model fitted to dwells, and what the fit shows.
+
+    Attributes
+    ----------
+    terms : effects with their values
+    dwells : all of them
+    scatter : of the dwells, and which were fitted
+    residual : error of each dwell that the effects do not explain, rad/s, shape (n,)
+    left_out : the same for a fit without the dwell's sweep, rad/s, shape (n,); nan at outlying
+        dwells, infinite where the other sweeps do not determine it
+    deviation : standard deviation of each dwell, rad/s, shape (n,)
+    condition : number of the columns, each of length one
+    freedom : dwells less fitted values
+    misfit : sum of the whitened squared residuals; about `freedom` where no effect is missing
+
+    """
+
+    terms: tuple[Term, ...]
+    dwells: Dwells
+    scatter: Scatter
+    residual: Array
+    left_out: Array
+    deviation: Array
+    condition: float
+    freedom: int
+    misfit: float
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Return the effects of the model."""
+        return tuple(term.effect for term in self.terms)
+
+    @cached_property
+    def model(self) -> GyroModel:
+        """Return effects with values, covariance and valid range; 1.96 deviations hold 95 %."""
+        used = take(self.dwells, self.scatter.kept)
+        if not self.freedom:
+            return _model(used, self.terms, None)
+        uncertainty = self._uncertainty(*_forward(used, self.terms))
+        covariance, sweeps = uncertainty.covariance(), uncertainty.sweeps.tolist()
+        scatter = replace(self.scatter, sweep_bias=sweeps[0], sweep_scale=sweeps[1])
+
+        def columns(rate: Array, temperature: Array) -> Array:
+            channels = Channels(rate, rate, temperature)
+            return np.column_stack([row for term in self.terms
+                                    for row in term.sensitivity(channels)])
+
+        tolerance = tolerance_of(used, Whitener(used, scatter), uncertainty.sweeps, columns,
+                                 covariance)
+        return replace(_model(used, self.terms, covariance), tolerance=tolerance)
+
+    def deviation_of(self, effect: Effect) -> float:
+        """Return the standard deviation of the last value of an effect."""
+        owners = [term.effect for term in self.terms for _ in term.fitted]
+        assert self.model.covariance is not None
+        place = len(owners) - 1 - owners[::-1].index(effect)
+        return math.sqrt(float(self.model.covariance[place, place]))
+
+    def chance_of(self, effect: Effect) -> float:
+        """Return the two-sided probability of as much of an effect where there is none."""
+        used = take(self.dwells, self.scatter.kept)
+        term = next(each for each in self.terms if each.effect is effect)
+        if not self.freedom or not np.any(term.error(channels_of(used))):
+            return 1.0
+        others = [each for each in self.terms if each is not term]
+        # The whole effect, not its derivative by a shape: near zero, that of a sine vanishes too.
+        columns = ([*columns_of(used, others).T, term.error(channels_of(used))] if others
+                   else [term.error(channels_of(used))])
+        below = float(self._uncertainty(np.column_stack(columns),
+                                        self.residual[self.scatter.kept]).below(-1.0)[-1])
+        return 2.0 * min(below, 1.0 - below)
+
+    def _uncertainty(self, columns: Array, residual: Array) -> Uncertainty:
+        return Uncertainty.of(take(self.dwells, self.scatter.kept), self.scatter, columns,
+                              residual)
+
+    @property
+    def folded_beyond(self) -> float | None:
+        """
+        Return the slowest rate of a dwell, rad/s, at which the output no longer grows with it.
+
+        None where the output always grows with the rate.
+
+        """
+        folded = (self.model.steepness(channels_of(self.dwells)) + np.zeros(len(self.dwells))
+                  <= 0.1)
+        return float(np.abs(self.dwells.rate[folded]).min()) if folded.any() else None
+
+    @property
+    def before_rms(self) -> float:
+        """Return the root mean square of output less rate of what was fitted, rad/s."""
+        return rms((self.dwells.output - self.dwells.rate)[self.scatter.kept])
+
+    @property
+    def residual_rms(self) -> float:
+        """Return the root mean square of the residual of what was fitted, rad/s."""
+        return rms(self.residual[self.scatter.kept])
+
+    @property
+    def left_out_rms(self) -> float:
+        """Return the root mean square of the errors of sweeps left out, rad/s."""
+        return rms(self.left_out[self.scatter.kept])
+
+    def predicted_misfit(self) -> float:
+        """Return the mean over left-out sweeps of the mean squared error, in dwell variances."""
+        parts = parts_of(take(self.dwells, self.scatter.kept))
+        squares = (self.left_out / self.deviation)[self.scatter.kept] ** 2
+        return float(np.mean(summed(squares, parts) / np.bincount(parts)))
+
+
+def channels_of(dwells: Dwells) -> Channels:
+    """Return what the effects look at."""
+    temperature = (np.full(len(dwells), np.nan) if dwells.temperature is None
+                   else dwells.temperature)
+    return Channels(dwells.rate, dwells.output, temperature)
+
+
+# the fit
+
+def fit_effects(dwells: Dwells, effects: Sequence[Effect],
+                scatter: Scatter | None = None) -> Calibration:
+    """
+    Fit effects to dwells by generalised least squares, solved by QR.
+
+    Effects of the rate look at the reference rate. The polynomial of Ojeda et al. (eq. 9 to 12)
+    looks at the output, which does no harm where the output is an average. A shape is found by
+    Gauss-Newton steps from the best of a grid over its bounds.
+
+    Parameters
+    ----------
+    dwells : of a rate table or a log
+    effects : each once
+    scatter : of the dwells, if it is known already
+
+    Raises
+    ------
+    EffectsNotParted : some of the effects look alike in these dwells
+    DataRefused : too few dwells
+
+    """
+    _refuse_unseen(dwells, effects)
+    terms = tuple(Term(effect, tuple(_start(parameter, dwells) for parameter in effect.parameters))
+                  for effect in effects)
+    _refuse_few(dwells, terms)
+    scatter = scatter or find_scatter(dwells)
+    used = take(dwells, scatter.kept)
+    _refuse_few(used, terms)
+    whitener = Whitener(used, scatter)
+    return _calibration(dwells, _solve(used, _search(used, terms), whitener), scatter, whitener)
+
+
+def _start(parameter: Parameter, dwells: Dwells) -> float:
+    """Return a start value; conventions, such as the reference temperature, are final."""
+    temperature = np.zeros(2) if dwells.temperature is None else dwells.temperature
+    conventions = {
+        'reference_temperature': round(float(temperature.mean()), 1),
+        'output_centre': 0.5 * float(dwells.output.max() + dwells.output.min()),
+        'output_scale': 0.5 * float(np.ptp(dwells.output)) or 1.0,
+        'temperature_centre': 0.5 * float(temperature.max() + temperature.min()),
+        'temperature_scale': 0.5 * float(np.ptp(temperature)) or 1.0,
+    }
+    return conventions.get(parameter.name, parameter.default or 0.0)
+
+
+def error_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
+    """Return what effects leave of the errors of the dwells, rad/s, shape (n,)."""
+    channels = channels_of(dwells)
+    return dwells.output - dwells.rate - sum(term.error(channels) for term in terms)
+
+
+def columns_of(dwells: Dwells, terms: Sequence[Term]) -> Array:
+    """Return what the error changes by for each fitted value, shape (n, m)."""
+    channels = channels_of(dwells)
+    return np.column_stack([row for term in terms for row in term.sensitivity(channels)])
+
+
+def _forward(dwells: Dwells, terms: Sequence[Term]) -> tuple[Array, Array]:
+    """
+    Return the columns, shape (n, m), and residual of the output at the reference rate.
+
+    The columns are the change of the output for each fitted value; the residual is the output less
+    that of the model. The polynomial looks at the output. With the measured one among the columns,
+    a scale factor error of -1 would make every residual zero, whatever sweeps share, and the
+    likelihood would prefer a large scatter of their scale: the Jacobian of output against error is
+    missing there. Columns and residual are therefore those at the expected output:
+    ``Δoutput = Δerror / (1 - g)`` with ``g`` the slope of the error over the output.
+
+    """
+    model, channels = GyroModel(tuple(terms)), channels_of(dwells)
+    if not model.looks_at('output'):
+        return columns_of(dwells, terms), error_of(dwells, terms)
+    expected, step = model.output_in(channels), 1e-5
+    below, here, above = (channels.moving(channels.rate, expected + change)
+                          for change in (-step, 0.0, step))
+    slope = (model.error(above) - model.error(below)) / (2.0 * step)
+    columns = np.column_stack([row for term in terms for row in term.sensitivity(here)])
+    return columns / np.maximum(1.0 - slope, 0.1)[:, None], dwells.output - expected
+
+
+def _search(dwells: Dwells, terms: tuple[Term, ...]) -> tuple[Term, ...]:
+    """Set each fitted shape in turn to the best of a grid over its bounds."""
+    for number, term in enumerate(terms):
+        for place in term.fitted:
+            if place < len(term.effect.shapes):
+                grid = np.geomspace(*term.effect.shapes[place].bounds, 60).tolist()
+                tried = [(*terms[:number], _with(term, place, value), *terms[number + 1:])
+                         for value in grid]
+                terms = min(tried, key=lambda each: _linear_misfit(dwells, each))
+    return terms
+
+
+def _with(term: Term, place: int, value: float) -> Term:
+    low, high = term.effect.parameters[place].bounds
+    return replace(term, values=(*term.values[:place], min(max(value, low), high),
+                                 *term.values[place + 1:]))
+
+
+def _linear_misfit(dwells: Dwells, terms: Sequence[Term]) -> float:
+    """Return the sum of squares that is left when the coefficients, not the shapes, are fitted."""
+    channels = channels_of(dwells)
+    columns = [term.columns(channels)[place - len(term.effect.shapes)]
+               for term in terms for place in term.fitted if place >= len(term.effect.shapes)]
+    error = error_of(dwells, terms)
+    matrix = np.column_stack([*columns, np.zeros(len(dwells))])
+    return float(np.sum((error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0]) ** 2))
+
+
+def _solve(dwells: Dwells, terms: tuple[Term, ...], whitener: Whitener) -> tuple[Term, ...]:
+    """Take Gauss-Newton steps; where only coefficients are fitted the first is the solution."""
+    for _ in range(20):
+        orthogonal, triangle, lengths = _factor(dwells, terms, whitener)
+        step = solve_triangular(
+            triangle, orthogonal.T @ whitener.whiten(error_of(dwells, terms))) / lengths
+        terms = _moved(terms, step)
+        if np.all(np.abs(step) * lengths < 1e-6):  # of a standard deviation
+            break
+    return terms
+
+
+def _moved(terms: Sequence[Term], step: Array) -> tuple[Term, ...]:
+    changes, moved = iter(step.tolist()), []
+    for term in terms:
+        for place in term.fitted:
+            term = _with(term, place, term.values[place] + next(changes))
+        moved.append(term)
+    return tuple(moved)
+
+
+def _factor(dwells: Dwells, terms: Sequence[Term],
+            whitener: Whitener) -> tuple[Array, Array, Array]:
+    """Return Q and R of the whitened columns, each of length one, and their lengths before."""
+    columns = whitener.whiten(columns_of(dwells, terms))
+    lengths = np.linalg.norm(columns, axis=0)
+    orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
+    if not np.linalg.cond(triangle) < LARGEST_CONDITION:
+        raise _not_parted(terms, triangle)
+    return orthogonal, triangle, lengths
+
+
+# what a fit shows
+
+def _calibration(dwells: Dwells, terms: tuple[Term, ...], scatter: Scatter,
+                 whitener: Whitener) -> Calibration:
+    used = take(dwells, scatter.kept)
+    orthogonal, triangle, lengths = _factor(used, terms, whitener)
+    whitened = whitener.whiten(error_of(used, terms))
+    left_out, deviation = np.full(len(dwells), np.nan), np.full(len(dwells), np.nan)
+    left_out[scatter.kept], deviation[scatter.kept] = (_left_out(orthogonal, whitened, whitener),
+                                                       whitener.deviation)
+    return Calibration(terms, dwells, scatter, error_of(dwells, terms), left_out, deviation,
+                       float(np.linalg.cond(triangle)), len(used) - len(lengths),
+                       float(whitened @ whitened))
+
+
+def _left_out(orthogonal: Array, whitened: Array, whitener: Whitener) -> Array:
+    """Return each dwell's residual of a fit without its sweep: the deleted residuals."""
+    parts = whitener.parts
+    rest = np.eye(orthogonal.shape[1]) - summed(orthogonal[:, :, None] * orthogonal[:, None, :],
+                                                parts)
+    alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9  # only this sweep shows some value
+    rest[alone] = np.eye(len(rest[0]))
+    changes = np.linalg.solve(
+        rest, summed(orthogonal * whitened[:, None], parts)[:, :, None])[:, :, 0]
+    left_out = whitened + np.einsum('nm,nm->n', orthogonal, changes[parts])
+    return np.where(alone[parts], math.inf, whitener.restore(left_out))
+
+
+def _model(dwells: Dwells, terms: tuple[Term, ...], covariance: Array | None) -> GyroModel:
+    outputs, temperatures = dwells.output, dwells.temperature
+    middle = 25.0 if temperatures is None else round(float(temperatures.mean()), 1)
+    temperature_range = ((-math.inf, math.inf) if temperatures is None
+                         else (float(temperatures.min()), float(temperatures.max())))
+    return GyroModel(terms, covariance, (float(outputs.min()), float(outputs.max())),
+                     temperature_range, middle)
+
+
+# refusals
+
+def _refuse_few(dwells: Dwells, terms: Sequence[Term]) -> None:
+    values = sum(len(term.fitted) for term in terms)
+    if len(dwells) < values:
+        raise DataRefused(f'{len(dwells)} dwells do not determine {values} values; '
+                          'add dwells, or fit fewer effects')
+
+
+def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
+    thermal = [effect.name for effect in effects if 'temperature' in effect.looks_at]
+    if not thermal:
+        return
+    unseen = f'{", ".join(thermal)} cannot be seen'
+    if dwells.temperature is None:
+        raise EffectsNotParted(f'{unseen}: the log holds no temperature; '
+                               'record temperature_degc too', thermal)
+    spread = float(np.ptp(dwells.temperature))
+    if spread < SMALLEST_TEMPERATURE_SPREAD:
+        raise EffectsNotParted(f'{unseen}: the temperature varies by {spread:.2g} K, wanted at '
+                               f'least {SMALLEST_TEMPERATURE_SPREAD:g} K; '
+                               'repeat the rates at another temperature', thermal)
+
+
+def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
+    """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
+    direction = np.abs(np.linalg.svd(triangle)[2][-1])
+    owners = [term.effect for term in terms for _ in term.fitted]
+    alike = [effect for effect in dict.fromkeys(owners)
+             if max(size for size, owner in zip(direction, owners) if owner is effect)
+             > 0.1 * direction.max()]
+    names = [effect.name for effect in alike]
+    if len(names) == 1:
+        return EffectsNotParted(f'{names[0]} cannot be determined from these dwells; '
+                                f'{alike[0].shown_by}', names)
+    advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1]
+                                     if effect.shown_by))
+    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be parted; '
+                            f'{advice}, or leave one out', names)
+
+
+# looking at it
+
+@dataclass(frozen=True)
+class Bin:
+    """
+    Dwells of nearly one rate, or nearly one temperature.
+
+    Attributes
+    ----------
+    low, high : ends of the bin, in the unit of what was binned
+    count : of dwells
+    before, residual : mean error without the model and with it, rad/s
+    deviation : standard deviation of the mean residual, rad/s
+    rms : of the residual, rad/s
+
+    """
+
+    low: float
+    high: float
+    count: int
+    before: float
+    residual: float
+    deviation: float
+    rms: float
+
+
+def binned(fit: Calibration, values: Array, most: int = 8) -> list[Bin]:
+    """Return the errors over one quantity, shape (n,), in non-empty bins of equal width."""
+    edges = np.linspace(values.min(), values.max(), min(most, len(np.unique(values))) + 1)
+    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
+    chosen = [(place == number) & fit.scatter.kept for number in range(len(edges) - 1)]
+    return [_bin(fit, float(low), float(high), part)
+            for low, high, part in zip(edges, edges[1:], chosen) if part.any()]
+
+
+def _bin(fit: Calibration, low: float, high: float, chosen: Mask) -> Bin:
+    part, residual = take(fit.dwells, chosen), fit.residual[chosen]
+    # What a sweep shares does not average out within it.
+    sweeps = np.unique(part.sweep, return_inverse=True)[1]
+    variance = (np.sum(fit.deviation[chosen] ** 2)
+                + np.sum(summed(fit.scatter.shared(part), sweeps) ** 2))
+    before = float((part.output - part.rate).mean())
+    return Bin(low, high, len(part), before, float(residual.mean()),
+               math.sqrt(float(variance)) / len(part), rms(residual))

@@ -1,0 +1,307 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What went wrong in a run that its profile does not explain: a name, a test and a remedy for each.
+
+A gyro that is dead or saturated shows that by itself. What the robot did otherwise shows by which
+motion explains the run best: the profile with one deviating stretch, driven faster or slower,
+begun late, or ended early.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.calibration.likelihood import unlikeliest
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.motion import Motion
+import numpy as np
+
+#: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
+#: toggles.
+_DEAD = 0.9
+#: A flat top has at least so many samples at a limit, this part of all, and so many times as many
+#: as the code beside it.
+_FLAT, _FLAT_PART, _FLAT_RATIO = 10, 0.005, 3.0
+#: Where this part of neighbours differ at a steady rate, in blocks of so many samples, the noise
+#: is resolved, and no honest top stays in one code.
+_RESOLVED, _BLOCK = 0.2, 10
+#: Length of the pieces that motions are compared by, and step of the begins, ends and offsets that
+#: are tried, s. A long run has longer pieces, at most so many: the search takes the cube of their
+#: number.
+_PIECE, _STEP, _MOST_PIECES = 0.1, 0.1, 650
+#: Speeds that are tried, as parts of the profile's.
+_SPEEDS = 2.0 ** (np.arange(-32, 33) / 16.0)
+#: A motion explains a run if it leaves no more than this part of its squares.
+EXPLAINED = 0.1
+#: One that needs a stretch of its own must leave so many times less than one that does not.
+_SIMPLER = 1.5
+
+#: What a gyro that reports so many times the true rate may be: a confused unit of the gyro, or of
+#: the profile.
+_UNITS = {
+    180.0 / math.pi: ('the gyro is in deg/s and read as rad/s',
+                      'the profile in rad and read as deg'),
+    math.pi / 180.0: ('the gyro is in rad/s and read as deg/s',
+                      'the profile in deg and read as rad'),
+    1e3: ('the gyro is in thousandths (mdeg/s, mrad/s) and read as whole units',
+          'the profile in thousands'),
+    1e-3: ('the gyro is in thousands',
+           'the profile in thousandths (mdeg, mrad) and read as whole units'),
+    180e3 / math.pi: ('the gyro is in mdeg/s and read as rad/s',
+                      'the profile in rad and read as mdeg'),
+    math.pi / 180e3: ('the gyro is in rad/s and read as mdeg/s',
+                      'the profile in mdeg and read as rad'),
+    1e3 * math.pi / 180.0: ('the gyro is in mrad/s and read as deg/s',
+                            'the profile in deg and read as mrad'),
+    180e-3 / math.pi: ('the gyro is in deg/s and read as mrad/s',
+                       'the profile in mrad and read as deg'),
+    0.5 / math.pi: ('the gyro is in revolutions/s and read as rad/s '
+                    '(or in revolutions/min and read as deg/s)',
+                    'the profile in rad and read as revolutions'),
+    2.0 * math.pi: ('the gyro is in rad/s and read as revolutions/s',
+                    'the profile in revolutions and read as rad'),
+    1.0 / 360.0: ('the gyro is in revolutions/s and read as deg/s',
+                  'the profile in deg and read as revolutions'),
+    360.0: ('the gyro is in deg/s and read as revolutions/s',
+            'the profile in revolutions and read as deg'),
+    30.0 / math.pi: ('the gyro is in revolutions/min and read as rad/s',
+                     'the profile is 9.5 times too slow'),
+    3600.0: ('the gyro is in deg/h and read as deg/s', 'the profile is 3600 times too slow'),
+    648e3 / math.pi: ('the gyro is in deg/h and read as rad/s',
+                      'the profile is 206265 times too slow'),
+    1.0 / 3600.0: ('the gyro is in deg/s and read as deg/h', 'the profile is 3600 times too fast'),
+    2.0: ('the gyro is read with twice its sensitivity',
+          'the profile was driven at twice its rate'),
+    0.5: ('the gyro is read with half its sensitivity', 'the profile was driven at half its rate'),
+    **{factor: (f'the gyro is read with {factor:g} times its sensitivity',
+                f'the profile was driven at {factor:g} times its rate')
+       for factor in (4.0, 8.0, 10.0, 100.0, 0.25, 0.125, 0.1, 0.01)},
+}
+#: Scale errors up to this, as a logarithm, go with a unit.
+_NEAR = math.log(1.1)
+
+
+def unit_error(scale: float, by_profile: bool = True) -> str:
+    """
+    Return the error of units, of gyro or profile, that explains a scale; '' where there is none.
+
+    Parameters
+    ----------
+    scale : reported over true rate
+    by_profile : the unit of the profile may be wrong too
+
+    """
+    size = abs(math.log(max(abs(scale), 1e-300)))
+    nearest = min(_UNITS, key=lambda factor: abs(math.log(max(abs(scale), 1e-300) / factor)))
+    if size < _NEAR or abs(math.log(max(abs(scale), 1e-300) / nearest)) > _NEAR:
+        return ''
+    turned = ', and turns the other way' if scale < 0.0 else ''
+    gyro, profile = _UNITS[nearest]
+    cause = f'either {gyro}, or {profile}' if by_profile else gyro
+    return (f'the gyro reports {abs(scale):.4g} times what was turned{turned}: '
+            f'{cause}; mend the unit')
+
+
+def refuse_dead(rate: Array) -> None:
+    """Refuse samples of one value, or nearly all of one."""
+    if np.ptp(rate) == 0.0:
+        raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: '
+                          'the gyro is dead or not powered')
+    values, counts = np.unique(rate, return_counts=True)
+    part = counts.max() / len(rate)
+    if part > _DEAD:
+        raise DataRefused(f'{100 * part:.1f} % of the samples have the same value, '
+                          f'{values[counts.argmax()]:g} rad/s: the gyro is dead, not powered, '
+                          'or did not move')
+
+
+def refuse_saturated(output: Array) -> None:
+    """
+    Refuse an output that stays at its largest or smallest value as no noise does.
+
+    Codes so coarse that they hide the noise stay honestly: only the profile can tell then.
+
+    """
+    limit = _limit(output)
+    if limit is not None and _resolved(output):
+        raise _saturated(output, limit)
+
+
+def _saturated(output: Array, limit: float) -> DataRefused:
+    part = 100 * np.mean(output == limit)
+    return DataRefused(f'the gyro is saturated: {part:.0f} % of the samples are at its limit of '
+                       f'{limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
+
+
+def _limit(output: Array) -> float | None:
+    """Return the largest or smallest value if it is a flat top."""
+    values, counts = np.unique(output, return_counts=True)
+    if len(values) < 2:
+        return None
+    for end, beside in ((-1, -2), (0, 1)):
+        if (counts[end] >= max(_FLAT, _FLAT_PART * len(output))
+                and counts[end] > _FLAT_RATIO * counts[beside]):
+            return float(values[end])
+    return None
+
+
+def _resolved(output: Array) -> bool:
+    """
+    Tell whether the codes resolve the noise: whether they change at a steady rate.
+
+    The steady rate is that of the flattest quarter of the blocks away from both ends.
+
+    """
+    blocks = output[:len(output) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
+    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
+    if len(blocks) < 4:
+        return False
+    slopes = np.abs(blocks[:, _BLOCK // 2:].mean(axis=1) - blocks[:, :_BLOCK // 2].mean(axis=1))
+    flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
+    return bool(np.mean(np.diff(flattest, axis=1) != 0.0) > _RESOLVED)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A run in short pieces: their edges, s, and how far the gyro turned in each, rad."""
+
+    edges: Array
+    turned: Array
+
+    def headings(self, motion: Motion, offset: float = 0.0, speed: float = 1.0,
+                 end: float = math.inf) -> Array:
+        """Return the turn in each piece, rad, by a motion late by `offset` and cut at `end`, s."""
+        return np.diff(motion.heading_at(np.minimum(speed * (self.edges - offset), end)))
+
+    def left(self, reference: Array) -> tuple[float, float]:
+        """Return the unexplained part of the squares, and the scale; 1 and 0 without pieces."""
+        if not len(self.turned):
+            return 1.0, 0.0
+        known, turned = reference - reference.mean(), self.turned - self.turned.mean()
+        power = float(known @ known)
+        scale = float(known @ turned) / power if power > 0.0 else 0.0
+        return 1.0 - scale * float(known @ turned) / max(float(turned @ turned), 1e-300), scale
+
+
+def pieces(time: Array, rate: Array) -> Pieces:
+    """Return a run in pieces."""
+    length = max(_PIECE, 2.0 * float(np.median(np.diff(time))),
+                 float(time[-1] - time[0]) / _MOST_PIECES)
+    edges = np.arange(time[0], time[-1], length)
+    return Pieces(edges, np.diff(np.interp(edges, time, integrate(time, rate))))
+
+
+def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str = '') -> None:
+    """
+    Refuse a run that another motion explains far better than the profile, with the cause.
+
+    Parameters
+    ----------
+    slip : what is said of a slip, where more is known of it than its pieces show
+
+    Raises
+    ------
+    DataRefused : with the cause that explains it best
+
+    """
+    ways = {name: _best(way(run, motion, largest_offset)) for name, way in _WAYS.items()}
+    name = min(ways, key=lambda each: ways[each][0] * _PENALTIES.get(each, 1.0))
+    left, value = ways[name]
+    if _SIMPLER * left > followed(run, motion, largest_offset)[0] <= EXPLAINED:
+        return
+    if left > EXPLAINED:
+        raise DataRefused('the robot turned otherwise than the profile (the best that can be made '
+                          f'of it explains {100 * max(1 - left, 0.0):.0f} % of the run): '
+                          'was another profile driven?')
+    raise DataRefused(slip if slip and name == 'slip' else _SENTENCES[name](value, motion))
+
+
+def followed(run: Pieces, motion: Motion, largest_offset: float) -> tuple[float, float]:
+    """Return what the profile leaves unexplained at the best delay, and the scale there."""
+    return min(run.left(run.headings(motion, offset)) for offset in _offsets(largest_offset))
+
+
+#: Unexplained part of a run, and the value of what was tried: a speed, s, or a turn in rad with
+#: its time, s.
+Tried = Iterable[tuple[float, tuple[float, ...]]]
+
+
+def _best(tried: Tried) -> tuple[float, tuple[float, ...]]:
+    """Return what leaves the least; where there was nothing to try, all is left."""
+    return min(tried, key=lambda each: each[0], default=(math.inf, ()))
+
+
+def _offsets(largest: float) -> Array:
+    return np.arange(-round(largest / _STEP), round(largest / _STEP) + 1) * _STEP
+
+
+def _early(run: Pieces, motion: Motion, largest: float) -> Tried:
+    """Try ends of the motion; the delay is that which fits the part before."""
+    for end in np.arange(0.05, 0.97, 0.0125) * motion.duration:
+        yield _best((run.left(run.headings(motion, offset, end=end))[0], (float(end),))
+                    for offset in _offsets(largest)[::2])
+
+
+def _speed(run: Pieces, motion: Motion, largest: float) -> Tried:
+    for speed in _SPEEDS[np.abs(np.log(_SPEEDS)) > _NEAR]:
+        for offset in _offsets(largest)[::2]:
+            yield run.left(run.headings(motion, offset, float(speed)))[0], (float(speed),)
+
+
+def _late(run: Pieces, motion: Motion, largest: float) -> Tried:
+    for offset in _offsets(0.6 * motion.duration):
+        if abs(offset) > largest:
+            yield run.left(run.headings(motion, offset))[0], (float(offset),)
+
+
+def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
+    """Try a stretch that turned otherwise, at the delay that fits best with it."""
+    edges = np.arange(0, len(run.turned) + 1, 5)
+    interval = float(np.median(np.diff(run.edges)))
+    steps = np.where(np.arange(len(run.turned))[:, None] >= edges, interval, 0.0)
+    whole = np.sum((run.turned - run.turned.mean()) ** 2)
+    for offset in _offsets(largest):
+        reference = run.headings(motion, offset)
+        first, last, rate, squares, _ = unlikeliest(
+            np.column_stack([reference, np.full(len(reference), interval)]), steps, run.turned)
+        left = run.left(reference)[0] - squares / max(float(whole), 1e-300)
+        yield left, (rate * float(edges[last] - edges[first]) * interval,
+                     float(run.edges[edges[first]]))
+
+
+_WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {
+    'early': _early, 'speed': _speed, 'late': _late, 'slip': _slip}
+_PENALTIES = {'slip': _SIMPLER}
+_SENTENCES: dict[str, Callable[[tuple[float, ...], Motion], str]] = {
+    'early': lambda value, motion: (
+        f"the robot stopped at about {value[0]:.1f} s of the profile's {motion.duration:.1f} s: "
+        'drive the whole profile'),
+    'speed': lambda value, motion: (
+        f'the robot drove the profile {value[0]:.2f} times as fast as it says, in '
+        f'{motion.duration / value[0]:.1f} s instead of {motion.duration:.1f} s: '
+        'drive it at its own speed, or give the profile that was driven'),
+    'late': lambda value, _: (
+        f'the robot began {abs(value[0]):.1f} s {"after" if value[0] > 0 else "before"} '
+        'the profile: begin with it, or allow a larger time offset'),
+    'slip': lambda value, _: slip_sentence(abs(value[0]), value[1]),
+}
+
+
+def slip_sentence(turned: float, time: float, size: float = math.nan) -> str:
+    """Say that the robot slipped or was bumped."""
+    sure = '' if math.isnan(size) else f' ({size:.0f} standard deviations)'
+    return (f'a stretch of the run turned {turned / DEGREE:.1f} deg otherwise than the '
+            f'profile{sure}, at about {time:.1f} s: a slip or a bump; run again on free ground')

@@ -1,0 +1,414 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The scatter of dwells about a gyro's effects, and the uncertainty of the effects' values.
+
+The error of a dwell, output less rate, is the sum of the effects and of three scatters: its own,
+that of its sweep's bias, and that of its sweep's scale factor (a bias that wanders, a temperature
+that the sensor does not show). Their sizes are found by restricted likelihood, so that thirty
+dwells of one sweep do not count as thirty independent ones.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.calibration.likelihood import robust_residual
+from gyro_calibration.logs.log import Array, DataRefused, Mask
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+from scipy.stats import t as student
+
+#: A dwell beyond this many robust standard deviations is outlying, and is not fitted.
+OUTLYING = 6.0
+#: With a smaller spread, K, a sensor's own error looks like a change of temperature.
+SMALLEST_TEMPERATURE_SPREAD = 1.0
+#: With fewer, what the dwells of a sweep have in common is not distinguishable from chance.
+FEWEST_SWEEPS = 4
+#: Largest number of blocks of dwells that replace sweeps where there are fewer sweeps.
+_MOST_BLOCKS = 60
+#: With fewer, an outlying dwell is not distinguishable from a nonlinear gyro.
+_FEWEST_DWELLS = 12
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """
+    Standard deviations of dwells about a smooth surface over rate and temperature.
+
+    The surface is as smooth as the number of dwells allows. The scatter does not depend on the
+    effects that are fitted: one found with too few of them would include what they leave.
+
+    Attributes
+    ----------
+    dwell : of a dwell, beyond its own deviation, rad/s
+    dwell_scale : of the scale factor from dwell to dwell, 1, such as that of a table's speed
+    sweep_bias : of the bias from sweep to sweep, rad/s
+    sweep_scale : of the scale factor from sweep to sweep, 1
+    kept : which dwells are not outlying, shape (n,)
+
+    """
+
+    dwell: float
+    dwell_scale: float
+    sweep_bias: float
+    sweep_scale: float
+    kept: Mask
+
+    def deviation(self, dwells: Dwells) -> Array:
+        """Return the standard deviation of each dwell without its sweep's, rad/s, shape (n,)."""
+        return np.sqrt(_own_deviation(dwells) ** 2 + self.dwell ** 2
+                       + (self.dwell_scale * dwells.rate) ** 2)
+
+    def shared(self, dwells: Dwells) -> Array:
+        """Return the effect of one deviation of sweep bias and scale, rad/s, shape (n, 2)."""
+        return np.column_stack([np.full(len(dwells), self.sweep_bias),
+                                self.sweep_scale * dwells.rate])
+
+
+def _own_deviation(dwells: Dwells) -> Array:
+    """Return the deviations of the dwells, rad/s; an unknown one is the rms of the others."""
+    known = np.isfinite(dwells.deviation)
+    typical = rms(dwells.deviation[known]) if known.any() else 0.0
+    return np.where(known, dwells.deviation, typical)
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def parts_of(dwells: Dwells) -> Numbers:
+    """
+    Return the number of the part that each dwell is left out with, from 0 on, shape (n,).
+
+    It is the sweep, as what its dwells have in common does not predict other sweeps. Fewer than
+    four sweeps show too little of the gyro without one of them, two temperatures nothing of the
+    slope between them: then parts are blocks of time, or the dwells.
+
+    """
+    parts = np.unique(dwells.sweep, return_inverse=True)[1]
+    return (parts if parts.max() + 1 >= FEWEST_SWEEPS
+            else np.arange(len(dwells)) * min(len(dwells), _MOST_BLOCKS) // len(dwells))
+
+
+def summed(values: Array, parts: Numbers) -> Array:
+    """Return the sums of values of shape (n, ...) over each part, shape (parts, ...)."""
+    order = np.argsort(parts, kind='stable')
+    return np.add.reduceat(values[order], np.flatnonzero(np.diff(parts[order], prepend=-1)))
+
+
+class Whitener:
+    """The covariance of the errors of dwells: independent sweeps, two shared directions each."""
+
+    def __init__(self, dwells: Dwells, scatter: Scatter):
+        """Find the directions of each sweep, and the scatter of its dwells along them."""
+        self.parts = parts_of(dwells)
+        self.deviation = scatter.deviation(dwells)
+        self._shared = scatter.shared(dwells) / self.deviation[:, None]
+        self._sizes, self._directions = np.linalg.eigh(
+            summed(self._shared[:, :, None] * self._shared[:, None, :], self.parts))
+
+    def whiten(self, values: Array) -> Array:
+        """Return columns of shape (n,) or (n, m) as independent ones of variance one."""
+        return self._stretched((values.T / self.deviation).T, -0.5)
+
+    def restore(self, whitened: Array) -> Array:
+        """Return what `whiten` was given, shape (n,)."""
+        return self._stretched(whitened, 0.5) * self.deviation
+
+    def _stretched(self, values: Array, power: float) -> Array:
+        """Multiply by a power of the covariance in units of the dwells' own."""
+        sizes = np.maximum(self._sizes, 1e-12)
+        # the covariance is the identity plus the products of two columns a sweep
+        inner = (self._directions * (((1.0 + sizes) ** power - 1.0) / sizes)[:, None, :]
+                 @ self._directions.swapaxes(1, 2))
+        columns = values.reshape(len(values), -1)
+        along = inner @ summed(self._shared[:, :, None] * columns[:, None, :], self.parts)
+        return values + np.einsum('ni,nim->nm', self._shared,
+                                  along[self.parts]).reshape(values.shape)
+
+
+# how large it is
+
+def find_scatter(dwells: Dwells) -> Scatter:
+    """Return how dwells scatter, by restricted likelihood, and which of them are outlying."""
+    kept = not_outlying(dwells)
+    used = take(dwells, kept)
+    error, surface = used.output - used.rate, _surface(used)
+    # The likelihood does not depend on what the surface explains; errors near zero would be lost
+    # in rounding beside it.
+    error = error - surface @ (surface.T @ error)
+    size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
+    relative = size / max(float(np.abs(used.rate).max()), 1e-9)
+    units = np.array([size, relative, size, relative])[:_sought(used)]
+
+    def scatter(logarithms: Array) -> Scatter:
+        return Scatter(  # type: ignore[misc]
+            *np.append(units * np.exp(logarithms), np.zeros(4 - len(units))).tolist(), kept=kept)
+
+    # not by a simplex, which collapses onto a bound and stays there
+    best = minimize(
+        lambda logarithms: -_restricted_likelihood(used, scatter(logarithms), error, surface),
+        np.array([0.0, -1.5, -1.5, -1.5])[:len(units)], method='L-BFGS-B',
+        bounds=[(-7.0, 2.0)] * len(units), options={'eps': 1e-4, 'ftol': 1e-7})
+    return scatter(best.x)
+
+
+def _sought(dwells: Dwells) -> int:
+    """Return how many of the four scatters the dwells and sweeps determine."""
+    if len(dwells) < _FEWEST_DWELLS:
+        return 1
+    return 4 if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 2
+
+
+def not_outlying(dwells: Dwells) -> Mask:
+    """Return which dwells are not outlying, by a fit that counts residuals by their size."""
+    surface = _surface(dwells)
+    residual = np.abs(robust_residual(surface, dwells.output - dwells.rate, 20))
+    # Such a fit passes through as many dwells as it has columns; these do not show the scatter.
+    spread = 1.4826 * float(np.median(np.sort(residual)[surface.shape[1]:]))
+    return (residual <= OUTLYING * spread + 1e-12) | (len(dwells) < _FEWEST_DWELLS)
+
+
+def _surface(dwells: Dwells) -> Array:
+    """
+    Return orthonormal columns of a smooth surface over rate and temperature, shape (n, m).
+
+    There is at most one column for three dwells.
+
+    """
+    if len(dwells) < 2:
+        raise DataRefused('a single dwell shows no effect: '
+                          'turn at more rates, and rest between them')
+    rate = dwells.rate / max(float(np.abs(dwells.rate).max()), 1e-9)
+    temperature = (np.zeros(len(rate)) if dwells.temperature is None
+                   else dwells.temperature - dwells.temperature.mean())
+    temperature = temperature / max(float(np.abs(temperature).max()),
+                                    0.5 * SMALLEST_TEMPERATURE_SPREAD)
+    powers = sorted(((i, j) for i in range(6) for j in range(3)),
+                    key=lambda power: (power[0] + 2 * power[1], power[1]))
+    products = [rate ** i * temperature ** j for i, j in powers]
+    columns = np.column_stack([*products[:4], np.abs(rate), *products[4:]])[
+        :, :max(len(rate) // 3, min(len(rate) - 1, 2))]
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, sizes > 1e-4 * sizes[0]]
+
+
+def freedom_beside_surface(dwells: Dwells) -> int:
+    """Return the number of dwells less that of the columns of the surface of their scatter."""
+    return len(dwells) - _surface(dwells).shape[1]
+
+
+def _restricted_likelihood(dwells: Dwells, scatter: Scatter, error: Array,
+                           columns: Array) -> float:
+    """Return the log-likelihood of the scatter, whatever the values are, up to a constant."""
+    deviation = scatter.deviation(dwells)
+    sums = _Sums.of(dwells, deviation, np.column_stack([columns, error]))
+    (gram,), (of_sweeps,) = sums.reduced(np.array([[scatter.sweep_bias, scatter.sweep_scale]]))
+    factor = np.linalg.cholesky(gram[:-1, :-1])
+    explained = solve_triangular(factor, gram[:-1, -1], lower=True)
+    log_determinant = (float(of_sweeps) + 2.0 * float(np.log(deviation).sum())
+                       + 2.0 * float(np.log(np.diag(factor)).sum()))
+    return -0.5 * (log_determinant + float(gram[-1, -1] - explained @ explained))
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """
+    The sums of columns that a likelihood needs, whatever the scatter of sweeps is.
+
+    Attributes
+    ----------
+    gram : products of the columns, shape (m, m)
+    inner : products of what each sweep shares, shape (sweeps, 2, 2)
+    outer : products of that and the columns, shape (sweeps, 2, m)
+
+    """
+
+    gram: Array
+    inner: Array
+    outer: Array
+
+    @classmethod
+    def of(cls, dwells: Dwells, deviation: Array, columns: Array) -> _Sums:
+        """Sum over each sweep."""
+        columns = columns / deviation[:, None]
+        shared = np.column_stack([np.ones(len(dwells)), dwells.rate]) / deviation[:, None]
+        inner, outer = (summed(shared[:, :, None] * each[:, None, :], parts_of(dwells))
+                        for each in (shared, columns))
+        return cls(columns.T @ columns, inner, outer)
+
+    def reduced(self, sizes: Array) -> tuple[Array, Array]:
+        """
+        Return products of the whitened columns, and log-determinant of the sweeps (Woodbury).
+
+        Parameters
+        ----------
+        sizes : of the scatter of sweeps' bias and scale, shape (k, 2)
+
+        Returns
+        -------
+        arrays of shape (k, m, m) and (k,)
+
+        """
+        inner = np.eye(2) + sizes[:, None, :, None] * self.inner * sizes[:, None, None, :]
+        outer = sizes[:, None, :, None] * self.outer
+        taken = np.einsum('ksij,ksil->kjl', outer, np.linalg.solve(inner, outer), optimize=True)
+        return self.gram - taken, np.linalg.slogdet(inner)[1].sum(axis=1)
+
+
+# what it leaves open
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """
+    The uncertainty of values fitted to dwells.
+
+    Few dwells and few sweeps do not determine how large the scatter is. So the distribution of the
+    values is averaged over possible scatters, weighted by their restricted likelihood: that of the
+    dwells gives Student's distribution, that of the sweeps is summed over a grid. The prior
+    probability that sweeps share nothing is one half; if they do share something, it is about as
+    large as the scatter of a dwell (half Cauchy, Gelman 2006). The maximum of the likelihood alone
+    would be at zero about every other time, and its intervals too narrow.
+
+    Attributes
+    ----------
+    weights : of possible scatters, shape (k,)
+    offsets : from the values that were fitted to the middle of their distribution, shape (k, m)
+    covariances : scale matrices of the distribution, shape (k, m, m)
+    freedom : of Student's distribution
+    sweeps : root mean square over all possible scatters of the bias of a sweep, rad/s, and of its
+        scale factor, 1, shape (2,)
+
+    """
+
+    weights: Array
+    offsets: Array
+    covariances: Array
+    freedom: int
+    sweeps: Array
+
+    @classmethod
+    def of(cls, dwells: Dwells, scatter: Scatter, columns: Array, error: Array) -> Uncertainty:
+        """
+        Average over what the scatter may be.
+
+        Parameters
+        ----------
+        dwells : that were fitted, more than there are values
+        scatter : of them
+        columns : change of the error for each value, shape (n, m)
+        error : residual of the fitted values, rad/s, shape (n,)
+
+        """
+        lengths = np.linalg.norm(columns, axis=0)
+        deviation = scatter.deviation(dwells)
+        sums = _Sums.of(dwells, deviation, np.column_stack([columns / lengths, error]))
+        freedom = len(dwells) - len(lengths)
+        weights, offsets, covariances, sweeps = _averaged(sums, freedom,
+                                                          _units(dwells, deviation))
+        return cls(weights, offsets / lengths, covariances / np.outer(lengths, lengths), freedom,
+                   sweeps)
+
+    @property
+    def deviations(self) -> Array:
+        """Return the scales of the distributions of each value, shape (k, m)."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+
+    def below(self, change: Array | float) -> Array:
+        """Return the probability that each value is below the fitted plus a change, shape (m,)."""
+        return np.asarray(self.weights @ student.cdf((change - self.offsets) / self.deviations,
+                                                     self.freedom))
+
+    def covariance(self) -> Array:
+        """Return the covariance, (m, m), so wide that 1.96 standard deviations hold 95 %."""
+        low = np.zeros(self.offsets.shape[1])
+        high = (2.0 * student.ppf(0.975, self.freedom)
+                * (self.deviations + np.abs(self.offsets)).max(axis=0))
+        for _ in range(25):
+            half = 0.5 * (low + high)
+            narrow = self.below(half) - self.below(-half) < 0.95
+            low, high = np.where(narrow, half, low), np.where(narrow, high, half)
+        covariance = np.tensordot(self.weights, self.covariances, axes=1)
+        widened = high / 1.959964 / np.sqrt(np.diag(covariance))
+        return covariance * np.outer(widened, widened)
+
+
+def _units(dwells: Dwells, deviation: Array) -> Array:
+    """Return scatters of sweep bias and scale as large as a dwell's; zeros for few sweeps."""
+    return (np.array([rms(deviation), rms(deviation) / max(rms(dwells.rate), 1e-9)])
+            * (_sought(dwells) == 4))
+
+
+def _averaged(sums: _Sums, freedom: int, units: Array) -> tuple[Array, Array, Array, Array]:
+    """
+    Return weights of possible scatters of sweeps, offsets of the values and their covariances.
+
+    The shapes are (k,), (k, m) and (k, m, m). The last one, of shape (2,), is the root mean square
+    of the scatters.
+
+    """
+    shown = bool(units.any())
+    axes = [np.concatenate([[0.0], np.geomspace(0.03, 300.0, 14)]) if shown else np.zeros(1)] * 2
+    for _ in range(2 if shown else 1):
+        found = [_given(sums, freedom,
+                        units * np.column_stack([np.full(len(axes[1]), bias), axes[1]]))
+                 for bias in axes[0]]
+        logarithm = np.array([each[0] for each in found])
+        weights = (np.exp(logarithm - logarithm.max())
+                   * np.outer(*(_prior(axis) for axis in axes)))
+        weights /= weights.sum()
+        axes = [_nearer(axis, weights.sum(axis=other)) for axis, other in zip(axes, (1, 0))]
+    likely = weights.ravel() > 1e-4
+    values, covariances, squares = (np.concatenate([each[place] for each in found])[likely]
+                                    for place in (1, 2, 3))
+    share = weights.ravel()[likely] / weights.ravel()[likely].sum()
+    return share, values, covariances, np.sqrt(share @ squares)
+
+
+def _given(sums: _Sums, freedom: int, sizes: Array) -> tuple[Array, Array, Array, Array]:
+    """
+    Return log-likelihoods of sweep scatters, shape (k, 2), with values and covariances.
+
+    Last come the squares of the scatters, in which the sizes are parts of what dwells show.
+
+    """
+    gram, log_determinant = sums.reduced(sizes)
+    inverse, right = np.linalg.inv(gram[:, :-1, :-1]), gram[:, :-1, -1]
+    values = np.einsum('kij,kj->ki', inverse, right)
+    misfit = np.maximum(gram[:, -1, -1] - np.einsum('ki,ki->k', values, right),
+                        1e-12 * sums.gram[-1, -1]) + 1e-200
+    logarithm = -0.5 * (log_determinant - np.linalg.slogdet(inverse)[1] + freedom * np.log(misfit))
+    size = misfit / freedom
+    return logarithm, values, inverse * size[:, None, None], sizes ** 2 * size[:, None]
+
+
+def _prior(sizes: Array) -> Array:
+    """Return the prior of each size: one half for 0, a half Cauchy for the others."""
+    if len(sizes) == 1:
+        return np.ones(1)
+    return np.concatenate([[0.5], sizes[1:] / math.pi / (1.0 + sizes[1:] ** 2)
+                           * math.log(sizes[2] / sizes[1])])
+
+
+def _nearer(sizes: Array, weights: Array) -> Array:
+    """Return 0 and sizes spaced about as finely as the likely ones above 0."""
+    if len(sizes) == 1:
+        return sizes
+    logarithms, share = np.log(sizes[1:]), weights[1:] / max(weights[1:].sum(), 1e-300)
+    middle = float(share @ logarithms)
+    spread = max(math.sqrt(float(share @ (logarithms - middle) ** 2)), 0.3)
+    return np.concatenate([[0.0], np.exp(middle + spread * np.linspace(-3.0, 3.0, 13))])

@@ -1,0 +1,217 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What a gyro's error makes of a full turn of 360 degrees (Ojeda et al., section 4).
+
+An error of the rate, rad/s, adds up to an error of the heading in each turn, rad, which is larger
+the slower the turn is. Two errors are compared: with the bias of a rest before the mission only,
+and with a model and then the bias that is left at rest.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import math
+
+from gyro_calibration.calibration.dwells import Dwells, Numbers, take
+from gyro_calibration.calibration.rate_table import Calibration, fit_effects
+from gyro_calibration.calibration.self_calibration import refuse_scale
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
+from gyro_calibration.model.compensation import compensate
+import numpy as np
+
+#: rad/s; the error of slower turns is mostly bias, not scale; as published.
+SLOWEST = 5.0 * DEGREE
+#: A dwell that turns slower than this is a rest.
+AT_REST = 0.1 * DEGREE
+
+
+@dataclass(frozen=True)
+class TurnErrors:
+    """
+    Errors of full turns, counter-clockwise positive as the heading is, each array of shape (n,).
+
+    Attributes
+    ----------
+    rate : true rate of the turn, rad/s
+    temperature : degC; None where the log holds none
+    static : with the static bias only, rad per turn
+    modelled : with the model, and the static bias after it, rad per turn
+    sweep : that the turn was measured in
+    place : where it stands in its file
+    remarks : where the static bias comes from, and what has no error, one sentence each
+
+    """
+
+    rate: Array
+    temperature: Array | None
+    static: Array
+    modelled: Array
+    sweep: Numbers
+    place: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rate)
+
+
+def turn_errors(dwells: Dwells, rate: Array, slowest: float = SLOWEST) -> TurnErrors:
+    """
+    Return the errors of full turns at the rates and temperatures of some dwells.
+
+    Parameters
+    ----------
+    dwells : without those that are outlying
+    rate : of each dwell by the model (eq. 13), rad/s, shape (n,); nan where there is none, as from
+        `predicted_rates`
+    slowest : of a turn, rad/s
+
+    Raises
+    ------
+    DataRefused : nothing turns as fast as that with a rate by the model, nothing shows the static
+        bias, or the gyro is upside down
+
+    """
+    known = np.isfinite(rate)
+    lost = int(np.count_nonzero(~known & (np.abs(dwells.rate) >= slowest)))
+    dwells, rate = take(dwells, known), rate[known]
+    wanted = np.abs(dwells.rate) >= slowest
+    if not wanted.any():
+        raise DataRefused(f'none of {len(known)} dwells turns at {slowest / DEGREE:g} deg/s or '
+                          'faster and has a rate by the model; '
+                          'record faster turns, or several sweeps')
+    turns = take(dwells, wanted)
+    _refuse_other_way(turns)
+    rests, remark = _rests(dwells)
+    nearest = [_nearest(dwells, place, rests) for place in np.flatnonzero(wanted).tolist()]
+    # eq. 1 and 2, and eq. 13, 15 and 16
+    static, modelled = (_turned(dwells, error, wanted, nearest)
+                        for error in (dwells.output - dwells.rate, rate - dwells.rate))
+    return TurnErrors(turns.rate, turns.temperature, static, modelled, turns.sweep, turns.place,
+                      (remark, *_unknown(lost)))
+
+
+def _refuse_other_way(turns: Dwells) -> None:
+    scale = float(turns.rate @ turns.output) / float(turns.rate @ turns.rate)
+    refuse_scale(scale - 1.0, 'reference', 'give --invert, or turn the gyro over')
+
+
+def _unknown(lost: int) -> Iterator[str]:
+    if lost:
+        yield f'{lost} turns are left out: the other sweeps do not determine the model'
+
+
+def _turned(dwells: Dwells, error: Array, wanted: Mask, nearest: list[_Rest]) -> Array:
+    """Return the integral over a turn of errors of a rate, less those at rest, rad (eq. 14)."""
+    bias = np.array([rest.bias(error) for rest in nearest])
+    return (error[wanted] - bias) * 2.0 * math.pi / np.abs(dwells.rate[wanted])
+
+
+# static bias
+
+@dataclass(frozen=True)
+class _Rest:
+    """The dwells of a sweep that show the static bias, and their weights, shape (k,)."""
+
+    sweep: int
+    temperature: float
+    dwells: Numbers
+    weights: Array
+
+    def bias(self, error: Array) -> float:
+        """Return the error at rest, rad/s, from that of all dwells, shape (n,)."""
+        return float(self.weights @ error[self.dwells])
+
+
+def _rests(dwells: Dwells) -> tuple[list[_Rest], str]:
+    """Return the rests of the sweeps, or where there is none the slowest turns both ways."""
+    numbers = np.unique(dwells.sweep)
+    for find, words in ((_at_rest, 'the static bias is from the rest of each sweep'),
+                        (_between_turns, 'no rest; the static bias is the error between the '
+                         'slowest turns both ways of each sweep')):
+        found = [rest for number in numbers if (rest := find(dwells, int(number))) is not None]
+        if found:
+            others = len(numbers) - len(found)
+            more = (f'; {others} of {len(numbers)} sweeps have none and take that of the nearest '
+                    'temperature' if others else '')
+            return found, words + more
+    raise DataRefused(f'{len(dwells)} dwells hold no rest and turn one way only, so that nothing '
+                      'shows the static bias; record a rest before each sweep')
+
+
+def _at_rest(dwells: Dwells, number: int) -> _Rest | None:
+    """Return the rests of a sweep (eq. 1)."""
+    rows = np.flatnonzero((dwells.sweep == number) & (np.abs(dwells.rate) <= AT_REST))
+    return _rest(dwells, number, rows, np.full(len(rows), 1.0)) if len(rows) else None
+
+
+def _between_turns(dwells: Dwells, number: int) -> _Rest | None:
+    """Return the slowest turn each way of a sweep: the line between their errors passes rest."""
+    ways = [np.flatnonzero((dwells.sweep == number) & (way * dwells.rate > 0.0))
+            for way in (1.0, -1.0)]
+    if not all(map(len, ways)):
+        return None
+    rows = np.array([rows[np.argmin(np.abs(dwells.rate[rows]))] for rows in ways])
+    return _rest(dwells, number, rows, np.abs(dwells.rate[rows[::-1]]))
+
+
+def _rest(dwells: Dwells, number: int, rows: Numbers, weights: Array) -> _Rest:
+    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[rows].mean())
+    return _Rest(number, temperature, rows, weights / weights.sum())
+
+
+def _nearest(dwells: Dwells, place: int, rests: list[_Rest]) -> _Rest:
+    """Return the rest of a dwell's sweep, or else the nearest in temperature, then in order."""
+    sweep = int(dwells.sweep[place])
+    temperature = 0.0 if dwells.temperature is None else float(dwells.temperature[place])
+    return min(rests, key=lambda rest: (
+        rest.sweep != sweep, abs(rest.temperature - temperature), abs(rest.sweep - sweep)))
+
+
+# rates by a model
+
+def predicted_rates(calibration: Calibration) -> Array:
+    """
+    Return the rate of each dwell by a model not fitted to its sweep, rad/s, shape (n,).
+
+    The effects are those of the calibration, their values are fitted anew to the other sweeps. In
+    a single sweep, only the dwell itself is left out. The rate is nan where the other sweeps do
+    not determine the model.
+
+    """
+    dwells, rates = calibration.dwells, np.full(len(calibration.dwells), np.nan)
+    groups = dwells.sweep if len(np.unique(dwells.sweep)) > 1 else np.arange(len(dwells))
+    for number in np.unique(groups):
+        hidden = groups == number
+        scatter = replace(calibration.scatter, kept=calibration.scatter.kept[~hidden])
+        try:
+            model = fit_effects(take(dwells, ~hidden), calibration.effects, scatter).model
+        except DataRefused:
+            continue
+        left_out = take(dwells, hidden)
+        rates[hidden] = compensate(model, left_out.output, left_out.temperature).rate
+    return rates
+
+
+@dataclass(frozen=True)
+class Size:
+    """Root mean square and largest absolute value of errors, rad per turn, and their count."""
+
+    rms: float
+    largest: float
+    count: int
+
+
+def size(errors: Array) -> Size:
+    """Return how large some errors are, shape (n,) with n above 0."""
+    return Size(float(np.sqrt(np.mean(errors ** 2))), float(np.abs(errors).max()), len(errors))

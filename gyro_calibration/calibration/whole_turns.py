@@ -1,0 +1,231 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Scale factor error and bias from whole turns between two rests on one mark.
+
+The robot rests on the mark, turns at any rates, and rests on the mark again. The mark is the only
+reference. The rests give the bias, and the remaining angle over the turns gives the scale.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.calibration.likelihood import CHANCE, Fit
+from gyro_calibration.calibration.run_faults import refuse_dead, refuse_saturated, unit_error
+from gyro_calibration.calibration.self_calibration import Limits, refuse_samples, refuse_scale
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.model.noise import Noise
+import numpy as np
+from scipy.special import ndtri
+
+TURN = 2.0 * math.pi
+#: Standard deviation of the heading of a robot put on a mark by hand or eye, rad: two marks a
+#: finger's width apart at half a metre.
+MARKING = 1.0 * DEGREE
+#: Shortest rest, s, and the time at its end that is left out while the robot stops or starts, s.
+REST, _SETTLING = 1.0, 0.25
+#: Means over this length separate rest from motion, s; a robot that turns faster than this, rad/s,
+#: does not rest, however noisy the gyro.
+_PART, _MOVING = 0.25, 0.5 * DEGREE
+#: The angle must be nearer to the number of turns than this part of a turn; half a turn would be
+#: as near to the next number.
+AMBIGUOUS = 0.35
+#: Scale factor error up to which the turns are counted by the gyro itself, 1.
+COUNTED = 0.05
+#: How often two rests of one bias are said to differ.
+_FALSE_REFUSALS = 1e-4
+
+
+@dataclass(frozen=True)
+class Turns:
+    """
+    What whole turns showed.
+
+    Attributes
+    ----------
+    fit : s and b with their covariance
+    turns : how many, counter-clockwise positive
+    duration : from rest to rest, s
+    rests : how long the rests at both ends lasted, s
+
+    """
+
+    fit: Fit
+    turns: int
+    duration: float
+    rests: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A rest: from and to, s, the mean rate, rad/s, and its variance by white noise."""
+
+    begin: float
+    end: float
+    mean: float
+    variance: float
+
+    @property
+    def duration(self) -> float:
+        return self.end - self.begin
+
+
+def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
+                    limits: Limits | None = None, noise: Noise | None = None,
+                    marking: float = MARKING, output: Array | None = None) -> Turns:
+    """
+    Find scale factor error and bias from whole turns between two rests on one mark.
+
+    The rates of the turns do not matter, only the net number of turns. The number is accepted only
+    where the gyro agrees to less than `AMBIGUOUS` of a turn; so a gyro with a large scale factor
+    error needs few turns.
+
+    Parameters
+    ----------
+    time : s, shape (n,)
+    rate : output of the gyro, after its model if it has one, rad/s, shape (n,)
+    turns : how many, counter-clockwise positive; None for the nearest whole number, for a scale
+        factor error up to `COUNTED`
+    noise : of the gyro, if it is known; what the bias may wander goes into the standard deviations
+    marking : standard deviation of the angle between the two rests on the mark, rad
+    output : of the gyro before its model, where that differs, shape (n,)
+
+    Raises
+    ------
+    DataRefused : with the reason and the remedy
+
+    """
+    limits = limits or Limits()
+    refuse_samples(time, rate, limits)
+    refuse_dead(rate if output is None else output)
+    refuse_saturated(rate if output is None else output)
+    white = _white(time, rate, noise)
+    first, last = _rests(time, rate, white)
+    duration = last.begin - first.end
+    bias, variance = _bias(first, last, noise or Noise(), limits)
+    integral = integrate(time, rate)
+    begin, end = np.interp((first.end, last.begin), time, integral)
+    turned = float(end - begin) - bias * duration
+    count = _counted(turned / TURN, turns, limits)
+    scale = turned / (count * TURN)
+    _refuse_scale(scale, limits)
+    of_turned = white * duration + variance * duration ** 2 + (scale * marking) ** 2
+    shared = -variance * duration / (count * TURN)
+    covariance = np.array([[of_turned / (count * TURN) ** 2, shared], [shared, variance]])
+    return Turns(Fit(scale - 1.0, bias, covariance), count, duration,
+                 (first.duration, last.duration))
+
+
+def _white(time: Array, rate: Array, noise: Noise | None) -> float:
+    """Return N², rad²/s: what neighbours show of it, and no less than what is known."""
+    seen = (float(np.median(np.abs(np.diff(rate, 2))) / 0.6745) ** 2 / 6.0
+            * float(np.median(np.diff(time))))
+    return max(seen, 0.0 if noise is None else noise.angle_random_walk ** 2)
+
+
+def _rests(time: Array, rate: Array, white: float) -> tuple[_Rest, _Rest]:
+    """Return the rests at both ends."""
+    part = ((time - time[0]) / _PART).astype(int)
+    count = np.maximum(np.bincount(part), 1)
+    means = np.bincount(part, rate) / count
+    apart = max(CHANCE * math.sqrt(white / _PART), _MOVING)
+    found = []
+    for name, values in (('before', means), ('after', means[:-1][::-1])):
+        length = _steady(values, apart) * _PART - _SETTLING
+        if length < REST:
+            raise DataRefused(
+                f'the robot rests for {max(length, 0.0):.1f} s {name} the turns, wanted {REST:g} '
+                's at least: leave it at rest on the mark, and record until after that')
+        found.append(length)
+    if sum(found) >= time[-1] - time[0] - 2.0 * _SETTLING:
+        raise DataRefused('the gyro rests all the time: did the robot turn, '
+                          'and is the gyro alive?')
+    return (_rest(time, rate, time[0], time[0] + found[0], white),
+            _rest(time, rate, time[-1] - found[1], time[-1], white))
+
+
+def _steady(means: Array, apart: float) -> int:
+    """Return how many of the means, from the first on, differ by no more than by chance."""
+    middle = np.array([np.median(means[:end]) for end in range(1, len(means) + 1)])
+    moved = np.abs(means - middle) > apart
+    return int(np.argmax(np.append(moved, True)))
+
+
+def _rest(time: Array, rate: Array, begin: float, end: float, white: float) -> _Rest:
+    inside = (time >= begin) & (time <= end)
+    return _Rest(float(begin), float(end), float(rate[inside].mean()), white / float(end - begin))
+
+
+def _bias(first: _Rest, last: _Rest, noise: Noise, limits: Limits) -> tuple[float, float]:
+    """Return the mean bias over the turns, as the mean of both rests, and its variance."""
+    apart = last.begin - first.end
+    wander = noise.wander(apart, min(first.duration, last.duration))
+    difference, expected = (last.mean - first.mean,
+                            math.sqrt(first.variance + last.variance + wander))
+    if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSALS)) * expected, limits.drift):
+        raise DataRefused(
+            f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
+            f'{abs(difference) / expected:.1f} standard deviations: the robot did not rest at '
+            'both ends, or the gyro still warms up; wait, and run again')
+    bias = 0.5 * (first.mean + last.mean)
+    if abs(bias) > limits.bias:
+        raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
+                          f'{limits.bias / DEGREE:g} deg/s: did the robot rest at both ends?')
+    return bias, 0.25 * (first.variance + last.variance) + 0.5 * wander
+
+
+def _counted(measured: float, turns: int | None, limits: Limits) -> int:
+    """Return the number of turns, or refuse what cannot be whole turns."""
+    count = round(measured) if turns is None else turns
+    if not count:
+        raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
+                          'turn once at least, all in one direction or nearly so')
+    if turns is None:
+        _refuse_many(measured, count)
+    else:
+        _refuse_units(measured / turns, limits)
+    if abs(measured - count) > (AMBIGUOUS if turns else COUNTED * abs(count)):
+        raise DataRefused(_ambiguous(measured, turns))
+    return count
+
+
+def _refuse_many(measured: float, count: int) -> None:
+    if COUNTED * (2 * abs(count) + 1) > 1.0:
+        raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
+                          f'off by {100 * COUNTED:g} %: say how many they were')
+
+
+def _refuse_units(scale: float, limits: Limits) -> None:
+    """Refuse a scale that another unit or sign explains; a factor of two may be a wrong count."""
+    unit = (unit_error(scale, by_profile=False)
+            if abs(scale - 1.0) > limits.scale_factor_error and not 0.4 < abs(scale) < 2.5 else '')
+    if unit:
+        raise DataRefused(unit)
+    refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
+                 "else set the driver's parameter invert")
+
+
+def _ambiguous(measured: float, turns: int | None) -> str:
+    said = f', and {turns} were said' if turns else ''
+    return (f'the gyro counts {measured:.2f} turns{said}: that is no whole number that can be '
+            'told from the next; close the turns on the mark, count them, or make fewer')
+
+
+def _refuse_scale(scale: float, limits: Limits) -> None:
+    if abs(scale - 1.0) > limits.scale_factor_error:
+        raise DataRefused(
+            f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
+            f'{100 * limits.scale_factor_error:.0f} %: count the turns again, and look at the '
+            'sensitivity')

@@ -1,0 +1,348 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The demonstration: the whole graph on this machine, with a robot that exists in this file alone.
+
+The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
+motion of the robot; driver and compensation run as processes of their own, as on a robot. The
+compensation drives the calibration, then a drive follows.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, field
+import math
+import os
+from pathlib import Path
+import random
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from gyro_calibration.cli.plots import draw_headings
+from gyro_calibration.driver.emulator import Emulator
+from gyro_calibration.driver.protocols import find, Sample
+from gyro_calibration.files import write_atomically
+from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
+from gyro_calibration.logs.log import Array, DEGREE, Log, write_log
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import CALIBRATION, Motion, turns
+from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.reproduction.hong_park import TABLE_1
+from gyro_calibration.ros.runner import SENSOR_QOS
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+from tqdm import tqdm
+
+PROTOCOL = 'kvh_dsp3000'
+NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
+INTERVAL = 0.01  # s between samples
+ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
+ATTEMPTS = 3  # to calibrate
+DRIVE = turns([(4, 0), (5, 20), (4, 0), (5, -20), (4, 0), (5, 20), (5, -20), (4, 0), (5, -20),
+               (4, 0), (1, 0)])
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What the demonstration found, in words and as data."""
+
+    text: str
+    data: dict[str, Any]
+
+
+class Refused(OSError):
+    """A service says no."""
+
+
+@dataclass
+class Robot:
+    """
+    A robot that turns as commanded, within what its wheels can do, with the gyro of a model.
+
+    Attributes
+    ----------
+    command : rad/s
+    truth : of each sample the time by the clock of this machine, s, and the true heading, rad
+
+    """
+
+    model: GyroModel
+    noise: Array
+    command: float = 0.0
+    truth: list[tuple[float, float]] = field(default_factory=list)
+
+    def obey(self, message: Twist) -> None:
+        """Turn from now on as commanded."""
+        self.command = message.angular.z
+
+    def samples(self) -> Iterator[Sample]:
+        """Give the samples of the gyro, each at its time, until the noise ends."""
+        rate, heading, begin = 0.0, 0.0, time.monotonic()
+        for number, noise in enumerate(self.noise):
+            time.sleep(max(0.0, begin + number * INTERVAL - time.monotonic()))
+            change = np.clip(self.command - rate, -ACCELERATION * INTERVAL,
+                             ACCELERATION * INTERVAL)
+            heading += INTERVAL * (rate + 0.5 * change)
+            rate += change
+            self.truth.append((time.time(), heading))
+            yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
+                         time=number * INTERVAL)
+
+
+class Client:
+    """
+    What hears and calls the nodes, spinning in a thread of its own.
+
+    Attributes
+    ----------
+    raw, headings : of each message the time, s, with the raw rate, rad/s, and with the published
+        heading, rad
+
+    """
+
+    def __init__(self, robot: Robot):
+        """Subscribe; the robot hears ``cmd_vel`` from now on."""
+        self.raw: list[tuple[float, float]] = []
+        self.headings: list[tuple[float, float]] = []
+        self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._hear_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', self._hear_heading, SENSOR_QOS)
+        self._node.create_subscription(Twist, 'cmd_vel', robot.obey, 10)
+        self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _hear_raw(self, message: Imu) -> None:
+        self.raw.append((_seconds(message), message.angular_velocity.z))
+
+    def _hear_heading(self, message: Imu) -> None:
+        self.headings.append((_seconds(message), _yaw(message)))
+
+    def _spin(self) -> None:
+        while not self._stop.is_set():
+            self._executor.spin_once(timeout_sec=0.1)
+
+    def call(self, name: str, timeout: float, wait: Callable[[], None]) -> str:
+        """Call a service, wait again and again until it answers, and return its message."""
+        client = self._node.create_client(Trigger, name)
+        if not client.wait_for_service(20.0):
+            raise OSError(f'the service {name} did not appear within 20 s')
+        answer, deadline = client.call_async(Trigger.Request()), time.monotonic() + timeout
+        while not answer.done():
+            if time.monotonic() > deadline:
+                raise OSError(f'{name} did not answer within {timeout:g} s')
+            wait()
+        if not answer.result().success:
+            raise Refused(f'{name}: {answer.result().message}')
+        return answer.result().message
+
+    def is_ready(self) -> bool:
+        """Return whether gyro and heading come, and another node commands the robot."""
+        return bool(self.raw and self.headings) and self._node.count_publishers('cmd_vel') > 1
+
+    def turn(self, rate: float) -> None:
+        """Command a rate, rad/s."""
+        command = Twist()
+        command.angular.z = rate
+        self._velocity.publish(command)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stop.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+
+def _seconds(message: Imu) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def _yaw(message: Imu) -> float:
+    return 2.0 * float(np.arctan2(message.orientation.z, message.orientation.w))
+
+
+@contextmanager
+def _process(module: str, **parameters: object) -> Iterator[None]:
+    """Run a node in a process of its own."""
+    arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    quiet = ['-r', f'__ns:=/{NAMESPACE}', '--log-level', 'error']
+    process = subprocess.Popen([sys.executable, '-m', f'gyro_calibration.ros.{module}',
+                                '--ros-args', *arguments, *quiet])
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(20.0)
+
+
+def run_demo(out: Path, seed: int) -> Demonstration:
+    """
+    Run the demonstration, about 80 s, and leave heading.png, table.md and log.csv in a folder.
+
+    Raises
+    ------
+    OSError : a node does not answer, or the folder cannot be written to
+
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    calibration_file, model_file, port = (out / 'calibration.yaml', out / 'noise.yaml',
+                                          out.absolute() / 'gyro')
+    calibration_file.unlink(missing_ok=True)
+    # The graph stays apart from the network of a robot and from other graphs on this machine; so
+    # it needs no rights in a secured one.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                      ROS_DOMAIN_ID=str(random.randint(1, 101)), ROS_SECURITY_ENABLE='false')
+    model = read_model(_share('config', 'xv3500.yaml'))
+    write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
+    generator = np.random.default_rng(seed)
+    noise = [simulate_noise(model.noise, length, INTERVAL, generator)
+             for length in (12000, 6000)]  # the second for calibrations run again
+    robot = Robot(model, np.concatenate(noise))
+    with ExitStack() as stack:
+        stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port,
+                                     wait_for_reader=True))
+        stack.enter_context(_process('driver_node', port=port, protocol=PROTOCOL))
+        stack.enter_context(_process('compensation_node', model_file=model_file,
+                                     calibration_file=calibration_file,
+                                     **{'calibration.drive': True}))
+        rclpy.init()
+        stack.callback(rclpy.try_shutdown)
+        client = Client(robot)
+        stack.callback(client.close)
+        begin = _perform(client)
+    return _evaluate(out, robot, client, begin, seed)
+
+
+def _share(*parts: str) -> Path:
+    """Return a file of the package's share folder, or of its sources where it runs from them."""
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    roots = [Path(prefix, 'share', 'gyro_calibration') for prefix in prefixes if prefix]
+    for root in (*roots, Path(__file__).parents[1]):
+        if root.joinpath(*parts).exists():
+            return root.joinpath(*parts)
+    raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')
+
+
+def _perform(client: Client) -> float:
+    """Calibrate and drive; return when the drive began, s."""
+    total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
+    with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
+              disable=None) as bar:
+        bar.set_description('starting driver and compensation')
+        _until(client.is_ready, 20.0)
+        bar.set_description('calibrating on the motion profile')
+        calibrate(client, bar)
+        client.call('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
+        bar.set_description('driving')
+        begin = time.time()
+        _drive(client, DRIVE, bar)
+    return begin
+
+
+def calibrate(client: Client, bar: tqdm) -> None:
+    """
+    Calibrate; a refused run is repeated, since this robot turns late on a busy machine.
+
+    Raises
+    ------
+    Refused : so is the last attempt
+
+    """
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            client.call('compensation_node/calibrate', 60.0, lambda: _pass(bar, 0.2))
+            return
+        except Refused as refusal:
+            if attempt == ATTEMPTS:
+                raise
+            bar.total += CALIBRATION.duration + 4.0
+            bar.write(f'{refusal}; once more', file=sys.stderr)
+            _pass(bar, 2.0)  # until the robot stands
+
+
+def _until(condition: Callable[[], object], timeout: float) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            raise OSError(f'the nodes were not ready within {timeout:g} s; '
+                          'is another program using the port?')
+        time.sleep(0.02)
+
+
+def _pass(bar: tqdm, seconds: float) -> None:
+    time.sleep(seconds)
+    bar.update(seconds)
+
+
+def _drive(client: Client, motion: Motion, bar: tqdm) -> None:
+    begin = time.monotonic()
+    while (now := time.monotonic() - begin) < motion.duration:
+        client.turn(float(motion.rate_at(np.array(now))))
+        _pass(bar, 0.02)
+    client.turn(0.0)
+    _pass(bar, 0.5)
+
+
+def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) -> Demonstration:
+    """Compare five headings of the drive with the truth."""
+    clock, truth = np.array(robot.truth).T
+    time_, raw = np.array([pair for pair in client.raw if pair[0] >= begin]).T
+    stamp, yaw = np.array([pair for pair in client.headings if pair[0] >= begin]).T
+    true = np.interp(time_, clock, truth)
+    calibration = read_model(out / 'calibration.yaml').self_calibration
+    assert calibration is not None  # calibrate succeeded, so it is stored
+    corrected, threshold = calibration.correct(raw), Threshold()
+    headings = {
+        'pure integration': integrate(time_, raw),
+        'self-calibration': integrate(time_, corrected),
+        'threshold filter': integrate(time_, filter_rates(threshold, time_, raw)),
+        'both': integrate(time_, filter_rates(threshold, time_, corrected)),
+        'rests tracked': np.interp(time_, stamp, np.unwrap(yaw) - yaw[0])}
+    draw_headings(out / 'heading.png', time_ - begin, true - true[0], headings)
+    write_log(out / 'log.csv', Log(output=raw, time=time_ - time_[0],
+                                   reference_heading=true - true[0]))
+    errors = {name: np.abs(heading - (true - true[0])) / DEGREE
+              for name, heading in headings.items()}
+    table = _table(errors)
+    write_atomically(out / 'table.md', table.encode())
+    text = (f'{table}\nSelf-calibration: {calibration}.\n'
+            f'Seed {seed}. Picture, table and log are in {out}.')
+    means = {name: float(error.mean()) for name, error in errors.items()}
+    return Demonstration(text, {'seed': seed, **calibration.figures(), 'mean_error_deg': means})
+
+
+def _table(errors: dict[str, Array]) -> str:
+    """Return the table as Markdown, beside that of Hong and Park."""
+    lines = ['| heading | mean error | standard deviation | off pure integration '
+             '| Hong and Park, table 1 |', '|---|---|---|---|---|']
+    pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]
+    for name, error in errors.items():
+        mean, deviation = TABLE_1.get(name, (math.nan, math.nan))
+        theirs = '' if math.isnan(mean) else (f'{mean:.3f} deg, {deviation:.3f} deg, '
+                                              f'{100 * (1 - mean / published):.0f} %')
+        lines.append(f'| {name} | {error.mean():.3f} deg | {error.std():.3f} deg '
+                     f'| {100 * (1 - error.mean() / pure):.0f} % | {theirs} |')
+    return '\n'.join(lines) + '\n'

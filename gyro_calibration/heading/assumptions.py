@@ -1,0 +1,153 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Assumptions for values that nobody calibrated, and for temperatures without data.
+
+A tracker believes what it is given. So it is given all that may be wrong: scale factor error and
+bias where nothing says how well they are known, and the change of the bias from the temperature
+at which it was known to that of now.
+
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+import math
+
+from gyro_calibration.heading.bias_table import BiasTable
+from gyro_calibration.logs.log import Array, DEGREE, Number
+from gyro_calibration.model.compensation import covariance
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
+import numpy as np
+
+#: Step of the temperatures for which the change of the bias is computed, K; linear between them.
+_STEP = 0.5
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """
+    Standard deviations of what is not known.
+
+    Attributes
+    ----------
+    bias : of a gyro that nobody calibrated, rad/s
+    scale_factor_error : alike, 1
+    bias_temperature_coefficient : rad/s/K; 0 for a gyro that compensates its temperature by itself
+
+    """
+
+    bias: float = 0.5 * DEGREE
+    scale_factor_error: float = 0.03
+    bias_temperature_coefficient: float = 0.03 * DEGREE
+
+    @property
+    def covariance(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return that of (s, b)."""
+        return (self.scale_factor_error ** 2, 0.0), (0.0, self.bias ** 2)
+
+
+def assumed(model: GyroModel, assumptions: Assumptions) -> GyroModel:
+    """Return the model with a self-calibration that has a covariance, if nothing else has one."""
+    calibration = model.self_calibration
+    if calibration is None:
+        return (model if model.covariance is not None else with_self_calibration(
+            model, SelfCalibration(covariance=assumptions.covariance)))
+    if calibration.covariance is not None and np.isfinite(calibration.covariance).all():
+        return model
+    return with_self_calibration(model, replace(calibration, covariance=assumptions.covariance))
+
+
+def uncertain(model: GyroModel, assumptions: Assumptions) -> Array:
+    """
+    Return the covariance of all uncertain values of an `assumed` model, shape (m, m).
+
+    The temperature coefficient stands before s and b of a self-calibration, which are the last two
+    where there is one, and is the last where there is none. `sensitive` has the same order.
+
+    """
+    values = covariance(model)
+    place = _place(model, len(values))
+    whole = np.insert(np.insert(values, place, 0.0, axis=0), place, 0.0, axis=1)
+    whole[place, place] = assumptions.bias_temperature_coefficient ** 2
+    return whole
+
+
+def sensitive(model: GyroModel, sensitivity: Array, distance: Number) -> Array:
+    """
+    Return what the rate changes by for each value of `uncertain`, shape (m, ...).
+
+    Parameters
+    ----------
+    sensitivity : `compensation.rate_sensitivity` of the `assumed` model, shape (m - 1, ...)
+    distance : of the temperature from where the bias is known, K, a number or shape (...)
+
+    """
+    place = _place(model, len(sensitivity))
+    whole = np.empty((len(sensitivity) + 1, *sensitivity.shape[1:]))
+    whole[:place], whole[place], whole[place + 1:] = (
+        sensitivity[:place], -distance, sensitivity[place:])
+    return whole
+
+
+def _place(model: GyroModel, values: int) -> int:
+    return values if model.self_calibration is None else values - 2
+
+
+class Way:
+    """
+    Change of the bias from one temperature to others, by a table as it was when this began.
+
+    What the table learns later comes from rests, which the tracker uses itself. So it does not
+    count here before the tracker begins anew.
+
+    """
+
+    def __init__(self, table: BiasTable, begin: float, now: float, coefficient: float):
+        """
+        Begin at a temperature, degC.
+
+        Parameters
+        ----------
+        now : s since 1970
+        coefficient : standard deviation in which distances are counted, rad/s/K; above 0
+
+        """
+        self._table, self.begin, self._now, self._coefficient = (
+            deepcopy(table), begin, now, coefficient)
+        self._known: dict[int, tuple[float, float]] = {0: (0.0, 0.0)}
+
+    def at(self, temperature: float) -> tuple[float, float]:
+        """Return the change of the bias, rad/s, and the signed distance, K of the coefficient."""
+        steps = (temperature - self.begin) / _STEP
+        below = math.floor(steps)
+        (first, near), (last, far), part = (
+            self._computed(below), self._computed(below + 1), steps - below)
+        return first + part * (last - first), near + part * (far - near)
+
+    def along(self, temperature: Array) -> tuple[Array, Array]:
+        """Return the same as `at` for several temperatures, shape (n,) each."""
+        steps = (temperature - self.begin) / _STEP
+        below = np.floor(steps).astype(int)
+        known, places = np.unique(below, return_inverse=True)
+        near, far = (np.array([self._computed(int(step) + ahead) for step in known])[places]
+                     for ahead in (0, 1))
+        change, distance = (near + (steps - below)[:, None] * (far - near)).T
+        return change, distance
+
+    def _computed(self, step: int) -> tuple[float, float]:
+        if step not in self._known:
+            change, variance = self._table.difference(
+                self.begin, self.begin + step * _STEP, self._now)
+            self._known[step] = (
+                change, math.copysign(math.sqrt(variance), step) / self._coefficient)
+        return self._known[step]

@@ -1,0 +1,679 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Bias at rest over temperature: kept between runs, aged, and used with its variance.
+
+The bias here is the rate at rest *after the model and before the self-calibration*
+(`Compensated.modelled`), which is also what a `SelfCalibration` calls its bias. So it is the same
+quantity whichever self-calibration is in use. What the table says of a change of temperature is
+added to the bias of the last calibration, and the bias that the table says is never added to that
+of a calibration: nothing is compensated twice.
+
+Biases differ by what lies between them: temperature, whose local coefficient is a smooth random
+process over temperature; runs, as a gyro turns on with another bias each time; jumps; and time, by
+flicker, random walk and ageing. Seen from the present, every entry is then an estimate of the
+present bias with an error, and these errors have a known covariance: the answer is their
+generalized least squares mean. How large coefficient and turn-on scatter are is learned too, by
+restricted likelihood over a few sizes.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gyro_calibration.files import plain, reason, write_atomically
+from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
+from gyro_calibration.model.settings_file import read_settings, settings_text
+import numpy as np
+
+#: Width of a bin of temperature, K; a run has one entry in each.
+BIN = 1.5
+#: At most so many entries are kept.
+ENTRIES = 80
+#: What a rest is averaged over, s, as far as flicker asks for it.
+DURATION = 10.0
+#: An estimate further off than so many standard deviations does not belong to the others.
+FAR = 4.5
+#: So many estimates in a row that are off, and agree, are a jump.
+IN_A_ROW = 3
+#: Shortest time between two writes, s.
+INTERVAL = 600.0
+_YEAR = 365.25 * 86400.0
+#: What was made so near to an entry was made in its run, s.
+_SAME_RUN = 3600.0
+#: No bias is better known, (rad/s)².
+_LEAST = 1e-18
+#: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probability.
+_COEFFICIENTS = {0.03: 0.1, 0.1: 0.1, 0.3: 0.2, 1.0: 0.6}
+_TURN_ONS = {0.1: 0.2, 0.5: 0.3, 1.0: 0.2, 2.0: 0.2, 5.0: 0.1}
+_SIZES = np.array([(coefficient, turn_on)
+                   for coefficient in _COEFFICIENTS for turn_on in _TURN_ONS])
+_MET = np.array([often * also for often in _COEFFICIENTS.values() for also in _TURN_ONS.values()])
+
+
+@dataclass(frozen=True)
+class Prior:
+    """
+    What is known of a gyro before it was seen.
+
+    Attributes
+    ----------
+    coefficient : standard deviation of the temperature coefficient of the bias, rad/s/K (L3G4200D
+        data sheet: 0.03 deg/s/K)
+    length : over which the coefficient stays about the same, K
+    compensated : what a model that looks at temperature leaves of the coefficient inside its
+        range, 1
+    turn_on : standard deviation of the bias from one run to the next, rad/s
+    ageing : how far the bias at one temperature walks in a year, beyond the model's noise, rad/s
+    unknown : where a temperature is not known, it is taken to be so far away, K
+
+    """
+
+    coefficient: float = 0.03 * DEGREE
+    length: float = 15.0
+    compensated: float = 0.1
+    turn_on: float = 0.05 * DEGREE
+    ageing: float = 0.02 * DEGREE
+    unknown: float = 15.0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """
+    What rests of one run showed in one bin of temperature.
+
+    Attributes
+    ----------
+    temperature : degC
+    bias : rad/s, after the model and before the self-calibration
+    variance : of the bias as a mean around `time`, (rad/s)²
+    time : of the last of these rests, s since 1970
+    run : counts the runs of the gyro; between whole numbers for what came from elsewhere
+
+    """
+
+    temperature: float
+    bias: float
+    variance: float
+    time: float
+    run: float
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A step of the bias at all temperatures, where a run begins: (rad/s)² and s since 1970."""
+
+    run: int
+    variance: float
+    time: float
+
+
+_Dated = TypeVar('_Dated', Entry, Jump)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """
+    A stored calibration as it is worth now.
+
+    Attributes
+    ----------
+    calibration : with the bias and the covariance of now; to be used, and not to be stored
+    change : its bias less the stored one, rad/s
+    variance : what the variance of the bias grew by, (rad/s)²; negative where the table knows
+        better; nan where it was not known
+    sentence : for diagnostics, where age or distance matters; else ''
+
+    """
+
+    calibration: SelfCalibration
+    change: float
+    variance: float
+    sentence: str
+
+
+class BiasTable:
+    """
+    Biases at rest over temperature, of one gyro behind one model.
+
+    Attributes
+    ----------
+    digest : of the model that it belongs to
+    entries, jumps : what it knows
+    run : number of the run that goes on
+    held_back : how many estimates were not used so far
+
+    """
+
+    def __init__(self, model: GyroModel, prior: Prior | None = None,
+                 entries: Sequence[Entry] = (), jumps: Sequence[Jump] = ()):
+        """Begin a new run behind older entries, if there are any."""
+        self.digest = model_digest(model)
+        self.entries, self.jumps = list(entries), list(jumps)
+        self.run = 1 + max([-1, *(math.floor(each.run) for each in entries),
+                            *(each.run for each in jumps)])
+        self._first, self._dated_anew = self.run, False
+        self.held_back = 0
+        self._model, self._prior = model, prior or Prior()
+        self._held: list[Entry] = []
+        self._kept, self._kept_at = tuple(self.entries), -math.inf
+
+    def begin_run(self) -> None:
+        """Expect another turn-on bias, as after the gyro was without power."""
+        self._held.clear()
+        self.run += any(each.run == self.run for each in self.entries)
+
+    def clock_was_set(self, step: float) -> None:
+        """Correct the dates since this table began for a clock that was set by a step, s."""
+        self.entries, self._held = ([self._moved(each, step) for each in rows]
+                                    for rows in (self.entries, self._held))
+        self.jumps = [self._moved(each, step) for each in self.jumps]
+        self._dated_anew = (self._dated_anew
+                            or any(each.run >= self._first for each in self.entries))
+
+    def _moved(self, row: _Dated, step: float) -> _Dated:
+        return replace(row, time=max(row.time + step, 0.0)) if row.run >= self._first else row
+
+    def add(self, temperature: float, bias: float, variance: float, time: float) -> str:
+        """
+        Take what a rest showed.
+
+        Parameters
+        ----------
+        temperature : degC
+        bias : mean of the rate after the model and before the self-calibration, rad/s
+        variance : of that mean by white noise, (rad/s)²; how far a bias wanders is counted here
+        time : s since 1970
+
+        Returns
+        -------
+        '', or in a sentence why it was held back, or that the bias jumped
+
+        """
+        given = Entry(float(temperature), float(bias), float(variance), float(time), self.run)
+        if not _possible(given):
+            return (f'a bias of {bias:g} rad/s at {temperature:g} degC with a variance of '
+                    f'{variance:g} at {time:g} s is not used: that is beyond what a gyro has')
+        before, known = self.predict(temperature, time)
+        if abs(bias - before) <= FAR * math.sqrt(known + variance):
+            self._held.clear()
+            self._take(given)
+            return ''
+        self._held = [*(each for each in self._held if self._agree(each, given)), given]
+        off = (f'{(bias - before) / DEGREE:.4f} deg/s off what is known at '
+               f'{temperature:.1f} degC ({math.sqrt(known) / DEGREE:.4f} deg/s)')
+        if len(self._held) < IN_A_ROW:
+            self.held_back += 1
+            return f'a bias that is {off} was held back: was the robot turned slowly?'
+        self._jump((bias - before) ** 2)
+        return f'the bias jumped: {IN_A_ROW} rests in a row are {off}; what was known is shifted'
+
+    def _agree(self, held: Entry, given: Entry) -> bool:
+        variance = (held.variance + given.variance + self._wander(given.time - held.time)
+                    + self._prior.coefficient ** 2
+                    * _spread(given.temperature - held.temperature, self._prior.length))
+        return abs(given.bias - held.bias) <= FAR * math.sqrt(variance)
+
+    def _jump(self, variance: float) -> None:
+        """Let the curve step, and take what was held back for it."""
+        self.held_back -= IN_A_ROW - 1
+        self.run += 1
+        self.jumps.append(Jump(self.run, variance, self._held[0].time))
+        if len(self.jumps) > ENTRIES:
+            first, second, *others = self.jumps
+            self.jumps = [replace(second, variance=first.variance + second.variance), *others]
+        for each in self._held:
+            self._take(replace(each, run=self.run))
+        self._held.clear()
+
+    def _take(self, given: Entry) -> None:
+        for place, entry in enumerate(self.entries):
+            if entry.run == given.run and _bin(entry) == _bin(given):
+                self.entries[place] = self._merged(entry, given)
+                return
+        self.entries.append(given)
+        if len(self.entries) > ENTRIES:
+            self._forget()
+
+    def _merged(self, entry: Entry, given: Entry) -> Entry:
+        """Return both as one entry at the time of the newer, with the older aged until then."""
+        older = entry.variance + self._wander(given.time - entry.time)
+        weight = float(older / (older + given.variance))
+        return replace(given, bias=entry.bias + weight * (given.bias - entry.bias),
+                       variance=max(weight * given.variance, 2.0 * _LEAST),
+                       temperature=entry.temperature
+                       + weight * (given.temperature - entry.temperature))
+
+    def _forget(self) -> None:
+        """Drop the oldest entry of the fullest bin, and the jumps that no entry precedes."""
+        (fullest, _), = Counter(map(_bin, self.entries)).most_common(1)
+        self.entries.remove(min((each for each in self.entries if _bin(each) == fullest),
+                                key=lambda each: (each.run, each.time)))
+        first = min(each.run for each in self.entries)
+        self.jumps = [each for each in self.jumps if each.run > first]
+
+    def predict(self, temperature: float, time: float) -> tuple[float, float]:
+        """Return the bias in this run, rad/s, and its variance, (rad/s)²; 0 and inf if unknown."""
+        return self._predicted(self.entries, temperature, time)[:2]
+
+    def _predicted(self, entries: Sequence[Entry], temperature: float,
+                   time: float) -> tuple[float, float, float]:
+        """Return the bias, its variance, and the weight of the last entry in it."""
+        if not entries:
+            return 0.0, math.inf, 0.0
+        temperature, time = _bounded(temperature, time)
+        seen = self._seen(entries, temperature, time)
+        bias, variance = _mixture(seen.likely, seen.mean, 1.0 / seen.information)
+        return (bias + entries[0].bias, variance,
+                float(seen.likely @ (seen.of_ones[:, -1] / seen.information)))
+
+    def difference(self, from_temperature: float, to_temperature: float,
+                   time: float) -> tuple[float, float]:
+        """Return the change of bias between temperatures, rad/s, and its variance, (rad/s)²."""
+        (from_temperature, time), (to_temperature, _) = (_bounded(from_temperature, time),
+                                                         _bounded(to_temperature, time))
+        own = self._by_temperature(from_temperature, np.array([to_temperature]))[:, 0]
+        if not self.entries:
+            return 0.0, float(_MET @ own)
+        seen = self._seen(self.entries, from_temperature, time)
+        temperatures = np.array([each.temperature for each in self.entries])
+        near, far = (self._by_temperature(end, temperatures)
+                     for end in (from_temperature, to_temperature))
+        shared = 0.5 * (near + own[:, None] - far)
+        change, of_shared = (np.einsum('mi,mi->m', shared, values)
+                             for values in (seen.of_rests, seen.of_ones))
+        explained = np.einsum('mi,mij,mj->m', shared, seen.inverse, shared)
+        return _mixture(seen.likely, change,
+                        np.maximum(own - explained + of_shared ** 2 / seen.information, 0.0))
+
+    def joined(self, calibration: SelfCalibration, age: float, time: float,
+               temperature: float | None, this_run: bool) -> tuple[float, float, float]:
+        """Return bias and variance now (see `carry`), and the weight of the calibration in it."""
+        here = (self._model.reference_temperature if calibration.temperature is None
+                else calibration.temperature)
+        now = here if temperature is None else temperature
+        own = calibration.standard_deviations[1] ** 2
+        if calibration.temperature is None:
+            here, own = now, own + self._unknown()
+        made = time - age
+        jumped = any(each.time > made for each in self.jumps)
+        entry = Entry(here, calibration.bias, own, made,
+                      self.run if this_run and not jumped else self._run_at(made))
+        bias, variance, weight = self._predicted([*self.entries, entry], now, time)
+        return bias, variance + (self._unknown() if temperature is None else 0.0), weight
+
+    def _run_at(self, time: float) -> float:
+        """Return the run of a time, or a number between the jumps before and after it."""
+        after = max([-1, *(each.run for each in self.jumps if each.time <= time)])
+        until = min([self.run, *(each.run for each in self.jumps if each.time > time)])
+        near = {abs(each.time - time): each.run for each in self.entries
+                if after <= each.run < until and abs(each.time - time) < _SAME_RUN}
+        return near[min(near)] if near else after + 0.5
+
+    def _unknown(self) -> float:
+        """Return the variance of the bias, (rad/s)², where the temperature is unknown."""
+        return float(_MET @ (self._usual() ** 2 * _SIZES[:, 0] ** 2)) * self._prior.unknown ** 2
+
+    def _usual(self) -> float:
+        """Return the prior temperature coefficient within the range of the model, rad/s/K."""
+        return self._prior.coefficient * (
+            self._prior.compensated if self._model.looks_at('temperature') else 1.0)
+
+    def _by_temperature(self, here: Array | float, there: Array) -> Array:
+        """Return the variance of the bias between temperatures, (rad/s)², shape (sizes, ...)."""
+        inside = self._usual() ** 2 * _spread(there - here, self._prior.length)
+        return np.asarray(np.multiply.outer(_SIZES[:, 0] ** 2, inside)
+                          + self._outside(here, there))
+
+    def _outside(self, here: Array | float, there: Array) -> Array | float:
+        """Return the part of that variance from outside the temperature range of the model."""
+        if not self._model.looks_at('temperature'):
+            return 0.0
+        low, high = self._model.temperature_range
+        below = np.minimum(there - low, 0.0) - np.minimum(here - low, 0.0)
+        above = np.maximum(there - high, 0.0) - np.maximum(here - high, 0.0)
+        return self._prior.coefficient ** 2 * (below ** 2 + above ** 2)
+
+    def _wander(self, age: Array | float) -> Any:
+        """Return the variance of how far a bias goes by the noise of the gyro, (rad/s)²."""
+        return self._model.noise.wander(np.abs(age) + DURATION, DURATION)
+
+    def _seen(self, entries: Sequence[Entry], temperature: float, time: float) -> _Seen:
+        """Return what entries say of the bias in this run, now, at a temperature."""
+        covariance = self._covariance(entries, temperature, time)
+        rests = np.array([each.bias - entries[0].bias for each in entries])
+        inverse = np.linalg.inv(covariance)
+        of_ones, of_rests = inverse.sum(axis=2), inverse @ rests
+        information = of_ones.sum(axis=1)
+        mean = of_rests.sum(axis=1) / information
+        misfit = of_rests @ rests - mean ** 2 * information
+        logarithms = -0.5 * (np.linalg.slogdet(covariance)[1] + np.log(information) + misfit)
+        likely = _MET * np.exp(logarithms - logarithms.max())
+        return _Seen(likely / likely.sum(), mean, information, of_ones,
+                     of_rests - mean[:, None] * of_ones, inverse)
+
+    def _covariance(self, entries: Sequence[Entry], temperature: float, time: float) -> Array:
+        """Return the covariance of the errors of entries now, (rad/s)², shape (sizes, n, n)."""
+        temperatures, variances, times, runs = (
+            np.array([getattr(each, name) for each in entries])
+            for name in ('temperature', 'variance', 'time', 'run'))
+        age, runs_apart = np.abs(time - times), _between(runs) != 0.0
+        by_temperature = _shared(self._by_temperature(temperature, temperatures),
+                                 self._by_temperature(temperatures[:, None], temperatures))
+        wander = self._wander(_between(times)) * (1.0 - np.eye(len(times)))
+        alike = np.exp(-np.abs(_between(temperatures)) / self._prior.length)
+        fixed = (_shared(self._wander(age), wander) + np.diag(variances)
+                 + self._prior.ageing ** 2 / _YEAR * alike * np.minimum(age[:, None], age)
+                 + self._jumped(runs))
+        by_run = self._prior.turn_on ** 2 * _shared(2.0 * (runs != self.run), 2.0 * runs_apart)
+        return np.asarray(fixed + by_temperature + np.multiply.outer(_SIZES[:, 1] ** 2, by_run))
+
+    def _jumped(self, runs: Array) -> Array:
+        """Return the covariance by jumps, (rad/s)², shape (n, n), shared by all before a jump."""
+        total = np.zeros((len(runs), len(runs)))
+        for each in self.jumps:
+            before = runs < each.run
+            total += each.variance * np.outer(before, before)
+        return total
+
+    def changed(self) -> bool:
+        """Tell whether something worth a write was learned since `kept`, or dates were wrong."""
+        if self._dated_anew:
+            return True
+        kept = {(each.run, _bin(each)): each for each in self._kept}
+        return any(_differs(kept.get((each.run, _bin(each))), each) for each in self.entries)
+
+    def due(self, now: float, ending: bool = False) -> bool:
+        """Tell whether to write now, s since 1970: if changed, not too often, and at the end."""
+        return self.changed() and (ending or abs(now - self._kept_at) >= INTERVAL)
+
+    def kept(self, now: float) -> None:
+        """Take note that the table was written."""
+        self._kept, self._kept_at, self._dated_anew = tuple(self.entries), now, False
+
+    def not_kept(self, now: float) -> None:
+        """Take note that it could not be written: to be tried again later, and at the end."""
+        self._kept_at = now
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """
+    What entries say of the bias at one temperature, for each of the sizes.
+
+    Attributes
+    ----------
+    likely : probability of each, shape (sizes,)
+    mean : of the biases less that of the first entry, rad/s, shape (sizes,)
+    information : 1 over the variance of the mean, shape (sizes,)
+    of_ones, of_rests : the inverse times ones, and times what each entry is off the mean, shape
+        (sizes, n)
+    inverse : of the covariance, shape (sizes, n, n)
+
+    """
+
+    likely: Array
+    mean: Array
+    information: Array
+    of_ones: Array
+    of_rests: Array
+    inverse: Array
+
+
+def _mixture(likely: Array, means: Array, variances: Array) -> tuple[float, float]:
+    """Return mean and variance over what may be."""
+    mean = float(likely @ means)
+    return mean, float(likely @ (variances + (means - mean) ** 2))
+
+
+def _spread(distance: Array | float, length: float) -> Any:
+    """
+    Return the mean square, K², of the integral of a process of variance 1 over a distance.
+
+    Its covariance is (1 + |d|/length) exp(-|d|/length). Its paths have a slope, unlike those of a
+    Gauss-Markov process: the bias over temperature is as smooth.
+
+    """
+    lengths = np.abs(distance) / length
+    return 2.0 * length ** 2 * (2.0 * lengths - 3.0 + (3.0 + lengths) * np.exp(-lengths))
+
+
+def _between(values: Array) -> Array:
+    return values[:, None] - values
+
+
+def _shared(apart: Array, between: Array) -> Array:
+    """Return the covariance of members, from the mean squares off a point and between them."""
+    return np.asarray(0.5 * (apart[..., :, None] + apart[..., None, :] - between))
+
+
+def _bin(entry: Entry) -> int:
+    return round(entry.temperature / BIN)
+
+
+def _possible(entry: Entry) -> bool:
+    """Tell whether this may be a bias of a gyro; nan never is."""
+    temperature, time = _bounded(entry.temperature, entry.time)
+    return (entry.temperature == temperature and entry.time == time
+            and abs(entry.bias) <= 1e4 and _LEAST <= entry.variance <= 1e8
+            and 0 <= entry.run <= 1e9)
+
+
+def _bounded(temperature: float, time: float) -> tuple[float, float]:
+    """Return temperature, degC, and time, s since 1970, limited to their possible ranges."""
+    return min(max(temperature, -273.15), 1e4), min(max(time, 0.0), 1e11)
+
+
+def _differs(kept: Entry | None, entry: Entry) -> bool:
+    """Tell whether an entry is new: by half a standard deviation, or a fifth of the variance."""
+    return (kept is None or (entry.bias - kept.bias) ** 2 > 0.25 * kept.variance
+            or entry.variance < 0.8 * kept.variance)
+
+
+def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
+          temperature: float | None = None, this_run: bool = False) -> Carried:
+    """
+    Return a stored calibration as it holds now, moved and weighted by the table.
+
+    It is joined to the table as one more estimate of the bias, at its own temperature and time. It
+    is for the start of a run, or of a tracker that begins anew. Within a run an `assumptions.Way`
+    goes on from there, of the table as it was; carried into a tracker that goes on, it would hold
+    what that knows already. Its age is counted: whatever it is given to must take it for a
+    calibration of now.
+
+    Parameters
+    ----------
+    calibration : as it was stored
+    table : of the model in use; may be empty
+    age : of the calibration, s
+    time : now, s since 1970
+    temperature : now, degC; None where it is not known
+    this_run : the calibration was made in this run
+
+    """
+    if calibration.covariance is None:
+        return _moved(calibration, table, time, temperature)
+    (a, c), (_, own) = calibration.covariance
+    bias, variance, weight = table.joined(calibration, age, time, temperature, this_run)
+    moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
+    return Carried(moved, bias - calibration.bias, variance - own,
+                   _sentence(calibration, table, age, temperature, variance))
+
+
+def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
+           temperature: float | None) -> Carried:
+    """Return a calibration of which nobody knows how good it is, at another temperature."""
+    here = calibration.temperature
+    change = (0.0 if here is None or temperature is None
+              else table.difference(here, temperature, time)[0])
+    return Carried(replace(calibration, bias=calibration.bias + change), change, math.nan, '')
+
+
+def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,
+              temperature: float | None, variance: float) -> str:
+    """Say that a calibration is no longer as good as it was, and why."""
+    own = calibration.standard_deviations[1]
+    if variance < 2.0 * own ** 2:
+        return ''
+    if calibration.temperature is None or temperature is None:
+        why = 'at a temperature that is not known'
+    else:
+        why = f'at {calibration.temperature:.1f} degC, and now it is {temperature:.1f} degC'
+    return (f'the calibration was made {_age(age)} ago {why}: its bias is now known to '
+            f'{math.sqrt(variance) / DEGREE:.4f} deg/s, then to {own / DEGREE:.4f} deg/s; '
+            'let the robot rest, or calibrate again')
+
+
+def _age(age: float) -> str:
+    for unit, length in (('days', 86400.0), ('hours', 3600.0)):
+        if age >= 2.0 * length:
+            return f'{age / length:.0f} {unit}'
+    return f'{age / 60.0:.0f} minutes'
+
+
+FORMAT = 'gyro_calibration/bias_table'
+VERSION = 1
+#: A table of `ENTRIES` entries has a twentieth of this.
+_BYTES = 200_000
+_HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest and before '
+           'any self-calibration; times are UTC.\n'
+           '# Written by the compensation node. It may be deleted: then it is learned anew.\n')
+
+
+def model_digest(model: GyroModel) -> str:
+    """Return a name for models with `same_effects` and one serial number: they share biases."""
+    told = ([[term.effect.name, list(term.values)] for term in model.terms],
+            model.gyro.get('serial_number', ''))
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
+
+
+def read_bias_table(path: str | Path, model: GyroModel,
+                    prior: Prior | None = None) -> tuple[BiasTable, str]:
+    """
+    Read what earlier runs have learned, for a run that begins.
+
+    Returns
+    -------
+    the table, and '' or in a sentence why it is empty although there is a file; such a file is
+    kept when a new one is written
+
+    """
+    try:
+        digest, entries, jumps = _read(Path(path))
+    except FileNotFoundError:
+        return BiasTable(model, prior), ''
+    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
+        said = (f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, '
+                'and the file is kept')
+        return BiasTable(model, prior), plain(said)
+    if digest != model_digest(model):
+        return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another '
+                                              'model: it is learned anew, and the file is kept')
+    return BiasTable(model, prior, entries, jumps), ''
+
+
+def write_bias_table(path: str | Path, table: BiasTable,
+                     now: float) -> tuple[str, tuple[int, int]]:
+    """
+    Write a table completely or not at all.
+
+    A file in its place that is unreadable or not of this model is kept under another name.
+
+    Returns
+    -------
+    '', or in a sentence under which name the old file is kept; and the version that was written,
+    as `files.write_atomically` does
+
+    Raises
+    ------
+    OSError : the folder cannot be written to; the old file is as it was, or has its other name
+
+    """
+    said = _keep_aside(Path(path), table.digest)
+    written = write_atomically(path, (_HEADER + settings_text(_content(table))).encode())
+    table.kept(now)
+    return said, written
+
+
+def _keep_aside(path: Path, digest: str) -> str:
+    try:
+        if not path.exists() or _read(path)[0] == digest:
+            return ''
+    except (OSError, ValueError, TypeError, KeyError, OverflowError):
+        pass  # whatever it is, it is not ours to overwrite
+    number = 1
+    while (other := path.with_name(f'{path.name}.kept-{number}')).exists():
+        number += 1
+    path.rename(other)
+    return plain(f'what was in {path} is now in {other}')
+
+
+def _read(path: Path) -> tuple[str, list[Entry], list[Jump]]:
+    """Return digest, entries and jumps of a file."""
+    content = read_settings(path, _BYTES)
+    if not isinstance(content, dict) or content.get('format') != FORMAT:
+        raise ValueError(f'it does not say format: {FORMAT}')
+    if content.get('version') != VERSION:
+        raise ValueError(f'its version is {content.get("version")!r:.40}, wanted {VERSION}')
+    entries = [_entry(row, float(row['temperature']), float(row['bias']))
+               for row in _rows(content, 'entries')]
+    jumps = [Jump(int(each.run), each.variance, each.time)
+             for each in (_entry(row, 0.0, 0.0) for row in _rows(content, 'jumps'))]
+    return str(content['model']), entries, jumps
+
+
+def _entry(row: Mapping[str, Any], temperature: float, bias: float) -> Entry:
+    entry = Entry(temperature, bias, float(row['standard_deviation']) ** 2,
+                  _seconds(row['time']), int(row['run']))
+    if not _possible(entry):
+        raise ValueError(f'no gyro has {entry}')
+    return entry
+
+
+def _rows(content: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    rows = content[name]
+    if (not isinstance(rows, list) or len(rows) > ENTRIES
+            or not all(isinstance(row, dict) for row in rows)):
+        raise ValueError(f'{name} is no list of at most {ENTRIES} rows')
+    return rows
+
+
+def _seconds(value: Any) -> float:
+    """Return a time, s since 1970, from its text, or from what YAML takes it for."""
+    return float(np.datetime64(
+        str(value).removesuffix('Z').removesuffix('+00:00'), 's').astype('int64'))
+
+
+def _content(table: BiasTable) -> dict[str, Any]:
+    entries = [{'temperature': round(each.temperature, 3), 'bias': _short(each.bias),
+                **_common(each)} for each in table.entries]
+    jumps = [_common(each) for each in table.jumps]
+    return {'format': FORMAT, 'version': VERSION, 'model': table.digest,
+            'entries': entries, 'jumps': jumps}
+
+
+def _common(row: Entry | Jump) -> dict[str, Any]:
+    time = str(np.datetime64(round(row.time), 's'))
+    return {'standard_deviation': _short(math.sqrt(row.variance)), 'time': time,
+            'run': int(row.run)}
+
+
+def _short(value: float) -> float:
+    return float(f'{value:.9g}')

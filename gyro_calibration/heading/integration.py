@@ -1,0 +1,216 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""From rates to a heading and its error: threshold filter, and integration on the stamps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gyro_calibration.heading.gaps import FASTEST, Gaps
+from gyro_calibration.logs.log import Array, CACHED, DEGREE
+from gyro_calibration.model.compensation import quadratic_form
+from gyro_calibration.model.noise import Noise
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """
+    Settings of the threshold filter (Hong and Park, eq. 12).
+
+    Attributes
+    ----------
+    rate : rad/s; below it the robot counts as standing; 0 switches the filter off
+    window : s; the mean over it is compared with the rate. 0 compares single samples, as published
+    angle_random_walk : rad/√s; a window that varies by more than three times what this explains is
+        motion, whatever its mean; 0 switches this test off
+
+    """
+
+    rate: float = 0.3 * DEGREE
+    window: float = 0.2
+    angle_random_walk: float = 0.0
+
+
+class ThresholdFilter:
+    """
+    Set the rate to zero while the robot stands, sample by sample.
+
+    As published the filter decides on single samples. With the noise of a cheap gyro this has
+    little effect at rest, so here the mean over a short window decides. What it deletes is for the
+    caller to count: a turn slower than the threshold is lost.
+
+    """
+
+    def __init__(self, settings: Threshold):
+        """Begin with an empty window."""
+        self.settings = settings
+        # The window in two parts, oldest samples last in the first one, each sample with the sums
+        # from it to the border between them: nothing is subtracted, and what has left the window
+        # leaves no rounding error in its sums.
+        self._older: list[tuple[float, float, float]] = []
+        self._newer: list[tuple[float, float]] = []
+        self._sum = self._squares = 0.0
+
+    def clear(self) -> None:
+        """Forget the window, as after a gap."""
+        self._older.clear()
+        self._newer.clear()
+        self._sum = self._squares = 0.0
+
+    def filter(self, time: float, rate: float) -> float:  # noqa: A003
+        """Return the rate, rad/s, or zero; `time` in s increases from call to call."""
+        if not self.settings.rate:
+            return rate
+        return 0.0 if self._stands(time, rate) else rate
+
+    def _stands(self, time: float, rate: float) -> bool:
+        rate, begin = min(max(rate, -FASTEST), FASTEST), time - self.settings.window
+        self._newer.append((time, rate))
+        self._sum += rate
+        self._squares += rate * rate
+        while self._first <= begin and len(self._older) + len(self._newer) > 1:
+            if not self._older:
+                self._border()
+            self._older.pop()
+        count = len(self._older) + len(self._newer)
+        _, total, squares = self._older[-1] if self._older else (0.0, 0.0, 0.0)
+        mean = (total + self._sum) / count
+        if not abs(mean) < self.settings.rate:
+            return False
+        # it shakes where the window varies by more than noise would
+        explained = 9.0 * self.settings.angle_random_walk ** 2 * count
+        return not 0.0 < explained < (
+            ((squares + self._squares) / count - mean * mean) * (time - self._first))
+
+    @property
+    def _first(self) -> float:
+        """Return the time of the oldest sample, s."""
+        return self._older[-1][0] if self._older else self._newer[0][0]
+
+    def _border(self) -> None:
+        """Bring all samples to the older part."""
+        total = squares = 0.0
+        for time, rate in reversed(self._newer):
+            total += rate
+            squares += rate * rate
+            self._older.append((time, total, squares))
+        self._newer.clear()
+        self._sum = self._squares = 0.0
+
+
+def integrate(time: Array, rate: Array, begin: float = 0.0) -> Array:
+    """Return the heading, rad, shape (n,), by the trapezoid rule, from `begin` on."""
+    heading = np.empty(len(time))
+    heading[:1] = begin
+    for first in range(1, len(time), CACHED):
+        end = min(first + CACHED, len(time))
+        turned = np.add(rate[first:end], rate[first - 1:end - 1], out=heading[first:end])
+        turned *= time[first:end] - time[first - 1:end - 1]
+        turned *= 0.5
+        turned[0] += heading[first - 1]
+        np.cumsum(turned, out=turned)
+    return heading
+
+
+def filter_rates(settings: Threshold, time: Array, rate: Array) -> Array:
+    """Return what `ThresholdFilter` makes of a whole log, rad/s, shape (n,)."""
+    if not settings.rate:
+        return rate
+    end = np.arange(1, len(rate) + 1)
+    begin = np.minimum(np.searchsorted(time, time - settings.window, side='right'), end - 1)
+    # each window is summed by itself: one large value would ruin a running sum from there on
+    bounded, count, windows = (np.clip(rate, -FASTEST, FASTEST), end - begin,
+                               np.stack([begin, end], axis=1).ravel())
+    sums, squares = (np.add.reduceat(np.append(values, 0.0), windows)[::2]
+                     for values in (bounded, bounded * bounded))
+    mean = sums / count
+    variance = squares / count - mean * mean
+    explained = 9.0 * settings.angle_random_walk ** 2 * count
+    shakes = (explained > 0.0) & (explained < variance * (time - time[begin]))
+    return np.where((np.abs(mean) < settings.rate) & ~shakes, 0.0, rate)
+
+
+class BlockIntegrator:
+    """
+    Filter and integrate a log block by block, with the same result as in one piece.
+
+    The result is that of a `tracking.HeadingTracker` that looks for no rests, for a log without
+    gaps longer than that one bridges.
+
+    Attributes
+    ----------
+    intervals : of the samples, and how many are lost
+
+    """
+
+    def __init__(self, settings: Threshold, noise: Noise, covariance: Array):
+        """Begin at heading zero; `covariance` is that of the calibration, shape (m, m)."""
+        self._settings, self._noise, self._covariance = settings, noise, covariance
+        self._window: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._last: tuple[Array, Array] = np.zeros(0), np.zeros((2 + len(covariance), 0))
+        self._grown: Array = np.zeros(2 + len(covariance))
+        self._gaps, self._unseen, self._last_rate = Gaps(noise), 0.0, 0.0
+        self.intervals = self._gaps.intervals
+
+    def add(self, time: Array, rate: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
+        """
+        Take the next block, which may be empty.
+
+        Parameters
+        ----------
+        time, rate : s and rad/s, before the threshold filter, shape (n,)
+        sensitivity : of the rates to the calibration, shape (m, n), as in `compensation`
+
+        Returns
+        -------
+        filtered rate, rad/s, heading and its standard deviation, rad, shape (n,) each
+
+        """
+        if not len(time):
+            return rate, rate, rate
+        filtered = self._filtered(time, rate)
+        kept = (filtered == rate).astype(float)
+        unseen = self._unseen_at(time, rate, kept)
+        heading, moving_time, *grown = self._integrated(
+            time, np.vstack([filtered, kept, kept * sensitivity]))
+        calibration = quadratic_form(self._covariance,
+                                     np.reshape(grown, (len(self._covariance), len(time))))
+        return (filtered, heading,
+                np.sqrt(calibration + self._noise.heading_variance(moving_time) + unseen))
+
+    def _unseen_at(self, time: Array, rate: Array, kept: Array) -> Array:
+        """Return the variance by what was lost in gaps so far, rad², shape (n,)."""
+        unseen, (last_time, last_rows) = np.zeros(len(time)), self._last
+        before = ((float(last_time[0]), self._last_rate, bool(last_rows[1, 0]))
+                  if len(last_time) else None)
+        for index, sample in enumerate(zip(time.tolist(), rate.tolist(), (kept > 0.0).tolist())):
+            gap = self._gaps.add(sample[0] - before[0], sample[1], before[1]) if before else None
+            if gap is not None and before is not None and (sample[2] or before[2]):
+                self._unseen += gap.variance
+            unseen[index], before = self._unseen, sample
+        self._last_rate = float(rate[-1])
+        return unseen
+
+    def _filtered(self, time: Array, rate: Array) -> Array:
+        carried = len(self._window[0])
+        time, rate = (np.concatenate([self._window[0], time]),
+                      np.concatenate([self._window[1], rate]))
+        begin = np.searchsorted(time, time[-1] - self._settings.window, side='right')
+        self._window = time[begin:], rate[begin:]
+        return filter_rates(self._settings, time, rate)[carried:]
+
+    def _integrated(self, time: Array, grows: Array) -> Array:
+        carried = len(self._last[0])
+        time, grows = np.concatenate([self._last[0], time]), np.hstack([self._last[1], grows])
+        grown = np.array([integrate(time, row, begin) for row, begin in zip(grows, self._grown)])
+        self._last, self._grown = (time[-1:], grows[:, -1:]), grown[:, -1]
+        return grown[:, carried:]

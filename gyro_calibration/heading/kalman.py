@@ -1,0 +1,354 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Kalman filter of a heading: its error, those of calibrated values, and the wander of the bias.
+
+The state is the heading, the rate random walk w, the parts f of the flicker, and the errors e of
+the values of the calibration. In a turn, the heading goes on by the integral of the compensated
+rate, less what the state explains of it::
+
+    turned = true turn + T w + sum of tau (1 - exp(-T / tau)) f - sensitivity e + white noise
+
+At rest the true turn is zero, and the same line is a measurement (d of Hong and Park, eq. 11, with
+the noise figures of the model). It determines the bias, and by the correlation with the heading
+also the error of the heading before.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.noise import CALIBRATED, known_mean, Noise
+import numpy as np
+from scipy.linalg import pinvh
+
+#: Places of the heading and the random walk in the state; the flicker begins after them.
+HEADING, WALK, _FLICKER = 0, 1, 2
+
+
+@dataclass(slots=True)
+class Turn:
+    """
+    What the rates of some time came to.
+
+    Attributes
+    ----------
+    duration : s
+    turned : integral of the compensated rate, rad
+    sensitivity : integral of the sensitivity of the rate to the calibration, shape (m,)
+    lost : variance of what was turned unseen, rad²
+    noise : what the variance of the noise is beyond that of as long a time with all samples, rad²
+    wander : variance of what the robot turns at a rest that may be none, and its rates show, rad²
+    unseen : there were no rates: the heading stays, and the errors of rates do not affect it; not
+        to be added to others
+
+    """
+
+    duration: float
+    turned: float
+    sensitivity: Array
+    lost: float = 0.0
+    noise: float = 0.0
+    wander: float = 0.0
+    unseen: bool = False
+
+    def __add__(self, other: Turn) -> Turn:
+        """Return both after each other."""
+        return Turn(self.duration + other.duration, self.turned + other.turned,
+                    self.sensitivity + other.sensitivity,
+                    self.lost + other.lost, self.noise + other.noise)
+
+    def add(self, duration: float, turned: float, sensitivity: Array) -> None:
+        """Take in what the next sample brings."""
+        self.duration += duration
+        self.turned += turned
+        self.sensitivity += sensitivity
+
+    def __sub__(self, other: Turn) -> Turn:
+        """Return what is left of this one behind another with which it begins."""
+        return Turn(self.duration - other.duration, self.turned - other.turned,
+                    self.sensitivity - other.sensitivity,
+                    self.lost - other.lost, self.noise - other.noise)
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    How the state changes over some time, but for what the heading turned through.
+
+    Attributes
+    ----------
+    seen : what each part of the state adds to the integral of the compensated rate, shape (n,)
+    kept : what stays of each part, shape (n,)
+    grown : covariance of what comes in new, shape (n, n); its first row and column are those of
+        the integral of the rate, negated
+
+    """
+
+    seen: Array
+    kept: Array
+    grown: Array
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    Mean and covariance of the state, shape (n,) and (n, n).
+
+    n = 2 + parts of the flicker + values of the calibration.
+
+    """
+
+    noise: Noise
+    mean: Array
+    covariance: Array
+
+    @property
+    def calibrated(self) -> int:
+        """Return the place of the first value of the calibration in the state."""
+        return _FLICKER + len(self.noise.flicker()[0])
+
+    def step(self, turn: Turn) -> Step:
+        """Return how the state changes over a turn."""
+        seen, kept, grown = _step(self.noise, round(turn.duration, 6), turn.unseen,
+                                  len(turn.sensitivity))
+        seen, grown = seen.copy(), grown.copy()
+        seen[len(seen) - len(turn.sensitivity):] = -turn.sensitivity
+        white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
+        grown[HEADING, HEADING] += white + turn.lost + turn.noise
+        return Step(seen, kept, grown)
+
+    def moved(self, turn: Turn) -> Drift:
+        """Return the state after a turn."""
+        step = self.step(turn)
+        transition = np.diag(step.kept)
+        transition[HEADING] -= step.seen
+        mean = step.kept * self.mean
+        mean[HEADING] += turn.turned - step.seen @ self.mean
+        return Drift(self.noise, mean, transition @ self.covariance @ transition.T + step.grown)
+
+    def heading_variance(self, turn: Turn) -> float:
+        """Return the variance of the heading after a turn, rad²."""
+        return float(self.heading_variances([turn])[0])
+
+    def heading_variances(self, turns: list[Turn]) -> Array:
+        """Return the same after each of several turns, shape (k,)."""
+        steps = [_step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
+                 for turn in turns]
+        rows = -np.array([seen for seen, _, _ in steps])
+        rows[:, HEADING] += 1.0
+        rows[:, self.calibrated:] = [turn.sensitivity for turn in turns]
+        white = self.noise.angle_random_walk ** 2
+        grown = [float(each[HEADING, HEADING]) + white * turn.duration * (not turn.unseen)
+                 + turn.lost + turn.noise for (_, _, each), turn in zip(steps, turns)]
+        return np.einsum('ki,ij,kj->k', rows, self.covariance, rows) + grown
+
+    def rested(self, turn: Turn) -> Drift:
+        """Return the state after a time in which the true rate was zero."""
+        step = self.step(turn)
+        return self.measured(turn, step).carried(turn, step)
+
+    def measured(self, turn: Turn, step: Step | None = None) -> Drift:
+        """
+        Return the state at the begin of a time of rest, with what it shows.
+
+        Where the robot may turn by a `wander`, that is part of what the rates show and of the
+        heading, which is then that of the end.
+
+        """
+        step = step or self.step(turn)
+        along = self.covariance @ step.seen
+        variance = float(step.seen @ along + step.grown[HEADING, HEADING]) + turn.wander
+        off = turn.turned - float(step.seen @ self.mean)
+        covariance = self.covariance
+        if turn.wander:
+            along[HEADING] += turn.wander
+            covariance = covariance.copy()
+            covariance[HEADING, HEADING] += turn.wander
+        return Drift(self.noise, self.mean + along * (off / variance),
+                     covariance - along[:, None] * along / variance)
+
+    def carried(self, turn: Turn, step: Step | None = None) -> Drift:
+        """Return the state after a time in which the heading stood and nothing was measured."""
+        step = step or self.step(turn)
+        grown = step.grown.copy()
+        grown[HEADING] = grown[:, HEADING] = 0.0
+        grown[HEADING, HEADING] = turn.lost
+        return Drift(self.noise, step.kept * self.mean,
+                     step.kept[:, None] * self.covariance * step.kept + grown)
+
+    def expected(self, turn: Turn) -> tuple[float, float]:
+        """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
+        values, noise = len(turn.sensitivity), self.noise
+        seen, _, grown = _step(noise, round(turn.duration, 6), turn.unseen, values)
+        seen = seen.copy()
+        seen[len(seen) - values:] = -turn.sensitivity
+        white = 0.0 if turn.unseen else noise.angle_random_walk ** 2 * turn.duration
+        return (float(seen @ self.mean), float(seen @ self.covariance @ seen)
+                + float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise)
+
+    @cached_property
+    def offset(self) -> tuple[float, float]:
+        """Return the sum of random walk and flicker, rad/s, and its variance."""
+        parts = slice(WALK, self.calibrated)
+        return float(self.mean[parts].sum()), float(self.covariance[parts, parts].sum())
+
+    @cached_property
+    def values(self) -> tuple[Array, Array, Array]:
+        """Return the errors of the calibration, their covariance, and that with the `offset`."""
+        first = self.calibrated
+        return (self.mean[first:], self.covariance[first:, first:],
+                self.covariance[WALK:first, first:].sum(axis=0))
+
+    def bias(self, sensitivity: Array) -> tuple[float, float]:
+        """Return the error of the compensated rate, rad/s, and its variance; sensitivity (m,)."""
+        (offset, variance), (values, covariance, shared) = self.offset, self.values
+        return (offset - float(sensitivity @ values),
+                variance + float(sensitivity @ (covariance @ sensitivity - 2.0 * shared)))
+
+    def uncertain(self, place: int, variance: float) -> Drift:
+        """Return the state with one part less well known."""
+        covariance = self.covariance.copy()
+        covariance[place, place] += variance
+        return replace(self, covariance=covariance)
+
+    def known_to_head(self, heading: float, variance: float) -> Drift:
+        """Return the state where later times have shown the heading, rad, rad²."""
+        own = self.covariance[HEADING, HEADING]
+        gain = self.covariance[HEADING] / own if own > 0.0 else 0.0 * self.covariance[HEADING]
+        return replace(
+            self, mean=self.mean + gain * (heading - self.mean[HEADING]),
+            covariance=self.covariance + (variance - own) * np.outer(gain, gain))
+
+    def turned_to(self, heading: float, variance: float = 0.0) -> Drift:
+        """Return the state with another heading, rad, and its variance, rad²."""
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[HEADING] = heading
+        covariance[HEADING] = covariance[:, HEADING] = 0.0
+        covariance[HEADING, HEADING] = variance
+        return replace(self, mean=mean, covariance=covariance)
+
+
+def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float = 0.0,
+          age: float | None = None) -> Drift:
+    """
+    Return the state some time after a calibration.
+
+    Parameters
+    ----------
+    noise : of the model
+    covariance : of the calibration, shape (m, m), from `compensation.covariance`
+    heading, variance : rad and rad²
+    age : of a self-calibration, s, whose bias, the last value, is a mean over `CALIBRATED` s; None
+        without one. Its variance holds the floor of the Allan deviation for the flicker, which is
+        counted part by part here instead
+
+    """
+    constants, of_each = noise.flicker()
+    first = _FLICKER + len(constants)
+    mean, whole = np.zeros(first + len(covariance)), np.zeros((first + len(covariance),) * 2)
+    mean[HEADING], whole[HEADING, HEADING] = heading, variance
+    whole[first:, first:] = covariance
+    flicker = np.arange(_FLICKER, first)
+    whole[flicker, flicker] = of_each
+    if age is not None:
+        within, shared = known_mean(constants)
+        whole[WALK, WALK] = noise.rate_random_walk ** 2 * (age + CALIBRATED / 3.0)
+        whole[-1, -1] = max(whole[-1, -1] - noise.floor ** 2, 0.0) + of_each * np.sum(within)
+        whole[-1, flicker] = whole[flicker, -1] = -of_each * shared * np.exp(-age / constants)
+    return Drift(noise, mean, whole)
+
+
+@lru_cache(maxsize=4096)
+def _step(noise: Noise, duration: float, unseen: bool,
+          values: int) -> tuple[Array, Array, Array]:
+    """Return `_wander` or `_unseen` with room for the values of a calibration."""
+    seen, kept, grown = (_unseen if unseen else _wander)(noise, duration)
+    whole = np.zeros((len(kept) + values, len(kept) + values))
+    whole[:len(kept), :len(kept)] = grown
+    return (np.concatenate([seen, np.zeros(values)]), np.concatenate([kept, np.ones(values)]),
+            whole)
+
+
+def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+    """
+    Return what heading, walk and flicker add to the integral, what stays, and what comes in new.
+
+    White noise is not included.
+
+    """
+    constants, variance = noise.flicker()
+    left = np.exp(-duration / constants)
+    kept, seen = (np.concatenate([[1.0, 1.0], left]),
+                  np.concatenate([[0.0, duration], constants * (1.0 - left)]))
+    walk = noise.rate_random_walk ** 2
+    grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
+    grown[HEADING, WALK] = -0.5 * walk * duration ** 2
+    grown[HEADING, _FLICKER:] = -variance * constants * (1.0 - left) ** 2
+    grown[:, HEADING] = grown[HEADING]
+    ratio = duration / constants
+    grown[HEADING, HEADING] = walk * duration ** 3 / 3.0 + variance * float(np.sum(
+        constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)))
+    return seen, kept, grown
+
+
+def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
+    """Return the same where no rates are integrated: walk and flicker go on, and add nothing."""
+    seen, kept, grown = (values.copy() for values in _wander(noise, duration))
+    seen[:] = grown[HEADING] = grown[:, HEADING] = 0.0
+    return seen, kept, grown
+
+
+def smoothed(states: list[Drift], turns: list[Turn], resting: list[bool]) -> list[Drift]:
+    """
+    Return the states with all that came later (Rauch, Tung and Striebel).
+
+    Parameters
+    ----------
+    states : before each turn, and after the last; n + 1 of them
+    turns, resting : n each
+
+    """
+    later = [states[-1]]
+    for state, turn, rest in zip(states[-2::-1], turns[::-1], resting[::-1]):
+        later.append(_with_hindsight(state, turn, rest, later[-1]))
+    return later[::-1]
+
+
+def _with_hindsight(state: Drift, turn: Turn, rest: bool, later: Drift) -> Drift:
+    """Return a state with what the one after it has come to."""
+    step, start = state.step(turn), state
+    if rest:
+        after = state.measured(turn).carried(turn)
+        expected, variance = state.expected(turn)
+        along, variance = state.covariance @ step.seen, variance + turn.wander
+        start = replace(state, mean=state.mean + along / variance * (turn.turned - expected),
+                        covariance=state.covariance - np.outer(along, along) / variance)
+        shared = start.covariance * step.kept
+        shared[:, HEADING] -= along * turn.wander / variance
+    else:
+        after, transition = state.moved(turn), np.diag(step.kept)
+        transition[HEADING] -= step.seen
+        shared = state.covariance @ transition.T
+    back = shared @ _inverse(after.covariance)
+    return replace(
+        start, mean=start.mean + back @ (later.mean - after.mean),
+        covariance=start.covariance + back @ (later.covariance - after.covariance) @ back.T)
+
+
+def _inverse(covariance: Array) -> Array:
+    """Return the inverse of a covariance in which some parts may be known exactly."""
+    size = np.sqrt(np.diagonal(covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    return pinvh(covariance / np.outer(size, size)) / np.outer(size, size)

@@ -1,0 +1,172 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Compensation of a log by a model with history, whose surroundings are followed over blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import Any
+
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.logs.log import Array, DEGREE, Log, Mask, QUANTITIES
+from gyro_calibration.model.compensation import compensate, Compensated, rate_sensitivity
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.gyro_model import GyroModel
+import numpy as np
+from numpy.typing import NDArray
+
+#: Where effects look at a heading without reference, it is found for so long at once, s; longer
+#: parts need more passes.
+_AT_ONCE = 60.0
+#: A reference heading that is lost for no longer is interpolated, s.
+_BRIDGED = 1.0
+#: Passes end where the heading changes by less, rad, or after so many.
+_SETTLED, _PASSES = 1e-10, 50
+
+
+class LogCompensation:
+    """
+    Compensate a log block by block, with the same result as in one piece.
+
+    The heading that effects look at is that of the reference. Without one it is the integral of
+    the compensated rates from 0 on.
+
+    Where a reference is lost, the heading goes on from its last value by the compensated rates. Up
+    to `_BRIDGED` s inside a block are interpolated instead; over the border of blocks the next
+    value is not known, and the result differs a little. Before the first value of a reference its
+    heading is that value; in blocks before the one with that it is found from 0 on.
+
+    """
+
+    def __init__(self, model: GyroModel):
+        """Begin with nothing known of the past."""
+        self._model, self._history = model, model.history()
+        self._begin: float | None = None
+        self._referred = False
+        self._turned: tuple[Array, Array, float] = np.zeros(0), np.zeros(0), 0.0
+
+    def add(self, log: Log) -> tuple[Compensated, Array]:
+        """Take the next rows, with known outputs; return them with their `rate_sensitivity`."""
+        if not self._model.looks_around or not len(log):
+            return self._compensated(log, None)
+        compensated, sensitivities = zip(*(self._around(part) for part in self._parts(log)))
+        joined = {each.name: np.concatenate([
+            np.broadcast_to(getattr(part, each.name), part.rate.shape) for part in compensated])
+            for each in fields(Compensated)}
+        return Compensated(**joined), np.concatenate(sensitivities, axis=1)
+
+    def true_time(self, time: Array) -> Array:
+        """Return when the samples with the next stamps, s, were taken."""
+        if self._begin is None and len(time):
+            self._begin = float(time[0])
+        begin = self._begin or 0.0
+        return np.asarray(begin + self._model.true_time(time - begin))
+
+    def _compensated(self, log: Log, around: Channels | None) -> tuple[Compensated, Array]:
+        assert log.output is not None
+        result = compensate(self._model, log.output, log.temperature, around)
+        return result, rate_sensitivity(self._model, log.output, result.rate, result.temperature,
+                                        around)
+
+    def _parts(self, log: Log) -> Iterator[Log]:
+        """Give the rows in parts with a reference or without one; those without are short."""
+        if log.time is None or not self._model.looks_at('heading'):
+            yield log
+            return
+        part = np.where(self._referenced(log.time, log.reference_heading), -1,
+                        (log.time - log.time[0]) // _AT_ONCE)
+        for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
+            yield rows_of(log, rows)
+
+    def _referenced(self, time: Array, heading: Array | None) -> Mask:
+        """Return which rows have a reference heading, or one to interpolate, shape (n,)."""
+        known = np.flatnonzero(np.isfinite(heading)) if heading is not None else np.zeros(0, int)
+        if not len(known):
+            return np.zeros(len(time), bool)
+        rows, earlier = np.arange(len(time)), self._referred
+        before, after = (np.searchsorted(known, rows, 'right') - 1,
+                         np.searchsorted(known, rows, 'left'))
+        self._referred, inside = True, (before >= 0) & (after < len(known))
+        lost = time[known[np.minimum(after, len(known) - 1)]] - time[known[np.maximum(before, 0)]]
+        return (inside & (lost <= _BRIDGED)) | ((before < 0) & (not earlier))
+
+    def _seeks_heading(self, log: Log) -> bool:
+        return log.reference_heading is None or not np.isfinite(log.reference_heading).any()
+
+    def _around(self, log: Log) -> tuple[Compensated, Array]:
+        time = np.zeros(len(log)) if log.time is None else log.time
+        around = self._history.follow(time, log.temperature, log.specific_force, log.supply,
+                                      _bridged(time, log.reference_heading))
+        if not self._model.looks_at('heading') or log.time is None:
+            return self._compensated(log, around)
+        if self._seeks_heading(log):
+            return self._compensated(log, self._found_heading(log, around))
+        result, sensitivity = self._compensated(log, around)
+        self._turned = (self.true_time(log.time)[-1:], np.asarray(result.rate)[-1:],
+                        float(np.asarray(around.heading)[-1]))
+        return result, sensitivity
+
+    def _found_heading(self, log: Log, around: Channels) -> Channels:
+        """Repeat: compensate with a heading, and integrate the rates to the next heading."""
+        assert log.time is not None
+        last_time, last_rate, begin = self._turned
+        carried, time = len(last_time), np.concatenate([last_time, self.true_time(log.time)])
+        heading = np.full(len(log), begin)
+        for _ in range(_PASSES):
+            around = replace(around, heading=heading)
+            rate = np.concatenate([last_rate, compensate(
+                self._model, np.asarray(log.output), log.temperature, around).rate])
+            before, heading = heading, integrate(time, rate, begin)[carried:]
+            if np.abs(heading - before).max() < _SETTLED:
+                break
+        self._turned = time[-1:], rate[-1:], float(heading[-1])
+        return replace(around, heading=heading)
+
+
+def plausible(model: GyroModel, log: Log) -> Mask:
+    """Return which rows have a plausible output and temperature, shape (n,); no nan is one."""
+    assert log.output is not None
+    found = np.abs(log.output) <= model.rate_limit
+    if log.temperature is not None:
+        coldest, hottest = model.temperature_limits
+        found &= (coldest <= log.temperature) & (log.temperature <= hottest)
+    return np.asarray(found)
+
+
+def none_plausible(model: GyroModel) -> str:
+    """Return what to say of a log without a plausible row."""
+    coldest, hottest = model.temperature_limits
+    return (f'no row has an output within {model.rate_limit / DEGREE:.0f} deg/s and a temperature '
+            f'from {coldest:.0f} to {hottest:.0f} degC, which is all that is plausible; see '
+            'whether columns and units are right')
+
+
+def compensate_log(model: GyroModel, log: Log) -> Array:
+    """Return the rates of a log with output, rad/s, shape (n,); nan where not `plausible`."""
+    known = plausible(model, log)
+    rate = np.full(len(log), np.nan)
+    rate[known] = LogCompensation(model).add(rows_of(log, known))[0].rate
+    return rate
+
+
+def rows_of(log: Log, rows: NDArray[np.integer[Any]] | Mask) -> Log:
+    """Return some rows of a log, by their numbers or by a mask, without unknown columns."""
+    arrays = {quantity: getattr(log, quantity) for quantity in QUANTITIES}
+    return Log(**{quantity: values[rows] for quantity, values in arrays.items()
+                  if values is not None}, notes=log.notes)
+
+
+def _bridged(time: Array, heading: Array | None) -> Array | float:
+    """Return a heading that is interpolated where it was lost."""
+    if heading is None or not (known := np.isfinite(heading)).any():
+        return 0.0
+    return heading if known.all() else np.interp(time, time[known], heading[known])

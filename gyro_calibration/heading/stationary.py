@@ -1,0 +1,202 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Whether a gyro rests: the energy of its rate against the known noise, and how unlikely a mean is.
+
+Each test has its share of the false alarms per hour at rest.
+
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.heading.gaps import CLOSE
+from gyro_calibration.model.noise import Noise
+from scipy.special import chdtri, ndtri
+
+#: Length of a block of samples, and of the window whose energy is looked at, s.
+BLOCK, WINDOW = 0.1, 0.5
+#: Times, s, over which the mean of the rate is compared with the bias that was known before them.
+LAGS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+#: Times, s, over which the scatter of means over 1 s is compared with the noise.
+SCATTERED = (4.0, 8.0, 16.0, 32.0, 64.0)
+#: A window has at least so many samples.
+_SAMPLES = 8
+#: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
+#: of the model.
+_REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
+
+
+@dataclass(slots=True)
+class Block:
+    """
+    Samples of a short time, as sums.
+
+    Attributes
+    ----------
+    duration : of what its samples stand for, s; a gap is none of that
+    count : of samples
+    total, squares : of the compensated rate, rad/s and (rad/s)²
+    differences : sum of the squared differences of neighbours, (rad/s)²
+
+    """
+
+    duration: float = 0.0
+    count: int = 0
+    total: float = 0.0
+    squares: float = 0.0
+    differences: float = 0.0
+
+    def add(self, duration: float, rate: float, before: float) -> None:
+        """Take a sample that stands for `duration` s."""
+        self.duration += duration
+        self.count += 1
+        self.total += rate
+        self.squares += rate * rate
+        self.differences += (rate - before) ** 2
+
+
+def sigmas(lag: float, false_alarms: float) -> float:
+    """Return the sigmas of a mean over `lag` s that give `false_alarms` per hour at rest."""
+    chances = 3600.0 / lag * _OVERLAPPING
+    return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
+
+
+def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
+    """Return the sum of squares of means over `lag` s that gives `false_alarms` an hour."""
+    chances = 3600.0 / lag * _OVERLAPPING
+    return float(chdtri(freedom, min(false_alarms / (_TESTS * chances), 0.5)))
+
+
+#: Tests that share the false alarms, and how many more chances windows have that overlap.
+_TESTS, _OVERLAPPING = len(LAGS) + 2, 3.0
+
+
+class _Quietest:
+    """The lowest tenth of the last values."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    @property
+    def count(self) -> int:
+        return len(self._sorted)
+
+    def add(self, value: float) -> float:
+        """Take the next value; return the quantile of 10 %."""
+        if len(self._seen) == _REMEMBERED:
+            self._sorted.pop(bisect_left(self._sorted, self._seen.popleft()))
+        self._seen.append(value)
+        insort(self._sorted, value)
+        place = 0.1 * (len(self._sorted) - 1)
+        below = int(place)
+        low, high = self._sorted[below], self._sorted[min(below + 1, len(self._sorted) - 1)]
+        return low + (place - below) * (high - low)
+
+
+class Energy:
+    """
+    The energy of the last `WINDOW` s.
+
+    Attributes
+    ----------
+    factor : noise of the samples over that of the model, by the quietest windows; 1 until enough
+        were seen
+
+    """
+
+    def __init__(self, noise: Noise, false_alarms: float):
+        """Begin with an empty window."""
+        self.factor = 1.0
+        self._noise = noise
+        self._level = false_alarms / (_TESTS * 3600.0 / WINDOW * _OVERLAPPING)
+        self._blocks: deque[Block] = deque()
+        self._energies, self._roughnesses = _Quietest(), _Quietest()
+        self._since, self._interval = 0.0, BLOCK
+        self._sudden: float | None = None
+        self._most: dict[tuple[int, float], float] = {}
+
+    def clear(self) -> None:
+        """Forget the window, as where rates of another calibration come."""
+        self._blocks.clear()
+
+    def add(self, block: Block) -> bool | None:
+        """Take the next block; tell whether the window is only noise; None until it is full."""
+        blocks = self._blocks
+        blocks.append(block)
+        duration, count = 0.0, 0
+        for each in blocks:
+            duration += each.duration
+            count += each.count
+        while (duration - blocks[0].duration >= WINDOW + BLOCK - CLOSE
+               and count - blocks[0].count >= _SAMPLES):
+            duration -= blocks[0].duration
+            count -= blocks.popleft().count
+        total = squares = differences = means = 0.0
+        for each in blocks:
+            total += each.total
+            squares += each.squares
+            differences += each.differences
+            means += each.total * each.total / each.count
+        if duration < WINDOW + BLOCK - CLOSE or count < _SAMPLES:
+            return None
+        self._interval, self._sudden = duration / count, None
+        claimed = self._noise.rate_variance(self._interval)
+        energy = (squares - total * total / count) / (count - 1)
+        self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
+        claimed *= self.factor ** 2
+        if energy >= claimed * self._exceeded(count - 1, self._level) / (count - 1):
+            return False
+        # what a robot does is slower than its samples: means over blocks show it far better
+        freedom = len(blocks) - 1
+        return bool(freedom < 2 or means - total * total / count
+                    < claimed * self._exceeded(freedom, self._level))
+
+    def _exceeded(self, freedom: int, chance: float) -> float:
+        """Return what chi squared exceeds by such a chance."""
+        if (freedom, chance) not in self._most:
+            self._most[freedom, chance] = float(chdtri(freedom, chance))
+        return self._most[freedom, chance]
+
+    def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
+        """
+        Learn the noise of the samples from the quietest tenth of the windows.
+
+        Vibration of a robot that goes straight is no noise, and shows less in differences of
+        neighbours.
+
+        """
+        self._since += duration
+        if self._since < WINDOW - CLOSE:
+            return
+        self._since = 0.0
+        quietest, rough = self._energies.add(energy), self._roughnesses.add(differences)
+        if self._energies.count >= _NEEDED:
+            quietest = min(quietest, rough) * (count - 1) / self._exceeded(count - 1, 0.9)
+            self.factor = math.sqrt(min(max(quietest, 1.0), _TRUSTED ** 2))
+
+    def sudden(self) -> float:
+        """
+        Return how far a single sample may be off at rest, rad/s.
+
+        Its noise is that of the usual interval: late samples and bursts were sampled evenly too.
+
+        """
+        if self._sudden is None:
+            limit = sigmas(self._interval, _TESTS * self._level * 3600.0 / WINDOW)
+            self._sudden = limit * self.factor * math.sqrt(
+                self._noise.rate_variance(self._interval))
+        return self._sudden

@@ -1,0 +1,1181 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The heading of a robot from compensated rates, with its variance and the bias seen at rest.
+
+At rest the bias is tracked, the rate is zero and the heading stands. In motion the bias stays,
+with a variance that grows. A turn too slow to be seen at once is seen over a longer time, and what
+was taken for bias meanwhile becomes heading again.
+
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+from gyro_calibration.heading.gaps import block_ends, CLOSE, FASTEST, Gaps, Intervals, LONGEST
+from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
+from gyro_calibration.heading.kalman import begin, Drift, HEADING, smoothed, Turn, WALK
+from gyro_calibration.heading.stationary import (
+    BLOCK,
+    Block,
+    Energy,
+    LAGS,
+    most_scatter,
+    SCATTERED,
+    sigmas,
+    WINDOW,
+)
+from gyro_calibration.logs.log import Array, DEGREE, Mask, SHORTEST
+from gyro_calibration.model.noise import Noise
+import numpy as np
+
+#: A rate that changes from one sample to the next by more than this, rad/s, and this acceleration,
+#: rad/s², and then comes back, is no motion of a robot.
+_JUMP, _ACCELERATION = 0.5, 200.0
+#: A correction of the heading is taken over with this time constant while the robot moves, s.
+SETTLING = 1.0
+#: The state goes on at least so often, s.
+_STEP = 1.0
+#: A sample at rest may be off by so many standard deviations of the bias.
+_FAR = 4.0
+#: A rest that is over sooner was none, s.
+_BRIEF = 2.0
+#: While the wheels stand, nobody turns the robot, and the bias may have moved by so much, rad/s.
+_UNSEEN = 0.2 * DEGREE
+#: Noise of the samples counts from this factor over that of the model on; a mean may be off by so
+#: much more, for noise figures are not better known.
+_ALLOWED = 1.25
+#: A steady turn slower than so many times the slowest that is noticed may be a bias that moved;
+#: it is taken for one after so long, s.
+_DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
+#: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
+#: goes on is found again.
+_RECOGNIZED = 1.0
+#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much
+#: scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for so
+#: long, s.
+_RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
+#: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
+#: squared standard deviations.
+_STRETCHES, _SCATTER_MEMORY, _SCATTER_MOST = 20.0, 200.0, 40.0
+#: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
+_BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
+#: Samples of a log that are taken at once.
+_AT_ONCE = 1 << 15
+#: Blocks at rest whose samples are compared with the bias at once; it is known anew each second.
+_LOOKED_AHEAD = 12
+#: States of a rest that are remembered.
+_SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
+#: The slowest turn that is noticed is missed with a probability of 5 %.
+_POWER = 1.645
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How the heading is tracked.
+
+    Attributes
+    ----------
+    false_alarms : rests taken for motion, in an hour at rest, 1/h; 0 looks for no rests, and nor
+        does an unknown noise
+    threshold : of the filter of Hong and Park, eq. 12; used where rests are not looked for
+    maximum_gap : over a longer gap in the stamps nothing is integrated, s
+
+    """
+
+    false_alarms: float = 0.1
+    threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
+    maximum_gap: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Snapshot:
+    """
+    State at some time of a rest.
+
+    Attributes
+    ----------
+    drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
+    turn : what the rates came to since it began
+    squares, means : sum of the squared surprises of the steps since it began, and their number
+    excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
+    odds : logarithm of how much likelier they are on a straight way than at a rest
+
+    """
+
+    drift: Drift
+    turn: Turn
+    deleted: float
+    steps: int
+    squares: float = 0.0
+    means: int = 0
+    excess: float = 0.0
+    weight: float = 0.0
+    odds: float = 0.0
+
+
+@dataclass
+class _Ways:
+    """
+    How often a straight way passed for a rest, and how much the rates scatter there.
+
+    Attributes
+    ----------
+    rests, ways : how many there were
+    excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
+
+    """
+
+    rests: float = _RESTS
+    ways: float = _WAYS
+    excess: float = _SCATTER * _SCATTER_SEEN
+    weight: float = _SCATTER_SEEN
+
+    @property
+    def scatter(self) -> float:
+        """Return the scatter on a way, over the variance of the noise."""
+        return max(self.excess / self.weight, 0.0)
+
+    def chance(self, odds: float) -> float:
+        """Return the probability that what passes for a rest is a way."""
+        return 1.0 / (1.0 + self.rests / self.ways * math.exp(min(-odds, 700.0)))
+
+    def learn(self, last: _Snapshot) -> None:
+        """Take in all of what passed for a rest."""
+        way = self.chance(last.odds)
+        kept = _STRETCHES / max(_STRETCHES, self.rests + self.ways)
+        self.rests, self.ways = kept * self.rests + 1.0 - way, kept * self.ways + way
+        kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
+        self.excess, self.weight = (kept * self.excess + way * last.excess,
+                                    kept * self.weight + way * last.weight)
+
+
+@dataclass
+class _Doubt:
+    """
+    A turn that was seen late, and is so slow that the bias may have moved instead.
+
+    Attributes
+    ----------
+    before : the state when it began
+    rate : of the turn, rad/s
+    turn : what the rates came to since
+
+    """
+
+    before: _Snapshot
+    rate: float
+    turn: Turn
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Samples as `HeadingTracker.follow` is given them."""
+
+    time: Array
+    rate: Array
+    moving: Array
+    resting: Array
+    wheels: Sequence[bool | None] | None
+    still: Array | None
+
+    def still_at(self, place: int) -> Array | None:
+        return self.still if self.still is None or self.still.ndim == 1 else self.still[place]
+
+    def sample(self, place: int, resting: bool,
+               ) -> tuple[float, float, Array, bool | None, Array | None]:
+        """Return what `HeadingTracker.add` wants."""
+        return (float(self.time[place]), float(self.rate[place]),
+                (self.resting if resting else self.moving)[place],
+                None if self.wheels is None else self.wheels[place], self.still_at(place))
+
+
+@dataclass
+class _Epoch:
+    """
+    Samples over which nothing is learned; heading and what is pending of it at the begin, rad.
+
+    Attributes
+    ----------
+    place : of the sample behind which it begins
+    taken : counts the epochs
+    opens : behind which samples blocks ended, and what the rates came to since the state
+    end : behind its last sample
+
+    """
+
+    place: int
+    taken: int
+    drift: Drift
+    resting: bool
+    heading: float
+    pending: float
+    opens: list[tuple[int, Turn]]
+    end: int = -1
+
+
+class _Piece:
+    """
+    Samples without jumps and gaps, n of them, and their sums by blocks, k of them.
+
+    Attributes
+    ----------
+    time, rate, intervals, halves, turned : stamps, rates, the intervals before them, half of them,
+        and the integrals of the rates over them, shape (n,)
+    moving, resting : sensitivities, shape (n, m)
+    seen : those that were used, with that of the sample before, shape (n + 1, m)
+    begins, ends, whole : of the blocks, and which of them are whole
+    sums : duration, integral, share of a pending correction that stays, half of the first
+        interval, and sums of the rates, their squares, and the squares of their steps, by block
+    weighted, weighted_at_rest : integrals of the sensitivities without the sample before, (k, m)
+    found : what `HeadingTracker.follow` returns
+    epochs : begun so far
+
+    """
+
+    def __init__(self, given: _Samples, where: slice, last: tuple[float, float, float, Array],
+                 begun: float, found: Array):
+        """Begin behind the last sample, with a block that has begun for some time, s."""
+        self._given, self._first, self.found = given, where.start, found
+        self.time, self.rate = given.time[where], given.rate[where]
+        self.moving, self.resting = given.moving[where], given.resting[where]
+        count = len(self.time)
+        self.intervals = np.diff(self.time, prepend=last[0])
+        self.halves, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
+        self.turned = self.halves * (2.0 * self.rate - steps)
+        self.seen = np.empty((count + 1, len(last[3])))
+        self.seen[0] = last[3]
+        self.ends = block_ends(self.intervals, BLOCK, begun)
+        whole = len(self.ends)
+        if not self.ends or self.ends[-1] < count:
+            self.ends.append(count)
+        self.begins = [0, *self.ends[:-1]]
+        self.whole = range(bool(begun), whole)
+        weights = self.halves + np.append(self.halves[1:], 0.0)
+        weights[np.array(self.ends) - 1] = self.halves[np.array(self.ends) - 1]
+        self.weighted = self._by_blocks(weights[:, None] * self.moving)
+        self.weighted_at_rest = (self.weighted if self.resting is self.moving
+                                 else self._by_blocks(weights[:, None] * self.resting))
+        sums = [self._by_blocks(values).tolist() for values in (
+            self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
+        self._kept = 1.0 - self.intervals / SETTLING
+        sums[2:2] = [np.multiply.reduceat(self._kept, self.begins).tolist(),
+                     self.halves[self.begins].tolist()]
+        self.sums = list(zip(*sums))
+        self.epochs = list[_Epoch]()
+        self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
+
+    def _by_blocks(self, values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, self.begins))
+
+    def moved(self, number: int) -> Sequence[bool | None]:
+        """Return what the wheels said in a block."""
+        wheels = self._given.wheels
+        return () if wheels is None else wheels[self._first + self.begins[number]:
+                                                self._first + self.ends[number]]
+
+    def still(self, place: int) -> Array | None:
+        return self._given.still_at(self._first + place)
+
+    def extremes(self, number: int, offset: float, values: Array,
+                 taken: int) -> tuple[float, float]:
+        """Return the highest and the lowest corrected rate at rest of a block, rad/s."""
+        known, first, highest, lowest = self._extremes
+        if known != taken or number >= first + len(highest):
+            first, last = number, min(number + _LOOKED_AHEAD, len(self.ends))
+            rows = slice(self.begins[first], self.ends[last - 1])
+            rate = self.rate[rows] + self.resting[rows] @ values
+            rate -= offset
+            places = np.array(self.begins[first:last]) - self.begins[first]
+            highest, lowest = (which.reduceat(rate, places).tolist()
+                               for which in (np.maximum, np.minimum))
+            self._extremes = taken, first, highest, lowest
+        return highest[number - first], lowest[number - first]
+
+    def close(self, end: int) -> None:
+        """Fill in heading and variance up to a sample where the last epoch ends."""
+        if not self.epochs:
+            return
+        epoch = self.epochs[-1]
+        begin, epoch.end = max(epoch.place, 0), end
+        if end <= begin:
+            return
+        rows = self.found[begin:end]
+        rows[:, 4] = epoch.resting
+        if epoch.resting:
+            rows[:, 0] = epoch.heading
+            rows[:, 1] = float(epoch.drift.covariance[HEADING, HEADING]) + epoch.pending ** 2
+            return
+        inside, offset, values = slice(epoch.place + 1, end), epoch.drift.offset[0], (
+            epoch.drift.values[0])
+        pending, turned = (np.empty(end - epoch.place) for _ in range(2))
+        intervals = self.intervals[inside]
+        pending[0], pending[1:] = epoch.pending, self._kept[inside]
+        np.cumprod(pending, out=pending)
+        turned[0] = epoch.heading + epoch.pending
+        turned[1:] = self.turned[inside] - intervals * offset + self.halves[inside] * (
+            (self.seen[1:][inside] + self.seen[:-1][inside]) @ values)
+        np.cumsum(turned, out=turned)
+        known = epoch.drift.heading_variances([turn for _, turn in epoch.opens])
+        places = [place for place, _ in epoch.opens]
+        since = np.append(0.0, np.cumsum(intervals))
+        block = np.searchsorted(places, np.arange(epoch.place, end), side='right') - 1
+        since -= since[np.array(places) - epoch.place][block]
+        variance = known[block] + epoch.drift.noise.angle_random_walk ** 2 * since + pending ** 2
+        rows[:, 0] = (turned - pending)[begin - epoch.place:]
+        rows[:, 1] = variance[begin - epoch.place:]
+
+    def rates(self, usual: Array) -> None:
+        """Fill in the rates and their variances; `usual` are the intervals behind each sample."""
+        found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
+        for epoch in self.epochs:
+            here = slice(max(epoch.place, 0), epoch.end)
+            (offset, variance), (values, covariance, shared) = (
+                epoch.drift.offset, epoch.drift.values)
+            rows = self.seen[1:][here]
+            found[here, 2] = (0.0 if epoch.resting
+                              else self.rate[here] + rows @ values - offset)
+            found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
+                              + epoch.drift.noise.angle_random_walk ** 2
+                              / (WINDOW if epoch.resting else interval[here]))
+
+
+@dataclass(frozen=True)
+class Step:
+    """A part of the way: state before, integral of the rates, robot at rest or not, end in s."""
+
+    before: Drift
+    turn: Turn
+    resting: bool
+    end: float
+
+
+class HeadingTracker:
+    """
+    Follow the heading sample by sample.
+
+    Attributes
+    ----------
+    heading : as it is published, rad, continuous, not wrapped
+    rate : rad/s; zero at rest
+    resting : whether the robot rests
+    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
+    intervals : of the samples, and how many are lost
+    refused : samples that were not used, as no robot turns so fast; they count as lost
+    outliers : samples that were not used, as no robot starts and stops so fast; they count as lost
+    rebuilt : how often the state was not finite and was built anew
+    steps : the way so far, where it is kept
+    renewed : numbers of steps behind which another calibration was used, and the state before it
+
+    """
+
+    def __init__(self, noise: Noise, covariance: Array, settings: Settings,
+                 age: float | None = 0.0, keep: bool = False):
+        """
+        Begin at heading zero.
+
+        Parameters
+        ----------
+        noise : of the model
+        covariance : of the calibration, shape (m, m), from `compensation.covariance`
+        age : of the self-calibration, whose s and b are the last values, s; None without one
+        keep : the `steps`, for `smoothed`
+
+        """
+        self.heading = self.rate = self.deleted = 0.0
+        self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
+        self.renewed = list[tuple[int, Drift]]()
+        self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
+        self._known: float | None = None
+        self._doubt: _Doubt | None = None
+        self._last: tuple[float, float, float, Array] | None = None
+        self._reached = self._hesitates = 0.0
+        self._ways, self.outliers, self._taken = _Ways(), 0, 0
+        self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
+        self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
+        self._seen: Array | None = None
+        self._biased: Array | None = None
+        self._seen_off, self._bias_seen = 0.0, (0.0, 0.0)
+        self._still: Array | None = None
+        self._gaps, self._energy, self._tested = (
+            Gaps(noise), Energy(noise, settings.false_alarms), (noise, settings.false_alarms))
+        self.intervals = self._gaps.intervals
+        self._begin(noise, covariance, 0.0, 0.0, age)
+        self.set(settings)
+
+    def _begin(self, noise: Noise, covariance: Array, heading: float, variance: float,
+               age: float | None) -> None:
+        self._claimed, self._calibrated = noise, (covariance, age)
+        self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
+        self._nothing, self._part = self._none(), self._none()
+        self._open = self._nothing
+
+    def _none(self) -> Turn:
+        return Turn(0.0, 0.0, np.zeros(len(self._drift.mean) - self._drift.calibrated))
+
+    def set(self, settings: Settings) -> None:  # noqa: A003
+        """Go on with other settings."""
+        self._settings = settings
+        self._seeks = settings.false_alarms > 0.0 and self._claimed.angle_random_walk > 0.0
+        rests = (self.resting and self._seeks
+                 and self._tested == (self._claimed, settings.false_alarms))
+        if self._tested != (self._claimed, settings.false_alarms):
+            self._tested = self._claimed, settings.false_alarms
+            self._energy = Energy(*self._tested)
+        self._block, self._driven = Block(), False
+        self._filter = ThresholdFilter(replace(settings.threshold, rate=0.0) if self._seeks
+                                       else settings.threshold)
+        self._sigmas = {lag: _ALLOWED * sigmas(lag, settings.false_alarms)
+                        for lag in (WINDOW, *LAGS)} if self._seeks else {}
+        self._most_scatter: dict[tuple[float, int], float] = {}
+        if rests:
+            self._rest()
+        else:
+            self._recognize()
+        self._take()
+
+    def use(self, noise: Noise, covariance: Array, age: float | None = 0.0) -> None:
+        """
+        Go on with other noise figures and another calibration.
+
+        The heading does not jump. What was learned of the bias at rest is forgotten, but not what
+        it showed of the turn before.
+
+        """
+        heading, variance = self.heading + self._pending, self.variance - self._pending ** 2
+        if self._keep and self._last is not None:
+            drift, turn = self._drift, self._open + self._part
+            self._go_on(self._at_rest(turn) if self.resting else turn, self._reached)
+            self.renewed.append((len(self.steps), self._drift))
+            self._drift = drift
+        self._still = None
+        if self._last is not None:
+            self._last = (*self._last[:3], np.zeros(len(covariance)))
+        self._energy.clear()
+        self._begin(noise, covariance, heading, variance, age)
+        self.set(self._settings)
+
+    def reset(self) -> None:
+        """Call this direction zero, known exactly."""
+        self._settle()
+        self.heading = self.deleted = 0.0
+        self._drift = self._drift.turned_to(0.0)
+        if self._doubt:
+            # if the robot has stood since, it had this direction then
+            self._doubt.before = replace(
+                self._doubt.before, drift=self._doubt.before.drift.turned_to(0.0), deleted=0.0)
+        self._take()
+        if self.resting:
+            self._rest()
+
+    def rewind(self, heading: float, variance: float) -> None:
+        """Go back to a heading, rad, with its variance, rad²; the bias stays."""
+        self._settle()
+        self._recognize()
+        self.heading, self._doubt = heading, None
+        self._drift = self._drift.turned_to(heading, variance)
+        self._take()
+
+    @property
+    def variance(self) -> float:
+        """Return the variance of the heading, rad²; what is still to be taken over counts too."""
+        if self.resting:
+            return float(self._drift.covariance[HEADING, HEADING]) + self._pending ** 2
+        if self._known is None:
+            self._known = self._drift.heading_variance(self._open)
+        part = self._part
+        return (self._known + self._drift.noise.angle_random_walk ** 2 * part.duration
+                + part.lost + part.noise + self._pending ** 2)
+
+    # Samples
+
+    def add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None = None,
+            still: Array | None = None) -> str:
+        """
+        Take one sample.
+
+        Parameters
+        ----------
+        time : stamp, s
+        rate : compensated, rad/s
+        sensitivity : of the rate to the calibration, shape (m,), as in `compensation`
+        wheels : whether wheels or commands move the robot, or moved it since the last sample; None
+            where that is not known
+        still : the sensitivity if the true rate is zero; without it that of the samples serves at
+            rest too: their noise then counts as a scale factor error, which is harmless only where
+            the scale factor is well known
+
+        Returns
+        -------
+        '', or why the integration began anew with this sample
+
+        """
+        if not -FASTEST < rate < FASTEST:
+            self.refused += 1
+            return ''
+        spike, self._spike = self._spike, None
+        if self._last is not None and self._jumps(time, rate):
+            if spike is None:
+                self._spike = time, rate, sensitivity, wheels, still
+                return ''
+            # the rate stays there: when it began to, the samples do not tell
+            self._part.lost += (0.5 * (spike[1] - self._last[1]) * (spike[0] - self._last[0])) ** 2
+            self._add(*spike)
+        elif spike is not None:
+            self.outliers += 1
+        return self._add(time, rate, sensitivity, wheels, still)
+
+    def _jumps(self, time: float, rate: float) -> bool:
+        """Tell whether no robot turns so much faster or slower since the last sample."""
+        if self._last is None:
+            return False
+        interval, step = time - self._last[0], abs(rate - self._last[1])
+        return (step > _JUMP and step > _JUMP + _ACCELERATION * interval
+                and 0.0 <= interval <= self._settings.maximum_gap)
+
+    def _add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
+             still: Array | None, lost: int | None = None) -> str:
+        """Take a sample; `lost` are samples before it where the intervals are known already."""
+        self._still = still
+        filtered = self._filter.filter(time, rate)
+        last, self._last = self._last, (time, rate, filtered, sensitivity)
+        if last is None:
+            self._reached, self.rate = time, rate - self._off(sensitivity)
+            return ''
+        interval = time - last[0]
+        if interval < 0.0 or interval > self._settings.maximum_gap:
+            said = self._restart(interval, max(abs(rate), abs(last[1])), wheels is not False)
+            self.rate = rate - self._off(sensitivity)
+            return said
+        self._interval, self._reached = interval, time
+        self._integrate(interval, last)
+        gap = None if lost == 0 else self._gaps.add(interval, rate, last[1], lost)
+        if gap is not None and (filtered == rate or last[2] == last[1]):
+            self._part.lost += gap.motion
+            self._part.noise += gap.noise
+        if self._seeks:
+            self._look(interval if gap is None else interval - gap.duration, last[1], wheels)
+        elif self._part.duration >= _STEP - CLOSE:
+            self._settle()
+        self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
+        if not -math.inf < self.heading + self.rate < math.inf:
+            self._rebuild()
+        said, self._mended = self._mended, ''
+        return said
+
+    # Many samples at once
+
+    def follow(self, time: Array, rate: Array, sensitivity: Array,
+               wheels: Sequence[bool | None] | None = None, still: Array | None = None,
+               resting: Array | None = None) -> Array:
+        """
+        Take samples as `add` does, whole blocks at once where nothing is decided within them.
+
+        Parameters
+        ----------
+        time, rate : as in `add`, shape (n,)
+        sensitivity : as in `add`, shape (n, m)
+        wheels : as in `add`, n of them, or None
+        still : as in `add`, shape (m,) or (n, m)
+        resting : stands for `sensitivity` where the robot rests before a sample, shape (n, m)
+
+        Returns
+        -------
+        heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
+
+        """
+        given = _Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
+                         wheels, still)
+        found, begin = np.empty((len(time), 5)), 0
+        while begin < len(time):
+            count = self._even(time[begin:begin + _AT_ONCE], rate[begin:begin + _AT_ONCE])
+            if count:
+                begin = self._follow_even(given, begin, begin + count, found)
+            else:
+                self.add(*given.sample(begin, self.resting))
+                found[begin] = self._found()
+                begin += 1
+        return found
+
+    def _found(self) -> tuple[float, float, float, float, bool]:
+        return self.heading, self.variance, self.rate, self.rate_variance, self.resting
+
+    def _even(self, time: Array, rate: Array) -> int:
+        """Return how many samples come without a jump of stamps or rates."""
+        if not self._seeks or self._last is None or self._spike is not None:
+            return 0
+        intervals = np.diff(time, prepend=self._last[0])
+        with np.errstate(invalid='ignore'):
+            steps = np.abs(np.diff(rate, prepend=self._last[1]))
+            even = ((np.abs(rate) < FASTEST) & (intervals >= 0.0)
+                    & (intervals <= self._settings.maximum_gap)
+                    & (steps <= _JUMP + _ACCELERATION * intervals))
+        return len(even) if even.all() else int(np.argmin(even))
+
+    def _follow_even(self, given: _Samples, begin: int, end: int, found: Array) -> int:
+        """Take samples without jumps up to the next lost ones; return behind which sample."""
+        assert self._last is not None
+        usual, lost = self.intervals.add_many(
+            np.diff(given.time[begin:end], prepend=self._last[0]))
+        count = len(usual) - bool(lost)
+        if count:
+            piece = _Piece(given, slice(begin, begin + count), self._last, self._block.duration,
+                           found[begin:begin + count])
+            self._gaps.add_many(piece.intervals, piece.rate, self._last[1])
+            if not self._block.duration:
+                piece.epochs.append(self._epoch(-1))
+            for number, until in enumerate(piece.ends):
+                if number in piece.whole and self._take_block(piece, number):
+                    if self._taken != piece.epochs[-1].taken:
+                        piece.close(until - 1)
+                        piece.epochs.append(self._epoch(until - 1))
+                    elif not self.resting:
+                        piece.epochs[-1].opens.append((until - 1, self._open))
+                    continue
+                piece.close(piece.begins[number])
+                for place in range(piece.begins[number], until):
+                    sample = given.sample(begin + place, self.resting)
+                    piece.seen[place + 1] = sample[2]
+                    self._add(*sample, lost=0)
+                    found[begin + place] = self._found()
+                if not self._block.duration:
+                    piece.epochs.append(self._epoch(until - 1))
+            if not self._block.duration:
+                piece.close(count)
+            piece.rates(usual[:count])
+            self.rate = float(piece.found[-1, 2])
+        if lost:
+            self._add(*given.sample(begin + count, self.resting), lost=lost)
+            found[begin + count] = self._found()
+        return begin + len(usual)
+
+    def _epoch(self, place: int) -> _Epoch:
+        return _Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
+                      [(place, self._open)])
+
+    def _take_block(self, piece: _Piece, number: int) -> bool:
+        """Take a whole block; return False, and take nothing, where it ends a rest within."""
+        begin, end, moved = piece.begins[number], piece.ends[number], piece.moved(number)
+        driven = True in moved
+        if self.resting:
+            highest, lowest = piece.extremes(number, self._offset, self._values, self._taken)
+            limit = math.hypot(self._energy.sudden(), self._unsure)
+            if driven or highest > limit or lowest < -limit:
+                return False
+        elif self._hesitates > 0.0:
+            return False
+        part, block, sums = self._part, self._block, piece.sums[number]
+        rows, weighted = (piece.resting, piece.weighted_at_rest) if self.resting else (
+            piece.moving, piece.weighted)
+        piece.seen[begin + 1:end + 1] = rows[begin:end]
+        part.duration, part.turned, decayed = sums[:3]
+        part.sensitivity = weighted[number] + sums[3] * piece.seen[begin]
+        block.duration, block.count, block.total, block.squares, block.differences = (
+            part.duration, end - begin, *sums[4:])
+        turned = self._corrected(part)
+        if self.resting:
+            self.deleted += turned
+        else:
+            self.heading += turned + self._pending * (1.0 - decayed)
+            self._pending *= decayed
+        time, rate = float(piece.time[end - 1]), float(piece.rate[end - 1])
+        self._last = time, rate, rate, rows[end - 1]
+        self._interval, self._reached = float(piece.intervals[end - 1]), time
+        self._still = piece.still(end - 1)
+        self._end_block(driven, moved[-1] if moved else None)
+        if not -math.inf < self.heading < math.inf:
+            self._rebuild()
+        return True
+
+    def _off(self, sensitivity: Array) -> float:
+        """Return what a rate is off by, as seen at rest, rad/s; cached for one sensitivity."""
+        if sensitivity is not self._seen:
+            self._seen, self._seen_off = (
+                sensitivity, self._offset - float(sensitivity @ self._values))
+        return self._seen_off
+
+    def _integrate(self, interval: float, last: tuple[float, float, float, Array]) -> None:
+        """Take the heading on to the last sample."""
+        assert self._last is not None
+        (_, rate, filtered, sensitivity), (_, last_rate, last_filtered, last_sensitivity) = (
+            self._last, last)
+        half = 0.5 * interval
+        kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
+        duration, turned = kept + last_kept, half * (filtered + last_filtered)
+        if sensitivity is last_sensitivity:
+            self._part.add(duration, turned, duration * sensitivity)
+            turned -= duration * self._off(sensitivity)
+        else:
+            seen = kept * sensitivity + last_kept * last_sensitivity
+            self._part.add(duration, turned, seen)
+            turned += float(seen @ self._values) - duration * self._offset
+        if self.resting:
+            self.deleted += turned
+            return
+        self.deleted += half * (rate - filtered + last_rate - last_filtered)
+        if self._hesitates > 0.0:
+            self._hesitates -= interval
+            settled = 0.0
+        else:
+            settled = self._pending * duration / SETTLING
+            self._pending -= settled
+        self.heading += turned + settled
+
+    def _look(self, duration: float, before: float, wheels: bool | None) -> None:
+        """Look for sudden motion at each sample, and for any at the end of each block."""
+        assert self._last is not None
+        _, rate, _, sensitivity = self._last
+        self._block.add(duration, rate, before)
+        if self.resting and (wheels or abs(rate - self._off(sensitivity))
+                             > math.hypot(self._energy.sudden(), self._unsure)):
+            self._notice(0.0)
+        self._driven = self._driven or bool(wheels)
+        if self._block.duration >= BLOCK - CLOSE:
+            self._end_block(self._driven, wheels)
+
+    def _end_block(self, driven: bool, wheels: bool | None) -> None:
+        quiet = self._energy.add(self._block)
+        self._judge(False if driven else quiet, driven or wheels)
+        self._block, self._driven = Block(), False
+
+    def _judge(self, quiet: bool | None, wheels: bool | None) -> None:
+        """Decide at the end of a block; one that cannot yet be told from a rest ends none."""
+        part, self._part, self._known = self._part, self._none(), None
+        self._open += part
+        if self.resting:
+            if quiet is False:
+                self._notice(WINDOW)
+            elif self._open.duration >= _STEP - CLOSE:
+                self._advance()
+                self._compare(wheels)
+            return
+        if not quiet or wheels:
+            self._wanted, self._doubt = WINDOW, None
+        if wheels:
+            # an even turn has no more energy than a rest: nothing is held back while wheels move
+            self._move(WINDOW)
+        self._hold(part)
+        if self._open.duration >= self._held.duration + _STEP - CLOSE:
+            self._advance(self._held)
+        if quiet and self._stands(wheels):
+            self._advance(self._settled())
+            self._rest()
+
+    def _hold(self, part: Turn) -> None:
+        """Hold the last blocks back that may turn out to be the begin of a rest."""
+        self._recent.append(part)
+        self._held += part
+        while (len(self._recent) > 2
+               and self._held.duration - self._recent[0].duration >= self._wanted - CLOSE):
+            self._held -= self._recent.popleft()
+
+    def _settled(self) -> Turn:
+        """Return what is held back without its first block, in which the robot may move."""
+        return self._held - self._recent[0]
+
+    def _stands(self, wheels: bool | None) -> bool:
+        """Tell whether the mean of a quiet time that is long enough may be that of a rest."""
+        if self._held.duration < self._wanted - CLOSE or len(self._recent) < 2:
+            return False
+        most = self._sigmas[self._wanted] * (1.0 if self._wanted == WINDOW else 0.5)
+        stands = abs(self._surprise(self._drift, self._at_rest(self._settled()),
+                                    _UNSEEN if wheels is False else 0.0)) < most
+        if not stands and self._wanted > WINDOW and not self._drifted():
+            self._move(self._wanted)
+        return stands
+
+    def _drifted(self) -> bool:
+        """
+        Take a slow turn that stays as it is for a bias that moved and a rest; tell whether so.
+
+        No robot turns as evenly for minutes. A bias that wanders by more than the model says would
+        otherwise make the heading drift at rest for ever.
+
+        """
+        doubt, held = self._doubt, self._at_rest(self._held)
+        if doubt is None:
+            return False
+        start = doubt.before.drift.uncertain(WALK, doubt.rate ** 2)
+        moved = start.rested(self._at_rest(doubt.turn))
+        if (doubt.turn.duration + held.duration < _DECIDED
+                or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]):
+            doubt.turn += held
+            return False
+        if self._keep:
+            assert self._last is not None
+            del self.steps[doubt.before.steps:]
+            self.steps.append(Step(start, self._at_rest(doubt.turn), True,
+                                   self._last[0] - self._part.duration - held.duration))
+        self._drift, self._open, self._doubt = moved, self._held, None
+        self._rest()
+        self._take()
+        return True
+
+    def _surprise(self, drift: Drift, turn: Turn, unseen: float = 0.0) -> float:
+        """Return how far the rates came to something else than at rest, in standard deviations."""
+        expected, variance = drift.expected(turn)
+        return (turn.turned - expected) / math.sqrt(variance + (unseen * turn.duration) ** 2)
+
+    def _compare(self, wheels: bool | None) -> None:
+        """Compare the means over the longer times with the bias that was known before them."""
+        for lag in LAGS:
+            before = self._before(lag)
+            if before is None:
+                return
+            turn = self._rested - before.turn
+            surprise = self._surprise(before.drift, turn)
+            if abs(surprise) > self._sigmas[lag]:
+                if wheels is False:
+                    expected, _ = before.drift.expected(turn)
+                    self._drift = self._drift.uncertain(
+                        WALK, ((turn.turned - expected) / turn.duration) ** 2)
+                    self._rest()
+                    self._take()
+                else:
+                    self._notice(lag)
+                return
+        if wheels is not False:
+            self._compare_scatter()
+
+    def _compare_scatter(self) -> None:
+        """Compare the scatter of the means over 1 s with the noise, over the longer times."""
+        last = self._snapshots[-1]
+        for lag in SCATTERED:
+            before = self._before(lag)
+            if before is None:
+                return
+            if last.squares - before.squares > self._scatter_limit(lag, last.means - before.means):
+                self._notice(lag, max(self._snapshots, key=lambda each: (
+                    last.squares - each.squares - _BEGINS * (last.means - each.means))))
+                return
+
+    def _scatter_limit(self, lag: float, means: int) -> float:
+        if (lag, means) not in self._most_scatter:
+            self._most_scatter[lag, means] = _ALLOWED ** 2 * most_scatter(
+                lag, means, self._settings.false_alarms)
+        return self._most_scatter[lag, means]
+
+    def _before(self, lag: float) -> _Snapshot | None:
+        """Return the state `lag` s before the last step of this rest; None if before its begin."""
+        snapshots, until = self._snapshots, self._rested.duration - lag + CLOSE
+        if snapshots[0].turn.duration > until:
+            return None
+        place = max(len(snapshots) - 1 - round(lag / _STEP), 0)
+        while place + 1 < len(snapshots) and snapshots[place + 1].turn.duration <= until:
+            place += 1
+        while snapshots[place].turn.duration > until:
+            place -= 1
+        return snapshots[place]
+
+    # From rest to motion and back
+
+    def _rest(self) -> None:
+        """Take the robot for standing from here on."""
+        self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
+        self._snapshots = [_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
+
+    def _move(self, wanted: float) -> None:
+        """Take the robot for moving, until it is quiet for `wanted` s."""
+        self.resting, self._wanted, self._recent, self._held = (
+            False, wanted, deque[Turn](), self._nothing)
+
+    def _recognize(self) -> None:
+        """Look for a rest anew; if there was one, it may go on."""
+        if self.resting:
+            self._hesitates = _RECOGNIZED
+        self._move(WINDOW)
+
+    def _notice(self, lag: float, before: _Snapshot | None = None) -> None:
+        """Take the robot for moving since `lag` s before the last block, or some snapshot."""
+        self._advance()
+        scattered, before = before is not None, before or self._before(lag) or self._snapshots[0]
+        if self._rested.duration < _BRIEF - CLOSE:
+            before = self._snapshots[0]
+        turn = self._rested - before.turn
+        self._doubt = (self._doubtful(before, turn) if lag >= LAGS[0] and not scattered else None)
+        if self._snapshots[-1].means:
+            self._ways.learn(self._snapshots[-1])
+        self._drift, self.deleted, self._open = before.drift, before.deleted, turn
+        del self.steps[before.steps:]
+        self._move(max(lag, WINDOW))
+        self._advance()
+
+    def _doubtful(self, before: _Snapshot, turn: Turn) -> _Doubt | None:
+        """Return what was noticed, where it is so slow that the bias may have moved."""
+        longest = replace(self._nothing, duration=LAGS[-1])
+        least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
+        rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
+        return (_Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
+                else None)
+
+    def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
+        """
+        Begin anew after a gap or a jump back, over which nothing is integrated.
+
+        Where nothing saw that the robot stood, it may have turned to any direction meanwhile, also
+        from one rest to another. The stamps do not tell how much time a jump back hides.
+
+        """
+        self._settle()
+        assert self._last is not None
+        interval, self._reached = min(max(interval, -LONGEST), LONGEST), self._last[0]
+        self._block, self._driven = Block(), False
+        self._energy.clear()
+        self._filter.clear()
+        self._gaps.clear()
+        self._recognize()
+        duration = max(interval, 0.0)
+        if interval > 0.0:
+            self.intervals.count(interval)
+        lost = (fastest * duration) ** 2 + unseen * math.tau ** 2
+        self._go_on(replace(self._nothing, duration=duration, lost=lost, unseen=True),
+                    self._reached)
+        self._take()
+        return (f'no samples for {interval:.3f} s' if interval > 0.0
+                else f'the stamp jumps back by {-interval:.3f} s')
+
+    def _settle(self) -> None:
+        """Take the state on to the last sample."""
+        self._open, self._part = self._open + self._part, self._none()
+        if not self.resting:
+            self._move(self._wanted)
+        self._advance()
+
+    def _advance(self, left: Turn | None = None) -> None:
+        """Take the state on over what is open, but for what is left open."""
+        left = left or self._nothing
+        turn, self._open = self._open - left, left
+        if turn.duration > CLOSE:
+            if self.resting:
+                self._advance_at_rest(self._at_rest(turn), left)
+            else:
+                self._go_on(turn, self._reached - self._part.duration - left.duration)
+        self._take()
+
+    def _advance_at_rest(self, turn: Turn, left: Turn) -> None:
+        """Take the state on over a part of a rest, and see how much its rates scatter."""
+        before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
+        white = self._drift.noise.angle_random_walk ** 2 * turn.duration
+        squared, weight = (turn.turned - expected) ** 2 / variance, (white / variance) ** 2
+        scatter = self._ways.scatter * white
+        ratio = 1.0 + scatter / variance
+        odds = before.odds + 0.5 * (squared * (1.0 - 1.0 / ratio) - math.log(ratio))
+        turn.wander = self._ways.chance(odds) * scatter
+        squares, squared = before.squares + squared, min(squared, _SCATTER_MOST)
+        self._go_on(turn, self._reached - self._part.duration - left.duration)
+        self._rested += turn
+        self._snapshots.append(_Snapshot(
+            self._drift, self._rested, self.deleted - self._corrected(self._part),
+            len(self.steps), squares, before.means + 1,
+            before.excess + weight * (squared - 1.0) * variance / white, before.weight + weight,
+            odds))
+        del self._snapshots[:-_SNAPSHOTS]
+
+    def _go_on(self, turn: Turn, end: float) -> None:
+        """Take the state on over a turn that ends at a time, s."""
+        if self._keep:
+            self.steps.append(Step(self._drift, turn, self.resting, end))
+        self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
+
+    def _at_rest(self, turn: Turn) -> Turn:
+        """Return what the rates of a rest came to, without their noise in the sensitivity."""
+        return (turn + self._nothing if self._still is None
+                else replace(turn, sensitivity=turn.duration * self._still))
+
+    def _take(self) -> None:
+        """Take over the state and the noise of the samples; the heading does not jump."""
+        if not math.isfinite(float(self._drift.mean.sum()) + float(self._drift.covariance.sum())):
+            self._rebuild()
+        walk = self._claimed.angle_random_walk * (
+            self._energy.factor if self._seeks and self._energy.factor > _ALLOWED else 1.0)
+        if walk != self._drift.noise.angle_random_walk:
+            self._drift = replace(
+                self._drift, noise=replace(self._claimed, angle_random_walk=walk))
+        self._gaps.noise = self._drift.noise
+        self._offset, self._values, self._seen, self._biased = (
+            self._drift.offset[0], self._drift.values[0], None, None)
+        self._unsure = _FAR * self.bias[1]
+        self._known, self._taken = None, self._taken + 1
+        estimate = float(self._drift.mean[HEADING]) + (
+            0.0 if self.resting else self._corrected(self._open + self._part))
+        self._pending = estimate - self.heading
+        self._good = self.heading, self.variance
+
+    def _rebuild(self) -> None:
+        """Begin anew from the last finite heading, which may be off by a full turn since."""
+        heading, variance = self._good
+        covariance, age = self._calibrated
+        self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2,
+                    age)
+        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._doubt = (
+            heading, 0.0, 0.0, 0.0, None, None)
+        if self._last is not None:
+            self._last = (*self._last[:3], np.zeros(len(covariance)))
+        self._energy, self._block, self._driven = Energy(*self._tested), Block(), False
+        intervals, self._gaps = self.intervals, Gaps(self._claimed)
+        self.intervals = self._gaps.intervals = intervals
+        self._filter.clear()
+        self._move(WINDOW)
+        self._known, self._pending = None, 0.0
+        self.rebuilt += 1
+        self._mended = ('the state was not finite and was built anew; '
+                        'the heading may be off by a full turn')
+        self._take()
+
+    def _corrected(self, part: Turn) -> float:
+        """Return what the rates of a part came to, less what rests have taught, rad."""
+        return part.turned - part.duration * self._offset + float(part.sensitivity @ self._values)
+
+    # What is known
+
+    def finish(self) -> Drift:
+        """Take the state on to the last sample, and return it."""
+        self._settle()
+        return self._drift
+
+    @property
+    def bias(self) -> tuple[float, float]:
+        """Return the bias seen at rest beyond the calibration, and its uncertainty, rad/s."""
+        return self.bias_by(self.sensitivity)
+
+    @property
+    def sensitivity(self) -> Array:
+        """Return that of the last sample."""
+        return self._nothing.sensitivity if self._last is None else self._last[3]
+
+    def bias_by(self, sensitivity: Array) -> tuple[float, float]:
+        """Return the same for another sensitivity, (m,), as of samples at another temperature."""
+        if sensitivity is not self._biased:
+            bias, variance = self._drift.bias(sensitivity)
+            self._biased, self._bias_seen = sensitivity, (bias, math.sqrt(variance))
+        return self._bias_seen
+
+    @property
+    def rate_variance(self) -> float:
+        """Return the variance of the last rate, (rad/s)², by noise, bias and scale."""
+        interval = max(min(self._interval, self.intervals.usual), SHORTEST)
+        return self.bias[1] ** 2 + self._drift.noise.rate_variance(
+            WINDOW if self.resting else interval)
+
+    @property
+    def slowest_noticed(self) -> float:
+        """Return the slowest turn, rad/s, that is noticed in 95 % of cases; nan if unknown."""
+        turns = ([(lag, replace(self._nothing, duration=lag)) for lag in LAGS]
+                 if self._seeks else [])
+        return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag
+                    for lag, turn in turns), default=math.nan)
+
+
+@dataclass(frozen=True)
+class Track:
+    """
+    A heading over a log.
+
+    Attributes
+    ----------
+    heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
+    resting : shape (n,)
+    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
+    intervals : of the samples, and how many are lost
+
+    """
+
+    heading: Array
+    variance: Array
+    rate: Array
+    rate_variance: Array
+    resting: Mask
+    deleted: float
+    intervals: Intervals
+
+
+def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
+          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
+          age: float | None = 0.0, still: Array | None = None) -> Track:
+    """
+    Return the heading over a whole log.
+
+    Parameters
+    ----------
+    time, rate : s and rad/s, compensated, shape (n,)
+    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
+    noise, covariance, settings, age : as in `HeadingTracker`
+    wheels : whether wheels or commands move the robot, n of them, or None
+    still : as in `HeadingTracker.add`
+    hindsight : let all that came later count too
+
+    Raises
+    ------
+    OverflowError : hindsight is wanted, and a heading or its variance is no finite number
+
+    """
+    tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
+    found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)
+    heading, variance, shown, rate_variance, resting = found.T
+    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted,
+                 tracker.intervals)
+    if not hindsight:
+        return live
+    if not np.isfinite(found).all():
+        raise OverflowError('the variance of the heading is beyond all numbers')
+    later, with_hindsight, rested = in_hindsight(tracker, time, rate)
+    return replace(live, heading=later, variance=with_hindsight, resting=rested)
+
+
+def _without_spikes(time: Array, rate: Array) -> Array:
+    """Return rates with what the tracker holds for no motion interpolated, shape (n,)."""
+    jumps = np.abs(np.diff(rate)) > _JUMP + _ACCELERATION * np.diff(time)
+    back = np.abs(rate[2:] - rate[:-2]) <= _JUMP + _ACCELERATION * (time[2:] - time[:-2])
+    spikes = np.flatnonzero(jumps[:-1] & back) + 1
+    if not len(spikes):
+        return rate
+    kept = np.delete(np.arange(len(rate)), spikes)
+    return np.interp(time, time[kept], rate[kept])
+
+
+def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
+    """
+    Return heading, rad, its variance, rad², and rest, shape (n,) each, with all that came later.
+
+    The heading is what the rates came to, with the correction interpolated between the steps.
+
+    Parameters
+    ----------
+    tracker : that kept its steps, and was given the samples
+    time, rate : of the samples, s and rad/s, shape (n,)
+
+    """
+    last, steps, states = tracker.finish(), tracker.steps, list[Drift]()
+    end, later = len(steps), None
+    # a calibration that was used later knows the heading alone of what was before
+    for first, before in [*tracker.renewed[::-1], (0, None)]:
+        part = steps[first:end]
+        states = smoothed(
+            [*(step.before for step in part), last if later is None else later],
+            [step.turn for step in part], [step.resting for step in part]) + states[1:]
+        if before is not None:
+            here, end = states[0], first
+            later = last = before.known_to_head(
+                float(here.mean[HEADING]), float(here.covariance[HEADING, HEADING]))
+    ends = np.array([time[0], *(step.end for step in steps)])
+    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
+                                  for state in states]).T
+    turned = integrate(time, _without_spikes(time, rate))
+    rested = np.array([step.resting for step in steps] or [False])
+    resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
+    moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
+    return (np.where(resting, np.interp(time, ends, heading), moved),
+            np.interp(time, ends, variance), resting)

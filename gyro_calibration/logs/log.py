@@ -1,0 +1,584 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Read and write logs.
+
+A log is a CSV file, one row a sample or, without time, one row a dwell of a rate table. The header
+names each column with its unit.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+import csv
+from dataclasses import dataclass, field, replace
+from functools import partial
+import gzip
+import io
+import itertools
+import math
+from pathlib import Path
+import reprlib
+from typing import Any, BinaryIO
+import zlib
+
+from gyro_calibration.files import (
+    GROWN,
+    GROWTH,
+    InputError,
+    LARGEST,
+    opened,
+    plain,
+    reason,
+    replacing,
+)
+from gyro_calibration.logs.columns import (
+    Column,
+    COLUMNS,
+    found_in,
+    is_header,
+    QUANTITIES,
+    suggestion,
+)
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+#: Goes through some items, and may show how far it has come.
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+Number = Any  # a float, or an array of shape (n,): most formulas serve both
+
+DEGREE = math.pi / 180.0
+
+#: Samples of a dozen columns that fit into the cache of a processor, twice as fast as memory.
+CACHED = 1 << 14
+#: Rows of a block of a log that is read piece by piece.
+ROWS = 1 << 16
+#: No gyro gives samples closer than this, s.
+SHORTEST = 1e-9
+#: A heading is wrapped if it changes by full turns, to this part of one, and faster than any
+#: vehicle turns, rad/s.
+_FULL, _FASTEST = 0.1, 35.0
+#: Characters of a line, of what is before the rows, and of a block of lines, or of one row that
+#: goes over several.
+_LINE, _HEAD, _BLOCK = 1 << 16, 1 << 20, 1 << 24
+#: Numbers of a log that is held whole, 4 GB; a text takes as much as so many numbers.
+_WHOLE, _TEXT = 1 << 29, 10
+
+#: Of a temperature, degC; a value of any other quantity is at most `LARGEST`, in its unit.
+_HOTTEST = 1e5
+_MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
+
+
+#: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
+#: that are not ours as text.
+Parsed = tuple[Sequence[int], dict[str, Array], dict[str, tuple[str, ...]]]
+
+
+class LogError(InputError):
+    """A file is not a log; the message names file, row and column."""
+
+
+class DataRefused(InputError):
+    """The data do not allow an answer; the message says why and what would."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """
+    What was recorded, as arrays in SI, each of shape (n,) or absent.
+
+    Attributes
+    ----------
+    output : what the gyro reported, rad/s, counter-clockwise positive
+    counts : the same before any scaling, 1
+    time : s, increasing; without it the rows are dwells of a rate table
+    temperature : the gyro's own sensor, degC
+    reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the
+        heading is continuous
+    specific_force : along the input axis, m/s²
+    supply : V
+    moving : 1 or 0
+    notes : the lines before the header, without their '#'
+    others : columns of the file that are not ours, as text, in their order; of one name, the
+        second is called `name.1`
+
+    """
+
+    output: Array | None = None
+    counts: Array | None = None
+    time: Array | None = None
+    temperature: Array | None = None
+    reference_rate: Array | None = None
+    reference_heading: Array | None = None
+    specific_force: Array | None = None
+    supply: Array | None = None
+    moving: Array | None = None
+    notes: tuple[str, ...] = ()
+    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        first = self.output if self.output is not None else self.counts
+        return 0 if first is None else len(first)
+
+
+def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
+             columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
+    """
+    Read a log file (.csv or .csv.gz).
+
+    Values are parted by commas, or by semicolons or tabs; then the decimal mark may be a comma.
+
+    Parameters
+    ----------
+    path : the file
+    sensitivity : rad/s a count; used where the file has raw counts alone
+    rate : Hz; the samples came at this rate, whatever the file says of time
+    columns : names of columns that are not those of the log format: time, gyro, counts,
+        temperature, rate, heading, acceleration, supply or moving -> name, or name:unit
+    axis : x, y or z, of columns such as gyro_x_dps
+
+    Raises
+    ------
+    LogError : the file cannot be read, or is not a log; names file, row and column
+
+    """
+    blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate, columns=columns,
+                                                       axis=axis)))
+    first = blocks[0]
+    present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
+    arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])
+              for quantity in present}
+    others = {name: tuple(itertools.chain.from_iterable(block.others[name] for block in blocks))
+              for name in first.others}
+    return Log(**arrays, notes=first.notes, others=others)
+
+
+def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
+    numbers = 0
+    for block in blocks:
+        numbers += len(block) * (sum(getattr(block, quantity) is not None
+                                     for quantity in QUANTITIES) + _TEXT * len(block.others))
+        if numbers > _WHOLE:
+            raise LogError(f'{path}: holds more than {_WHOLE} numbers, which are too many to look '
+                           'at at once; cut it into pieces')
+        yield block
+
+
+def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
+                    rows: int = ROWS, heard: Callable[[int], object] | None = None,
+                    columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
+    """
+    Read a log file row by row, and give blocks of it, so that any length needs little memory.
+
+    Parameters
+    ----------
+    path, sensitivity, rate, columns, axis : as for `read_log`
+    rows : of a block, at least 2; the last block has less, and so have those with texts that go
+        over several lines
+    heard : is told after each block how many bytes of the file are read, if it is not a pipe
+
+    Raises
+    ------
+    LogError : as `read_log`, when the row is reached
+
+    """
+    count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
+    with _refusing(path), opened(path, pipes=True) as file, _reading(file, compressed) as text:
+        lines = _lines(text)
+        table, first_line = _head(path, _bounded(lines, _HEAD), columns, axis)
+        unfolded = 0
+        if rate is not None:
+            table.columns.pop('time', None)
+        while block := _block(lines, rows):
+            unfolded += sum(map(len, block))
+            if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
+                raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log '
+                               'does; unpack it if that is what was recorded')
+            places, arrays, others = (_quickly(block, first_line, table)
+                                      or _carefully(path, block, lines, first_line, table))
+            first_line, before, count = places[-1], count, count + len(places) - 1
+            if rate is not None:
+                arrays['time'] = np.arange(before, count) / rate
+            last = _refuse_time(path, places, arrays.get('time'), last)
+            if 'output' not in arrays and sensitivity is not None:
+                arrays['output'] = arrays['counts'] * sensitivity
+            if heard is not None and file.seekable():
+                heard(file.tell())
+            if count > 1:
+                yield Log(**arrays, notes=table.notes, others=others)
+    if count < 2:
+        raise LogError(f'{path}: {count} rows of data; a log has at least two: record more')
+
+
+@contextmanager
+def _refusing(path: str | Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f'{path}: cannot be read as a log ({reason(error)}); '
+                       'wanted a CSV file, .csv or .csv.gz') from error
+
+
+def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
+    data: Any = gzip.GzipFile(fileobj=file) if compressed else file
+    return io.TextIOWrapper(data, encoding='utf-8-sig', newline='')
+
+
+def _lines(text: io.TextIOWrapper) -> Iterator[str]:
+    """Give the lines of a file, but for empty ones at its end."""
+    empty: list[str] = []
+    for line in iter(partial(text.readline, _LINE + 1), ''):
+        if len(line) < 3 and not line.strip('\r\n') and len(empty) < _BLOCK:
+            empty.append(line)
+            continue
+        if len(line) > _LINE:
+            raise csv.Error(f'a line has more than {_LINE} characters')
+        yield from empty
+        empty.clear()
+        yield line
+
+
+def _block(lines: Iterator[str], rows: int) -> list[str]:
+    """Return the next lines: so many, or fewer where they are long."""
+    block: list[str] = []
+    length = 0
+    while length < _BLOCK and (more := list(itertools.islice(lines, min(rows - len(block), 256)))):
+        block += more
+        length += sum(map(len, more))
+    return block
+
+
+def _bounded(lines: Iterator[str], most: int) -> Iterator[str]:
+    """Give the lines of one row, or of what is before the rows, up to so many characters."""
+    left = most
+    for line in lines:
+        left -= len(line)
+        if left < 0:
+            raise csv.Error(f'a row, or what is before the first, has more than {most} characters')
+        yield line
+
+
+@dataclass(frozen=True)
+class _Table:
+    """
+    What the head of a file says of its rows.
+
+    Attributes
+    ----------
+    notes : lines before the header
+    header : names of the columns
+    columns : quantity -> its column
+    delimiter : between values
+
+    """
+
+    notes: tuple[str, ...]
+    header: list[str]
+    columns: dict[str, Column]
+    delimiter: str
+
+    @property
+    def others(self) -> dict[str, int]:
+        """Return the names of columns that are no quantity, each once, with their places."""
+        taken = {column.place for column in self.columns.values()}
+        return {name: index for index, name in enumerate(_distinct(self.header))
+                if index not in taken and self.header[index] not in COLUMNS}
+
+
+def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
+          axis: str) -> tuple[_Table, int]:
+    """Take notes and header off the lines, and return them with the number of the next line."""
+    notes, line = [], next(lines, '')
+    while line.startswith('#'):
+        notes.append(line[1:].strip())
+        line = next(lines, '')
+    delimiter = max((',', ';', '\t'), key=line.count)
+    rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
+    header = [_unix(name.strip()) for name in next(rows, [])]
+    if not is_header(header, columns, axis):
+        raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, '
+                       f'such as time_s,gyro_dps,temperature_degc{suggestion(header)}')
+    try:
+        found = found_in(header, columns, axis)
+    except InputError as error:
+        raise LogError(f'{path}: {error}') from None
+    return _Table(tuple(notes), header, found, delimiter), len(notes) + rows.line_num + 1
+
+
+def _distinct(header: list[str]) -> list[str]:
+    """Return the names of columns, each once: a second x is x.1."""
+    taken, numbers, names = set(header), dict[str, int](), list[str]()
+    for name in header:
+        tried = name
+        while name in numbers and tried in taken:
+            numbers[name] += 1
+            tried = f'{name}.{numbers[name]}'
+        numbers.setdefault(name, 0)
+        taken.add(tried)
+        names.append(tried)
+    return names
+
+
+def _quickly(lines: list[str], first_line: int, table: _Table) -> Parsed | None:
+    """Parse rows of numbers by numpy; None where they hold anything else."""
+    if table.others:
+        return None
+    if table.delimiter != ',':
+        lines = [line.replace(',', '.') for line in lines]
+    try:
+        values = np.loadtxt(lines, delimiter=table.delimiter, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    if values.shape != (len(lines), len(table.header)):
+        return None
+    arrays: dict[str, Array] = {}
+    for quantity, (index, factor, offset) in table.columns.items():
+        arrays[quantity] = values[:, index] * factor
+        if offset:
+            arrays[quantity] += offset
+        if _wrong(values[:, index], quantity).any():
+            return None
+    return range(first_line, first_line + len(lines) + 1), arrays, {}
+
+
+def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_line: int,
+               table: _Table) -> Parsed:
+    """
+    Parse rows one by one, with the texts of columns that are not ours, and name what is wrong.
+
+    A text in quotes may go on in the next line, and so take lines of the rest.
+
+    """
+    reader = csv.reader(itertools.chain(lines, _bounded(rest, _BLOCK)), delimiter=table.delimiter)
+    places, rows, header = [first_line], [], table.header
+    for row in reader:
+        if len(row) != len(header):
+            raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
+                           f'{len(header)}; mend or remove the line')
+        rows.append(row)
+        places.append(first_line + reader.line_num)
+        if reader.line_num >= len(lines) and len(rows) > 1:
+            break
+    texts = list(zip(*rows))
+    if table.delimiter != ',':
+        for index, _, _ in table.columns.values():
+            texts[index] = tuple(text.replace(',', '.') for text in texts[index])
+    arrays = {quantity: _numbers(path, places, header[index], texts[index], quantity) * factor
+              + offset for quantity, (index, factor, offset) in table.columns.items()}
+    return places, arrays, {name: texts[index] for name, index in table.others.items()}
+
+
+def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
+             quantity: str) -> Array:
+    try:
+        values = np.array(texts, dtype=np.float64)
+    except ValueError:
+        row = next(number for number, text in enumerate(texts) if not _is_number(text))
+        raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} '
+                       'is not a number') from None
+    wrong = _wrong(values, quantity)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        fault = (f'beyond {_most(quantity):g}, which no gyro means' if np.isfinite(values[row])
+                 else 'not a finite number')
+        raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} '
+                       f'is {fault}; remove the row')
+    return values
+
+
+def _wrong(values: Array, quantity: str) -> Mask:
+    size = np.abs(values)
+    return size > LARGEST if quantity in _MAY_BE_LOST else ~(size <= _most(quantity))
+
+
+def _most(quantity: str) -> float:
+    return _HOTTEST if quantity == 'temperature' else LARGEST
+
+
+def shown(text: str) -> str:
+    """Return a text of a file for a message: not more than a line."""
+    return plain(text[:100])
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
+                 before: float) -> float:
+    """Refuse time that does not increase, from the block before on, and return the last one."""
+    if time is None:
+        return before
+    late = ~(np.diff(time, prepend=before) >= SHORTEST)
+    if late.any():
+        row = int(np.argmax(late))
+        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come '
+                       f'after {time[row - 1] if row else before:g} s; sort the rows, or give '
+                       '--rate where the stamps are no use')
+    return float(time[-1])
+
+
+def log_from_table(table: Any, columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
+    """
+    Return a log from a pandas DataFrame, or from a mapping of names to arrays.
+
+    Parameters
+    ----------
+    table : its names, when iterated, and under each name an array of shape (n,)
+    columns, axis : as for `read_log`
+
+    Raises
+    ------
+    LogError : no output, arrays of different lengths, values that are no numbers, or a time that
+        does not increase
+
+    """
+    header = [str(name) for name in table]
+    try:
+        found = found_in(header, columns, axis)
+        arrays: dict[str, Any] = {
+            quantity: np.asarray(table[list(table)[index]], float) * factor + offset
+            for quantity, (index, factor, offset) in found.items()}
+    except (TypeError, ValueError) as error:
+        raise LogError(f'the table is no log: {reason(error)}') from None
+    shapes = {values.shape for values in arrays.values()}
+    if len(shapes) > 1 or any(len(shape) != 1 or shape[0] < 2 for shape in shapes):
+        raise LogError(f'the columns have shapes {sorted(shapes)}; wanted one shape (n,), with at '
+                       'least two rows')
+    for quantity, values in arrays.items():
+        if (wrong := _wrong(values, quantity)).any():
+            raise LogError(f'row {int(np.argmax(wrong))} of {header[found[quantity].place]} is '
+                           f'{values[np.argmax(wrong)]:g}; remove the row')
+    _refuse_time('the table', range(len(next(iter(arrays.values())))), arrays.get('time'),
+                 -math.inf)
+    return Log(**arrays)
+
+
+def part(log: Log, rows: slice | Mask) -> Log:
+    """Return some rows of a log."""
+    which = np.arange(len(log))[rows]
+    arrays: dict[str, Any] = {name: getattr(log, name)[which] for name in QUANTITIES
+                              if getattr(log, name) is not None}
+    others = {name: tuple(texts[place] for place in which) for name, texts in log.others.items()}
+    return replace(log, **arrays, others=others)
+
+
+def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Array, bool]:
+    """
+    Return a heading without its jumps by whole turns.
+
+    Where the reference was lost or is slow, it may turn by more than half a turn from one value to
+    the next. The integral of the gyro gives the number of turns, with its sign and bias against
+    the reference, which are found where the values lie close together.
+
+    Parameters
+    ----------
+    at, wrapped : times, s, and heading, rad, of shape (m,); nan where it was lost
+    time, output : of the gyro, s and rad/s, shape (n,)
+
+    Returns
+    -------
+    the heading, rad, and whether the gyro had to say by how many turns it went on
+
+    """
+    known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)
+    if known.sum() < 2:
+        return heading, False
+    plainly, rates = np.unwrap(wrapped[known]), np.nan_to_num(output)
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(time))])
+    turned, steps = np.interp(at[known], time, angle), np.diff(at[known])
+    # as rates, since over a gap the plain change may be anything
+    plain_rate, gyro_rate = np.diff(plainly) / steps, np.diff(turned) / steps
+    sign = -1.0 if np.dot(plain_rate, gyro_rate) < 0.0 else 1.0
+    bias = float(np.median(plain_rate - sign * gyro_rate))
+    expected = sign * turned + bias * at[known]
+    heading[known] = expected + np.unwrap(wrapped[known] - expected)
+    return heading, bool(np.abs(np.diff(heading[known]) - np.diff(plainly)).max() > np.pi)
+
+
+def refuse_wrapped(log: Log) -> None:
+    """
+    Refuse a reference heading that jumps by full turns, as one that is wrapped does.
+
+    Raises
+    ------
+    DataRefused : it does, faster than anything turns
+
+    """
+    if log.time is None or log.reference_heading is None:
+        return
+    known = np.isfinite(log.reference_heading)
+    time, change = log.time[known], np.diff(log.reference_heading[known])
+    turns = np.abs(np.abs(change) / (2.0 * math.pi) - 1.0) < _FULL
+    jumps = np.flatnonzero(turns & (np.abs(change) > _FASTEST * np.diff(time)))
+    if len(jumps):
+        raise DataRefused(
+            f'the reference heading jumps by a full turn from one sample to the next, the first '
+            f'time at {time[jumps[0] + 1]:.3f} s; it must be continuous: use --unwrap')
+
+
+def write_log(path: str | Path, log: Log, more: Mapping[str, Array] | None = None) -> None:
+    """
+    Write a log in SI columns, its other columns, and more named columns, completely or not at all.
+
+    Parameters
+    ----------
+    path : .csv or .csv.gz
+    log : what to write
+    more : name -> array of shape (n,)
+
+    """
+    write_log_blocks(path, [(log, more or {})])
+
+
+def write_log_blocks(path: str | Path,
+                     blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
+    """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
+    with (replacing(path) as file,
+          _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data):
+        for number, (log, more) in enumerate(blocks):
+            data.write(_text(log, more, headed=number == 0).encode('utf-8', 'backslashreplace'))
+
+
+def _compressing(file: BinaryIO) -> gzip.GzipFile:
+    # Without a time in it, since the same log must give the same file.
+    return gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
+
+
+def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:
+    columns: dict[str, Sequence[Any]] = {}
+    for name, (quantity, factor) in COLUMNS.items():
+        values = getattr(log, quantity)
+        if factor == 1.0 and values is not None:
+            columns[name] = values.tolist()
+    columns.update({name: list(map(_unix, texts)) for name, texts in log.others.items()})
+    columns.update({name: np.asarray(values, dtype=float).tolist()
+                    for name, values in more.items()})
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    if headed:
+        text.writelines(f'# {" ".join(note.splitlines())}\n' for note in log.notes)
+        writer.writerow(columns)
+    writer.writerows(zip(*columns.values()))
+    return text.getvalue()
+
+
+def _unix(text: str) -> str:
+    """Return a text with the ends of lines that a writer of CSV puts in quotes."""
+    return text.replace('\r\n', '\n').replace('\r', '\n') if '\r' in text else text

@@ -1,0 +1,476 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+A ROS 2 recording as a `Log`: Imu is the gyro, Temperature and a reference come onto its stamps.
+
+Times are the stamps of the headers, at which something was measured. Times of receiving are taken
+only where headers have no stamps, and a note says so. Everything else that was mended is in a note
+as well.
+
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+import os.path
+from pathlib import Path
+from typing import Any
+
+from gyro_calibration.logs.cdr import (
+    heading_of,
+    IMU,
+    layout,
+    MessageError,
+    NOT_REPORTED,
+    NSEC_PER_SEC,
+    ODOMETRY,
+    parse,
+    POSE,
+    TEMPERATURE,
+    TWIST,
+)
+from gyro_calibration.logs.log import Array, Log, LogError, Mask, ROWS, unwrapped
+from gyro_calibration.logs.ros_bag import Contents, Heard, Message, read_messages
+import numpy as np
+from numpy.typing import NDArray
+
+Nanoseconds = NDArray[np.int64]
+
+REFERENCES = (ODOMETRY, IMU, POSE, TWIST)
+#: Role of a topic -> the option that names it, and the kinds of messages that it may have.
+ROLES = {
+    'gyro': ('--topic', (IMU,)),
+    'temperature': ('--temperature-topic', (TEMPERATURE,)),
+    'reference': ('--reference-topic', REFERENCES),
+}
+
+#: s; a stamp so much before an earlier one shows that a clock was set; a smaller step shows that
+#: messages overtook each other.
+_LARGEST_STEP_BACK = 1.0
+#: Share of samples that may have the stamp of another one and be left out.
+_DOUBLED = 0.01
+#: A reference is lost between values further apart than so many of its intervals and so many s.
+_LOST_INTERVALS, _LOST_TIME = 5.0, 0.1
+#: Topics that a sentence names at most.
+_MOST_LISTED = 20
+#: s without a temperature, beyond which a note says so; gyros take minutes to warm up.
+_LONG_WITHOUT_TEMPERATURE = 30.0
+
+# Places among the numbers that are kept of an Imu, see `messages.LAYOUTS`.
+_ORIENTATION_VARIANCE, _RATE, _RATE_VARIANCE, _FORCE, _FORCE_VARIANCE = 4, 5, 6, 7, 8
+
+
+@dataclass(frozen=True)
+class Topics:
+    """
+    Which topics of a recording are meant; None is the only one, or for the reference none.
+
+    The axis is that of the gyro: x, y or z.
+
+    """
+
+    gyro: str | None = None
+    reference: str | None = None
+    temperature: str | None = None
+    axis: str = 'z'
+
+
+def wrong_kind(role: str, topic: str, kind: str) -> str:
+    """Return what is wrong with the kind of a topic for its role; empty where nothing is."""
+    option, kinds = ROLES[role]
+    return '' if kind in kinds else f'{topic} is {kind}; {option} wants {_listed(kinds, "or")}'
+
+
+def _same(topic: str, other: str | None) -> bool:
+    return topic.strip('/') == (other or '').strip('/')
+
+
+class _Series:
+    """Messages of one topic as they come: stamps and times of receiving, ns, and numbers kept."""
+
+    def __init__(self, topic: str, kind: str, axis: str):
+        self.topic, self.kind, self.damaged = topic, kind, 0
+        self._layout = layout(kind, axis)
+        self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, message: Message) -> None:
+        """Keep what matters of a message; a damaged one is counted."""
+        try:
+            stamp, numbers = parse(message.data, self._layout)
+            self._received.append(message.received)
+        except (MessageError, OverflowError):
+            self.damaged += 1
+            return
+        self._stamps.append(stamp)
+        self._numbers.extend([numbers[place] for place in self._layout.kept])
+
+    def by_arrival(self) -> _Course:
+        """Return what came, in the order in which it was received."""
+        received = np.frombuffer(self._received, np.int64)
+        numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
+        course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received,
+                         numbers)
+        # Long recordings are hardly ever out of order, and need no copy then.
+        return (course if (received[1:] >= received[:-1]).all()
+                else course.taken(np.argsort(received, kind='stable')))
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Stamps and times of receiving of a topic, ns, shape (n,), and numbers, shape (n, kept)."""
+
+    topic: str
+    kind: str
+    stamps: Nanoseconds
+    received: Nanoseconds
+    numbers: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def has_stamps(self) -> bool:
+        """Return whether the headers have stamps; else they are zero or all the same."""
+        return bool(self.stamps.any()) and (len(self) < 2 or int(np.ptp(self.stamps)) > 0)
+
+    def taken(self, which: Mask | NDArray[np.intp]) -> _Course:
+        return replace(self, stamps=self.stamps[which], received=self.received[which],
+                       numbers=self.numbers[which])
+
+    def timed(self, use_stamps: bool) -> _Course:
+        """Return it with the times that are to be used as its stamps."""
+        if not use_stamps:
+            return replace(self, stamps=self.received)
+        return self if self.stamps.all() else self.taken(self.stamps != 0)
+
+
+def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
+                   heard: Heard = lambda place: None,
+                   say: Callable[[str], object] = lambda note: None) -> Log:
+    """
+    Read a ROS 2 recording: a folder, or a file .mcap or .db3.
+
+    Parameters
+    ----------
+    path : the recording
+    topics : which of its topics are meant
+    rate : Hz; the samples came at this rate, whatever their stamps say
+    heard : is told how many bytes are read
+    say : is told what was taken, and what had to be done for it; the notes of the log have it too
+
+    Raises
+    ------
+    LogError : it cannot be read, holds no gyro, or several; names the topics that there are
+
+    """
+    contents, series = Contents(), dict[str, _Series]()
+    for message in read_messages(path, contents, heard):
+        if message.topic not in series:
+            axis = 'z' if _same(message.topic, topics.reference) else topics.axis
+            series[message.topic] = _Series(message.topic, message.kind, axis)
+        series[message.topic].add(message)
+    log = _Reader(path, topics, contents, series).log(rate)
+    for note in log.notes:
+        say(note)
+    return replace(log, notes=(*log.notes, *contents.about))
+
+
+def blocks_of(log: Log, rows: int = ROWS) -> Iterator[Log]:
+    """Give a log in blocks, as a log file is read."""
+    for begin in range(0, len(log), rows):
+        here = slice(begin, begin + rows)
+        pieces: dict[str, Any] = {name: values[here] for name, values in vars(log).items()
+                                  if isinstance(values, np.ndarray)}
+        yield replace(log, **pieces)
+
+
+class _Reader:
+    """Makes a log of what was read of a recording, and notes what had to be done for it."""
+
+    def __init__(self, path: str | Path, topics: Topics, contents: Contents,
+                 series: dict[str, _Series]):
+        self._path, self._topics, self._contents, self._series = path, topics, contents, series
+        self._notes = [f'ROS 2 recording {Path(path).name}']
+
+    def log(self, rate: float | None) -> Log:
+        gyro, reference, temperature = self._gyro(), self._reference(), self._temperature_topic()
+        use_stamps = all(course.has_stamps for course in (gyro, reference) if course is not None)
+        if not use_stamps:
+            self._notes.append('headers have no stamps: times are those at which messages were '
+                               'received')
+        gyro = self._in_order(gyro.timed(use_stamps), rate)
+        time = (gyro.stamps - gyro.stamps[0]) / NSEC_PER_SEC
+        self._notes.append(f'gyro: {gyro.topic} ({gyro.kind}), {len(gyro)} samples, '
+                           f'time_s from {_seconds(gyro.stamps[0])} s on')
+        log = Log(output=self._output(gyro), time=time, specific_force=self._force(gyro))
+        if temperature is not None:
+            times = temperature.timed(use_stamps and temperature.has_stamps)
+            log = replace(log, temperature=self._temperature(times, gyro.stamps[0], time))
+        if reference is not None:
+            log = replace(log, **self._referred(reference.timed(use_stamps), gyro, time,
+                                                log.output))
+        if rate is not None:
+            log = replace(log, time=np.arange(len(gyro)) / rate)
+        return replace(log, notes=(*self._notes, *self._contents.notes))
+
+    # Which topics
+
+    def _gyro(self) -> _Course:
+        wanted = self._topics.gyro
+        found = self._named(wanted, 'gyro') if wanted else self._only_imu()
+        course = self._course(found)
+        if (course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
+            raise LogError(f'{self._path}: {found} says that it reports no angular velocity; '
+                           'name another by --topic')
+        return course
+
+    def _only_imu(self) -> str:
+        found = [topic for topic in self._of_kind((IMU,))
+                 if not _same(topic, self._topics.reference)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise LogError(f'{self._path}: several gyros, {_listed(found)}; '
+                           'say by --topic which one is meant')
+        reasons = ''.join(f' ({note})' for note in self._contents.notes)
+        raise LogError(f'{self._path}: no message of {IMU} in it{reasons}'
+                       f'{self._what_there_is()}; record the topic of the gyro')
+
+    def _reference(self) -> _Course | None:
+        wanted = self._topics.reference
+        if wanted is None:
+            found = [topic for topic in self._of_kind(REFERENCES)
+                     if self._series[topic].kind != IMU]
+            if found:
+                self._notes.append('no reference was asked for; --reference-topic may be '
+                                   f'{_listed(found)}')
+            return None
+        return self._course(self._named(wanted, 'reference'))
+
+    def _temperature_topic(self) -> _Course | None:
+        wanted = self._topics.temperature
+        if wanted is not None:
+            return self._course(self._named(wanted, 'temperature'))
+        found = self._of_kind((TEMPERATURE,))
+        if not found:
+            return None
+        gyro = self._topics.gyro or self._only_imu()
+        near = max(found, key=lambda topic: len(
+            os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
+        if len(found) > 1:
+            self._notes.append(f'of the temperatures {_listed(found)}, '
+                               'the one named most like the gyro is taken')
+        return self._course(near)
+
+    def _named(self, wanted: str, role: str) -> str:
+        topic = next((topic for topic in self._contents.topics
+                      if _same(topic, wanted)), None)
+        if topic is None:
+            raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
+                           f'name one of them by {ROLES[role][0]}')
+        if wrong := wrong_kind(role, topic, self._contents.topics[topic]):
+            raise LogError(f'{self._path}: {wrong}')
+        if topic not in self._series or not len(self._series[topic]):
+            raise LogError(f'{self._path}: {topic} has no message that can be read; record again')
+        return topic
+
+    def _of_kind(self, kinds: Sequence[str]) -> list[str]:
+        return sorted(topic for topic, series in self._series.items()
+                      if series.kind in kinds and len(series))
+
+    def _what_there_is(self) -> str:
+        topics = [f'{topic} ({kind})' for topic, kind in sorted(self._contents.topics.items())]
+        return f'; there are {_listed(topics)}' if topics else ', which holds no topic at all'
+
+    def _course(self, topic: str) -> _Course:
+        series = self._series[topic]
+        if series.damaged:
+            self._notes.append(f'{series.damaged} messages of {topic} could not be read and were '
+                               'left out')
+        return series.by_arrival()
+
+    # The gyro
+
+    def _in_order(self, gyro: _Course, rate: float | None) -> _Course:
+        """Sort samples that overtook each other, leave out doubled ones, refuse unusable times."""
+        if rate is None:
+            gyro = self._single(self._sorted(gyro))
+        else:
+            gyro = replace(gyro, stamps=np.maximum.accumulate(gyro.stamps))
+        if len(gyro) < 2:
+            raise LogError(f'{self._path}: {gyro.topic} has {len(gyro)} samples with a time; '
+                           'a log has at least two: record more')
+        return gyro
+
+    def _sorted(self, gyro: _Course) -> _Course:
+        back = np.maximum.accumulate(gyro.stamps) - gyro.stamps
+        if not back.any():
+            return gyro
+        if back.max() > _LARGEST_STEP_BACK * NSEC_PER_SEC:
+            place = int(np.argmax(back > _LARGEST_STEP_BACK * NSEC_PER_SEC))
+            raise LogError(
+                f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s '
+                f'at sample {place + 1}, as of a clock that was set; cut the recording there, or '
+                'give --rate')
+        self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
+        return gyro.taken(np.argsort(gyro.stamps, kind='stable'))
+
+    def _single(self, gyro: _Course) -> _Course:
+        doubled = np.diff(gyro.stamps, prepend=gyro.stamps[:1] - 1) == 0
+        if not doubled.any():
+            return gyro
+        same = doubled.copy()
+        same[1:] &= gyro.numbers[1:, _RATE] == gyro.numbers[:-1, _RATE]
+        other = int(np.count_nonzero(doubled & ~same))
+        if other > 1 + _DOUBLED * len(gyro):
+            raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
+                           'the stamp of another sample, so nobody knows when they were taken; '
+                           'give --rate')
+        self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
+                           'were left out')
+        return gyro.taken(~doubled)
+
+    def _output(self, gyro: _Course) -> Array:
+        output = gyro.numbers[:, _RATE].copy()
+        lost = ~np.isfinite(output)
+        if lost.any():
+            self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
+                               'as lost')
+            output[lost] = np.nan
+        return output
+
+    def _force(self, gyro: _Course) -> Array | None:
+        """Return the specific force along z, or None if it is not reported or never filled in."""
+        force = gyro.numbers[:, _FORCE]
+        if (gyro.numbers[:, _FORCE_VARIANCE] == NOT_REPORTED).any() or not force.any():
+            return None
+        if not np.isfinite(force).all():
+            self._notes.append('the specific force is not finite everywhere and was left out')
+            return None
+        return force.copy()
+
+    # Beside the gyro
+
+    def _temperature(self, course: _Course, begin: np.int64, time: Array) -> Array | None:
+        """
+        Return the temperature at the samples, by linear interpolation between readings.
+
+        Before the first reading and after the last it is held. A housing takes minutes to warm up,
+        so interpolation is nearer than the last reading, which a robot has to take.
+
+        """
+        course = _rising(course.taken(np.isfinite(course.numbers[:, 0])))
+        at = (course.stamps - begin) / NSEC_PER_SEC
+        if (not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE
+                or at[-1] < -_LONG_WITHOUT_TEMPERATURE):
+            self._notes.append(f'temperature: {course.topic} says none at the times of the gyro, '
+                               'and was left out')
+            return None
+        self._notes.append(f'temperature: {course.topic} ({course.kind}), {len(at)} readings')
+        inside = at[(at >= 0.0) & (at <= time[-1])]
+        longest = float(np.diff(np.concatenate([[0.0], inside, time[-1:]])).max())
+        if longest > _LONG_WITHOUT_TEMPERATURE:
+            self._notes.append(f'no temperature came for up to {longest:.0f} s; '
+                               'it was interpolated, or held at the ends')
+        return np.interp(time, at, course.numbers[:, 0])
+
+    def _referred(self, course: _Course, gyro: _Course, time: Array,
+                  output: Array | None) -> dict[str, Any]:
+        """Return heading and rate of a reference at the samples of the gyro; nan where lost."""
+        if course.topic == gyro.topic:
+            raise LogError(f'{self._path}: {gyro.topic} cannot be its own reference; '
+                           'name another by --reference-topic')
+        course = _rising(course)
+        at, wrapped, rate = ((course.stamps - gyro.stamps[0]) / NSEC_PER_SEC, _headings(course),
+                             _rates(course))
+        heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
+        if (rate is not None and heading is not None and not rate.any()
+                and np.nanmax(heading) - np.nanmin(heading) > 0.1):
+            self._notes.append('the rates of the reference are never filled in, and were left out')
+            rate = None
+        found: dict[str, Any] = {
+            name: _at(time, at, values)
+            for name, values in (('reference_heading', heading), ('reference_rate', rate))
+            if values is not None and np.isfinite(values).sum() > 1}
+        if not any(np.isfinite(values).any() for values in found.values()):
+            raise LogError(f'{self._path}: {course.topic} says no heading and no rate at the '
+                           'times of the gyro; name another reference, or see whether both '
+                           'clocks agree')
+        lost = np.isnan(next(iter(found.values()))).mean()
+        self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, '
+                           f'lost for {100 * lost:.1f} % of the samples')
+        return found
+
+    def _continuous(self, at: Array, wrapped: Array, time: Array, output: Array | None) -> Array:
+        """Return a heading without its jumps by whole turns, and note where the gyro helped."""
+        heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
+        if by_gyro:
+            self._notes.append('the reference turned by more than half a turn between two values; '
+                               'the gyro says by how much')
+        return heading
+
+
+def _rising(course: _Course) -> _Course:
+    """Return it sorted by its stamps, each of them once."""
+    return course.taken(np.unique(course.stamps, return_index=True)[1])
+
+
+def _headings(course: _Course) -> Array | None:
+    """Return the rotation about z, wrapped, nan where there is none; None without any."""
+    if course.kind == TWIST:
+        return None
+    if course.kind == IMU and not _knows_heading(course):
+        return None
+    heading: Array = heading_of(*course.numbers[:, :4].T)
+    return heading
+
+
+def _knows_heading(course: _Course) -> bool:
+    """Return whether an Imu has a heading: neither declared unknown nor left at its default."""
+    variance = course.numbers[:, _ORIENTATION_VARIANCE]
+    untouched = (not (course.numbers[:, :3].any() or variance.any())
+                 and bool((course.numbers[:, 3] == 1.0).all()))
+    return not untouched and not (variance == NOT_REPORTED).all()
+
+
+def _rates(course: _Course) -> Array | None:
+    place: dict[str, Any] = {IMU: _RATE, ODOMETRY: 4, TWIST: 0}
+    if course.kind not in place or course.kind == IMU and (
+            course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
+        return None
+    rate = course.numbers[:, place[course.kind]].copy()
+    rate[~np.isfinite(rate)] = np.nan
+    return rate
+
+
+def _at(time: Array, at: Array, values: Array) -> Array:
+    """Return values interpolated at other times; nan where two values are too far apart."""
+    at, values = at[np.isfinite(values)], values[np.isfinite(values)]
+    longest = max(_LOST_INTERVALS * float(np.median(np.diff(at))), _LOST_TIME)
+    place = np.clip(np.searchsorted(at, time, 'right') - 1, 0, len(at) - 2)
+    inside = (time >= at[0]) & (time <= at[-1])
+    close = (at[place + 1] - at[place] <= longest) | (time == at[place]) | (time == at[place + 1])
+    return np.where(inside & close, np.interp(time, at, values), np.nan)
+
+
+def _seconds(nanoseconds: np.int64) -> str:
+    return f'{int(nanoseconds) // NSEC_PER_SEC}.{int(nanoseconds) % NSEC_PER_SEC:09d}'
+
+
+def _listed(names: Sequence[str], word: str = 'and') -> str:
+    if len(names) > _MOST_LISTED:
+        names = [*names[:_MOST_LISTED], f'{len(names) - _MOST_LISTED} more']
+    return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} {word} {names[-1]}'

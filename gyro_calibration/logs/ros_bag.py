@@ -1,0 +1,531 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What a ROS 2 recording holds: the messages of a folder, of an .mcap file or of a .db3 file.
+
+A recording whose program was killed lacks its closing part and the index, so neither is used: the
+records are read from the beginning, up to the end or the tear. Nothing in a file may take
+more memory than `LARGEST`, or grow to more than `GROWTH` times the file.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+import importlib
+import io
+import os
+from pathlib import Path
+import re
+import shutil
+import sqlite3
+import struct
+import sys
+import tempfile
+from typing import Any, BinaryIO
+from urllib.parse import quote
+import zlib
+
+from gyro_calibration.files import GROWN, GROWTH, opened, plain, reason, remedy
+from gyro_calibration.logs.cdr import LAYOUTS
+from gyro_calibration.logs.log import LogError, shown
+
+#: Bytes of a record or chunk, beyond which it is left out; recorders make chunks of 1 to 10 MB.
+LARGEST = 1 << 28
+_PIECE = 1 << 20
+
+_MAGIC = b'\x89MCAP0\r\n'
+_ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 2, 3, 4, 5, 6, 12, 15
+_READ = _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA
+#: Closing part of an MCAP file without index and checksum: the end of the data, a footer of zeros.
+MCAP_END = struct.pack('<BQ4x', _DATA_END, 4) + struct.pack('<BQ20x', _FOOTER, 20) + _MAGIC
+#: Name of the metadata of a recorder of this program, and the most characters shown of a text.
+ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
+
+#: The errors of SQLite in a damaged file: its own, whose words need not be text, and a length that
+#: asks for more memory than there may be.
+_DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
+
+#: Is told how many bytes of all files are read.
+Heard = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message as recorded: its topic, its kind, the time of receiving, ns, and its bytes."""
+
+    topic: str
+    kind: str
+    received: int
+    data: bytes
+
+
+@dataclass
+class Contents:
+    """The contents of a recording so far: topic -> kind, notes of its recorder, and remarks."""
+
+    topics: dict[str, str] = field(default_factory=dict)
+    about: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    left_out: int = 0
+
+
+def said(text: object) -> str:
+    """Return a text of a file for a sentence: one line, not too long, no control characters."""
+    return plain(' '.join(str(text).split()))[:_MOST_CHARACTERS]
+
+
+def is_recording(path: str | Path) -> bool:
+    """Return whether a path is that of a recording, by its name."""
+    return os.path.isdir(path) or _kind_of(Path(path)) is not None
+
+
+def files_of(path: str | Path) -> list[Path]:
+    """
+    Return the files of a recording, in their order.
+
+    The list in metadata.yaml is not asked for: a recorder that was killed leaves none.
+
+    Raises
+    ------
+    LogError : a folder without any
+
+    """
+    path = Path(path)
+    if not os.path.isdir(path):
+        return [path]
+    try:
+        found = [file for file in path.iterdir() if file.is_file() and _kind_of(file)]
+    except OSError as error:
+        raise LogError(f'{path}: cannot be read ({reason(error)}); '
+                       f'{remedy(error, path)}') from error
+    if not found:
+        raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
+                       'name the folder of a ROS 2 recording, or a log file')
+    return sorted(found, key=_natural)
+
+
+def read_messages(path: str | Path, contents: Contents,
+                  heard: Heard = lambda place: None) -> Iterator[Message]:
+    """
+    Give the messages of a recording that may be of use for a gyro, and fill in its contents.
+
+    Parameters
+    ----------
+    path : a folder, or a file .mcap or .db3, each perhaps with .zstd
+    contents : is filled in
+    heard : is told how far it is
+
+    Raises
+    ------
+    LogError : a file is no recording
+
+    """
+    done = 0
+    for file in files_of(path):
+        try:
+            with _unpacked_file(file) as source:
+                read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
+                yield from read(source, file, contents, partial(_shifted, heard, done))
+            done += file.stat().st_size
+        except OSError as error:
+            raise LogError(f'{file}: cannot be read ({reason(error)}); '
+                           f'{remedy(error, file)}') from error
+    if contents.left_out:
+        parts = ('part of the recording was' if contents.left_out == 1
+                 else 'parts of the recording were')
+        contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
+
+
+def _shifted(heard: Heard, done: int, place: int) -> None:
+    heard(done + place)
+
+
+def _kind_of(path: Path) -> str | None:
+    name = path.name.removesuffix('.zstd')
+    return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+
+
+@contextmanager
+def _unpacked_file(path: Path) -> Iterator[Path]:
+    """Give a file without its compression."""
+    with opened(path) as packed:
+        if path.suffix != '.zstd':
+            yield path
+            return
+        with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+            source, budget = Path(folder) / path.stem, _Budget(path)
+            with open(source, 'wb') as file:
+                for piece in _unpacked(packed):
+                    budget.spend(len(piece))
+                    file.write(piece)
+            yield source
+
+
+class _Budget:
+    """What the content of a file may grow to where it is compressed."""
+
+    def __init__(self, path: Path):
+        self._path, self._left = path, GROWN + GROWTH * path.stat().st_size
+
+    def spend(self, size: int) -> None:
+        """
+        Take some bytes.
+
+        Raises
+        ------
+        LogError : there are too many
+
+        """
+        self._left -= size
+        if self._left < 0:
+            raise LogError(f'{self._path}: grows to more than {GROWTH} times its size, as no '
+                           'recording does; record again, or unpack it if that is what was '
+                           'recorded')
+
+
+def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
+    """Give what Zstandard made smaller piece by piece, up to a tear or damage."""
+    zstandard = _library('zstandard')
+    reader = zstandard.ZstdDecompressor(max_window_size=LARGEST).stream_reader(
+        packed, read_across_frames=True)
+    try:
+        while piece := reader.read(_PIECE):
+            yield piece
+    except zstandard.ZstdError:
+        return
+
+
+def _library(name: str) -> Any:
+    """Return a library that compresses; only compressed recordings need one."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.partition('.')[0]
+        raise LogError(f'the recording is compressed, which needs the Python package {package}: '
+                       f'pip install {package}') from None
+
+
+# MCAP
+
+
+def _from_mcap(source: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+    with open(source, 'rb') as file:
+        end = source.stat().st_size
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
+        reader, told = _McapReader(contents, _Budget(path)), 0
+        for code, body in _records(file, end, contents):
+            if code == _DATA_END:
+                return
+            yield from reader.read(code, body, torn=file.tell() == end)
+            if file.tell() - told > _PIECE:
+                told = file.tell()
+                heard(told)
+        contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
+                              'and was read up to there')
+
+
+def _records(stream: BinaryIO, end: int, contents: Contents) -> Iterator[tuple[int, bytes]]:
+    """Give code and content of each record of a file or a chunk; a torn chunk is cut short."""
+    while len(head := stream.read(9)) == 9:
+        code, length = struct.unpack('<BQ', head)
+        left = end - stream.tell()
+        if code == _CHUNK and left < length <= LARGEST:
+            yield code, stream.read()
+            return
+        if length > left or code == 0:
+            stream.seek(-9, io.SEEK_CUR)
+            return
+        if code in _READ and length <= LARGEST:
+            yield code, stream.read(length)
+            continue
+        contents.left_out += code in _READ
+        stream.seek(length, io.SEEK_CUR)
+        if code == _DATA_END:
+            yield code, b''
+            return
+
+
+class _McapReader:
+    """Reads the records of one file; it remembers channels and their schemas."""
+
+    def __init__(self, contents: Contents, budget: _Budget):
+        self._contents, self._budget = contents, budget
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+
+    def read(self, code: int, body: bytes, torn: bool = False) -> Iterator[Message]:
+        """Give the messages in a record; a torn chunk is read as far as it goes."""
+        try:
+            if code == _CHUNK:
+                data = _chunk_data(body, torn, self._budget)
+                for inner, content in _records(io.BytesIO(data), len(data), self._contents):
+                    yield from self.read(inner, content) if inner != _CHUNK else ()
+            elif code == _MESSAGE:
+                yield from self._message(body)
+            elif code == _SCHEMA:
+                self._schemas[struct.unpack_from('<H', body)[0]] = _text(body, 2)[0]
+            elif code == _CHANNEL:
+                self._add_channel(body)
+            elif code == _METADATA:
+                self._contents.about += _about(body)
+        except (_Damaged, struct.error):
+            self._contents.left_out += 1
+
+    def _add_channel(self, body: bytes) -> None:
+        number, schema = struct.unpack_from('<HH', body)
+        topic, place = _text(body, 4)
+        topic = shown(topic)
+        encoding, _ = _text(body, place)
+        kind = shown(self._schemas.get(schema, 'unknown'))
+        self._contents.topics[topic] = kind
+        if kind in LAYOUTS and encoding == 'cdr':
+            self._channels[number] = topic, kind
+
+    def _message(self, body: bytes) -> Iterator[Message]:
+        number, _, received, _ = struct.unpack_from('<HIQQ', body)
+        if number in self._channels:
+            yield Message(*self._channels[number], received,
+                          _message_data(body[22:], self._budget))
+
+
+class _Damaged(ValueError):
+    """A part of a recording is not what it should be."""
+
+
+def _text(body: bytes, place: int) -> tuple[str, int]:
+    end = place + 4 + struct.unpack_from('<I', body, place)[0]
+    if end > len(body):
+        raise _Damaged
+    return body[place + 4:end].decode(errors='replace'), end
+
+
+def _about(body: bytes) -> list[str]:
+    """Return what a recorder of this program says of a recording, as notes."""
+    name, place = _text(body, 0)
+    notes, place = [], place + 4
+    while name == ABOUT and place < len(body):
+        key, place = _text(body, place)
+        value, place = _text(body, place)
+        notes.append(said(f'{key}: {value}'))
+    return notes
+
+
+def _chunk_data(body: bytes, torn: bool, budget: _Budget) -> bytes:
+    """Return the records of a chunk as bytes, and of a torn one those that are there."""
+    _, _, size, check = struct.unpack_from('<QQQI', body)
+    compression, place = _text(body, 28)
+    if size > LARGEST:
+        raise _Damaged
+    data = _expanded(compression, body[place + 8:], size, budget)
+    if not torn and (len(data) != size or check and zlib.crc32(data) != check):
+        raise _Damaged
+    return data
+
+
+def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> bytes:
+    """Return what is in compressed data, and not more than the size that it should have."""
+    if compression == '':
+        return data[:size]
+    if compression not in _COMPRESSIONS:
+        raise _Damaged
+    expanded = bytearray()
+    for piece in _COMPRESSIONS[compression](data):
+        budget.spend(len(piece))
+        expanded += piece
+        if len(expanded) > size:
+            break
+    del expanded[size:]
+    return bytes(expanded)
+
+
+def _from_zstandard(data: bytes) -> Iterator[bytes]:
+    return _unpacked(io.BytesIO(data))
+
+
+def _from_lz4(data: bytes) -> Iterator[bytes]:
+    decompressor = _library('lz4.frame').LZ4FrameDecompressor()
+    try:
+        piece = decompressor.decompress(data, max_length=_PIECE)
+        while piece:
+            yield piece
+            piece = b'' if decompressor.eof else decompressor.decompress(b'', max_length=_PIECE)
+    except (RuntimeError, EOFError) as error:
+        raise _Damaged from error
+
+
+_COMPRESSIONS = {'zstd': _from_zstandard, 'lz4': _from_lz4}
+
+
+def _message_data(data: bytes, budget: _Budget) -> bytes:
+    """Return the bytes of a message that may be compressed by itself."""
+    return _expanded('zstd', data, 1 << 16, budget) if data.startswith(_ZSTANDARD_MAGIC) else data
+
+
+# SQLite
+
+
+def _from_database(source: Path, path: Path, contents: Contents,
+                   heard: Heard) -> Iterator[Message]:
+    with _database(source, path, contents) as database:
+        channels, budget = _topics(database, path, contents), _Budget(path)
+        size, last, count = path.stat().st_size, _last_row(database), 0
+        try:
+            for row, topic, received, data in _rows(database):
+                count += 1
+                if count % 4096 == 0:
+                    heard(int(size * row / last))
+                if topic not in channels:
+                    continue
+                if not (isinstance(received, int) and isinstance(data, bytes)):
+                    contents.left_out += 1
+                    continue
+                yield Message(*channels[topic], received, _message_data(data, budget))
+        except _DATABASE_ERRORS as error:
+            contents.notes.append(f'{path.name} is damaged after {count} messages '
+                                  f'({_why(error)}), and was read up to there')
+
+
+@contextmanager
+def _database(source: Path, path: Path, contents: Contents) -> Iterator[sqlite3.Connection]:
+    """
+    Open a database for reading only.
+
+    It is tried with the files that a killed writer left beside it, without them, and at last as
+    the part that is there. Its tables are read as they are stored: nothing in its schema is
+    computed, since nothing in the file would bound the cost.
+
+    """
+    with tempfile.TemporaryDirectory(prefix='gyro_calibration_') as folder:
+        reason: Exception | None = None
+        ways = (('mode=ro', lambda: source), ('mode=ro&immutable=1', lambda: source),
+                ('mode=ro', lambda: _shortened(source, Path(folder))))
+        for how, file in ways:
+            try:
+                database, tables = _opened(file(), how)
+            except _DATABASE_ERRORS as error:
+                reason = error
+                continue
+            with closing(database):
+                if not {'topics', 'messages'} <= tables:
+                    raise LogError(f'{path}: is a database, but not a ROS 2 recording with tables '
+                                   'of stored columns; name a recording')
+                yield database
+                return
+    raise LogError(f'{path}: cannot be read as a ROS 2 recording ({_why(reason)}); '
+                   'name a recording, or record again')
+
+
+def _why(error: Exception | None) -> str:
+    return said(str(error) or 'it asks for more memory than there may be')
+
+
+def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:
+    """Return a database and the names of its plain tables, which show whether it can be read."""
+    database = sqlite3.connect(f'file:{quote(str(file.resolve()))}?{how}', uri=True)
+    try:
+        database.text_factory = partial(str, encoding='utf-8', errors='replace')
+        database.set_progress_handler(_Steps(file.stat().st_size), _Steps.AT_ONCE)
+        if sys.version_info >= (3, 11):
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _PIECE)
+        database.execute('PRAGMA trusted_schema = OFF')
+        tables = {name for name, in database.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table'")}
+        stored = {name for name in sorted(tables & {'topics', 'messages'})
+                  if not any(hidden for *_, hidden
+                             in database.execute(f'PRAGMA table_xinfo({name})'))}
+        database.set_authorizer(_authorized)
+        return database, stored
+    except BaseException:
+        database.close()
+        raise
+
+
+class _Steps:
+    """
+    Ends a query that takes more steps of SQLite than the rows of a file can.
+
+    The smallest row has a dozen bytes and takes some 30 steps.
+
+    """
+
+    AT_ONCE, A_BYTE, ANYWAY = 1000, 10, 1_000_000
+
+    def __init__(self, size: int):
+        self._left = self.A_BYTE * size + self.ANYWAY
+
+    def __call__(self) -> bool:
+        self._left -= self.AT_ONCE
+        return self._left < 0
+
+
+def _authorized(action: int, first: str | None, second: str | None, _: str | None,
+                within: str | None) -> int:
+    """Allow SQLite to read both tables, with the functions used here, and nothing of a view."""
+    reads = action == sqlite3.SQLITE_READ and first in ('topics', 'messages')
+    computes = action == sqlite3.SQLITE_FUNCTION and second in ('length', 'max', 'typeof')
+    allowed = within is None and (action == sqlite3.SQLITE_SELECT or reads or computes)
+    return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
+
+
+def _shortened(source: Path, folder: Path) -> Path:
+    """Return a copy of a torn database with its true length, as SQLite refuses a shorter file."""
+    copy = Path(shutil.copy(source, folder))
+    with open(copy, 'r+b') as file:
+        head = file.read(100)
+        if len(head) == 100:
+            size = int.from_bytes(head[16:18], 'big')
+            size = 1 << 16 if size == 1 else max(size, 1)
+            file.seek(28)
+            file.write((copy.stat().st_size // size).to_bytes(4, 'big'))
+    return copy
+
+
+def _topics(database: sqlite3.Connection, path: Path,
+            contents: Contents) -> dict[int, tuple[str, str]]:
+    channels = {}
+    try:
+        for number, topic, kind, encoding in database.execute(
+                'SELECT id, name, type, serialization_format FROM topics'):
+            topic, kind = shown(str(topic)), shown(str(kind))
+            contents.topics[topic] = kind
+            if kind in LAYOUTS and encoding == 'cdr':
+                channels[number] = topic, kind
+    except _DATABASE_ERRORS as error:
+        raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); '
+                       'record again') from error
+    return channels
+
+
+def _last_row(database: sqlite3.Connection) -> int:
+    """Return the number of the last message, only to show how far the reading is."""
+    try:
+        return int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
+    except _DATABASE_ERRORS:
+        return sys.maxsize
+
+
+def _rows(database: sqlite3.Connection) -> Iterator[Any]:
+    """Give row, topic, time and data of the messages; data of 64 KiB and more are not loaded."""
+    return database.execute("""
+        SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
+               CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
+               CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
+        FROM messages""")

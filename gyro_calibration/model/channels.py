@@ -1,0 +1,171 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Channels that need a history: time since power-on, lagged channels, the branch of a temperature.
+
+A `History` follows a stream sample by sample, or a log in one piece or in blocks, with the same
+numbers. It remembers the lags that it is asked for: each starts at the value that its channel has
+then.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+from gyro_calibration.logs.log import Log, Number
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.effects.lag import lag_ahead
+import numpy as np
+
+#: Vibration is what deviates from the mean over so many seconds.
+VIBRATION_TIME = 1.0
+
+#: What the next sample needs to know, by (channel, time constant) of a lag and ('heating', filter
+#: time, threshold) of a branch.
+Known = dict[tuple[Any, ...], float]
+
+
+class History:
+    """
+    What has been, as far as effects look at it.
+
+    Parameters
+    ----------
+    stand_in : the temperature where none is known, degC
+    low, high : beyond these temperatures the nearest end is taken, degC
+
+    """
+
+    def __init__(self, stand_in: float = 25.0, low: float = -math.inf, high: float = math.inf):
+        """Begin with nothing known."""
+        self._stand_in, self._low, self._high = stand_in, low, high
+        self._piece: _Piece | None = None
+        self._begin = 0.0
+
+    def follow(self, time: Number, temperature: Number | None = None,
+               specific_force: Number | None = None, supply: Number | None = None,
+               heading: Number = 0.0) -> Channels:
+        """
+        Take the next sample (numbers) or the next samples (arrays of shape (n,), n > 0).
+
+        Parameters
+        ----------
+        time : stamp, s, increasing
+        temperature : degC; None where it is not known
+        specific_force, supply, heading : m/s², V, rad; None where they are not known
+
+        Returns
+        -------
+        the channels, with rate and output 0
+
+        """
+        if self._piece is None:
+            self._begin = float(_end(time, 0))
+        known = {'specific_force': specific_force}
+        if temperature is not None:
+            known['temperature'] = temperature = clip(temperature, self._low, self._high)
+        here = self._stand_in + 0.0 * time if temperature is None else temperature
+        piece = self._piece = _Piece(time, {name: signal for name, signal in known.items()
+                                            if signal is not None}, self._piece)
+
+        def lagged(channel: str, time_constant: float) -> Number:
+            signal = here if channel == 'temperature' else piece.signal(channel)
+            return signal + piece.ahead(channel, time_constant)
+
+        return Channels(0.0 * time, 0.0 * time, here, time - self._begin,
+                        0.0 * time if specific_force is None else specific_force, supply,
+                        heading, lagged, piece.heating)
+
+
+class _Piece:
+    """One sample, or the samples of a block, after what was before."""
+
+    def __init__(self, time: Number, known: Mapping[str, Number], before: _Piece | None):
+        self._known = dict(known)
+        self._end_time = _end(time, -1)
+        self._last: dict[str, float] = {}
+        self._state: Known = {}
+        begin = _end(time, 0)
+        if before is not None:
+            self._state, begin = before.ended(), before._end_time
+            self._last = before._last | {name: _end(signal, -1)
+                                         for name, signal in before._known.items()}
+        self._ended: Known = {}
+        self._interval = _change(time, begin)
+
+    def signal(self, channel: str) -> Number:
+        """Return a channel."""
+        if channel == 'vibration' and channel not in self._known:
+            ahead = self.ahead('specific_force', VIBRATION_TIME)
+            self._known[channel] = ahead * ahead
+        return self._known.get(channel, 0.0)
+
+    def ahead(self, channel: str, time_constant: float) -> Number:
+        """Return the lagged channel less the channel, which is held while it is not known."""
+        signal, key = self.signal(channel), (channel, time_constant)
+        change = (_change(signal, self._last.get(channel, _end(signal, 0)))
+                  if channel in self._known else 0.0 * self._interval)
+        ahead = lag_ahead(self._interval, change, time_constant, self._state.get(key, 0.0))
+        self._ended[key] = _end(ahead, -1)
+        return ahead
+
+    def heating(self, filter_time: float, threshold: float) -> Number:
+        """Return the branch: the sign of the temperature rate if beyond a threshold, K/s."""
+        fast, slow = (self.ahead('temperature', lag) for lag in (0.5 * filter_time, filter_time))
+        rate, key = (fast - slow) / (0.5 * filter_time), ('heating', filter_time, threshold)
+        branch = _held(np.sign(rate) * (abs(rate) > threshold), self._state.get(key, 0.0))
+        self._ended[key] = _end(branch, -1)
+        return branch
+
+    def ended(self) -> Known:
+        """Return what the next piece has to know, also of lags that nobody asked for now."""
+        for key in self._state.keys() - self._ended.keys():
+            (self.heating if key[0] == 'heating' else self.ahead)(*key[-2:])
+        return self._ended
+
+
+def channels_of(log: Log) -> Channels:
+    """
+    Return the channels of a whole log, with rate and output 0.
+
+    Without stamps no row is earlier than another. The heading is that of the reference, and 0
+    where there is none.
+
+    """
+    time = np.zeros(len(log)) if log.time is None else log.time
+    heading = np.zeros(len(log)) if log.reference_heading is None else log.reference_heading
+    return History().follow(time, log.temperature, log.specific_force, log.supply, heading)
+
+
+def clip(value: Number, low: float, high: float) -> Number:
+    """Return a number, or an array, within bounds."""
+    # numpy makes a numpy scalar of a number, and all computations with it three times slower
+    return (np.clip(value, low, high) if isinstance(value, np.ndarray)
+            else min(max(value, low), high))
+
+
+def _end(signal: Number, place: int) -> float:
+    return float(signal[place]) if isinstance(signal, np.ndarray) else signal
+
+
+def _change(signal: Number, before: float) -> Number:
+    return np.diff(signal, prepend=before) if isinstance(signal, np.ndarray) else signal - before
+
+
+def _held(sign: Number, before: float) -> Number:
+    """Return the last sign that is not zero."""
+    if not isinstance(sign, np.ndarray):
+        return float(sign) or before
+    last = np.maximum.accumulate(np.where(sign != 0.0, np.arange(len(sign)), -1))
+    return np.where(last < 0, before, sign[last])

@@ -1,0 +1,205 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""From the output of a gyro to the rate, the same for one sample and for a whole log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gyro_calibration.logs.log import Array, CACHED, Number
+from gyro_calibration.model.channels import clip
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.gyro_model import GyroModel
+import numpy as np
+
+#: A rate of this size, rad/s, comes of a model whose values are too large to be computed with.
+_LARGEST = 1e300
+
+
+@dataclass(frozen=True)
+class Compensated:
+    """
+    Compensated samples: numbers, or arrays of shape (n,).
+
+    Attributes
+    ----------
+    modelled : rate after the model and before the self-calibration, rad/s; for self-calibrations
+    rate : rad/s
+    temperature : degC; the nearest plausible one where the one given is not plausible
+    temperature_clipped : the temperature is outside the calibrated range. Up to
+        `GyroModel.used_temperatures` the correction is extrapolated, beyond that it is held
+    beyond_range : the output is outside the calibrated range of rates, or not plausible, or no
+        rate explains it. Up to `GyroModel.rate_limit` the correction is extrapolated; beyond that,
+        and from where the response no longer grows with the rate, the last correction is held, so
+        that the rate is finite whatever the output
+
+    """
+
+    modelled: Number
+    rate: Number
+    temperature: Number
+    temperature_clipped: Number
+    beyond_range: Number
+
+
+def compensate(model: GyroModel, output: Number, temperature: Number | None = None,
+               surroundings: Channels | None = None) -> Compensated:
+    """
+    Compensate by model (Ojeda et al., eq. 13), then self-calibration (Hong and Park, eq. 3).
+
+    Parameters
+    ----------
+    output : rad/s, a number or shape (n,)
+    temperature : degC, alike; the model's reference temperature where it is None
+    surroundings : what else effects look at, from the `GyroModel.history` that followed the same
+        temperatures; needed where the model `looks_around`
+
+    """
+    given = model.reference_temperature if temperature is None else temperature
+    if not isinstance(output, np.ndarray):
+        return _of_one(model, output, given, surroundings)
+    return (_by_blocks(model, output, given) if surroundings is None
+            else _compensated(model, output, given, surroundings))
+
+
+def _of_one(model: GyroModel, output: float, given: float,
+            surroundings: Channels | None) -> Compensated:
+    """Compensate a sample that comes alone, with the same result as in a log."""
+    (low, high), (slowest, fastest), limit = (
+        model.used_temperatures, model.rate_range, model.rate_limit)
+    used, seen = min(max(given, low), high), min(max(output, -limit), limit)
+    coldest, hottest = model.valid_temperatures
+    modelled, unexplained = model.rate_in(Channels.of(seen, seen, used) if surroundings is None
+                                          else surroundings.moving(seen, seen))
+    if not -_LARGEST < modelled < _LARGEST:
+        modelled, unexplained = seen, True
+    rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
+    if seen != output:
+        modelled, rate, unexplained = modelled + (output - seen), rate + (output - seen), True
+    return Compensated(modelled, rate,
+                       given if used == given else clip(given, *model.temperature_limits),
+                       not coldest <= given <= hottest,
+                       unexplained or not slowest <= output <= fastest)
+
+
+def _compensated(model: GyroModel, output: Array, given: Number,
+                 surroundings: Channels | None = None) -> Compensated:
+    (slowest, fastest), limit = model.rate_range, model.rate_limit
+    # where all samples are inside, which two numbers show, no masks are made
+    beyond = _outside(output, max(slowest, -limit), min(fastest, limit))
+    seen = output if beyond is False else np.clip(output, -limit, limit)
+    clipped, used, plausible = _outside(given, *model.valid_temperatures), given, given
+    if clipped is not False:
+        used, plausible = (clip(given, *ends)
+                           for ends in (model.used_temperatures, model.temperature_limits))
+    with np.errstate(all='ignore'):
+        modelled, unexplained = model.rate_in(Channels(seen, seen, used) if surroundings is None
+                                              else surroundings.moving(seen, seen))
+        if not -_LARGEST < modelled.sum() < _LARGEST:
+            # the model itself cannot be computed there: nothing is corrected
+            computed = abs(modelled) < _LARGEST
+            modelled, unexplained = np.where(computed, modelled, seen), unexplained | ~computed
+    rate = modelled if model.self_calibration is None else model.self_calibration.correct(modelled)
+    if seen is not output:
+        modelled, rate = modelled + (output - seen), rate + (output - seen)
+    return Compensated(modelled, rate, plausible, clipped,
+                       beyond if unexplained is False else beyond | unexplained)
+
+
+def _outside(values: Number, low: float, high: float) -> Number:
+    """Return which values are outside of bounds; False where none is."""
+    if not isinstance(values, np.ndarray):
+        return not low <= values <= high
+    if len(values) and low <= values.min() and values.max() <= high:
+        return False
+    return (values < low) | (values > high)
+
+
+def _by_blocks(model: GyroModel, output: Array, given: Number) -> Compensated:
+    """Compensate what the cache holds at a time; only what is returned goes through memory."""
+    modelled, clipped, beyond = (
+        np.empty(len(output)), np.zeros(len(output), bool), np.zeros(len(output), bool))
+    rate = modelled if model.self_calibration is None else np.empty(len(output))
+    for begin in range(0, len(output), CACHED):
+        block = slice(begin, begin + CACHED)
+        part = _compensated(model, output[block],
+                            given[block] if isinstance(given, np.ndarray) else given)
+        modelled[block] = part.modelled
+        if part.temperature_clipped is not False:
+            clipped[block] = part.temperature_clipped
+        if part.beyond_range is not False:
+            beyond[block] = part.beyond_range
+        if rate is not modelled:
+            rate[block] = part.rate
+    plausible = clip(given, *model.temperature_limits) if clipped.any() else given
+    return Compensated(modelled, rate, plausible, clipped, beyond)
+
+
+def rate_sensitivity(model: GyroModel, output: Number, rate: Number, temperature: Number,
+                     surroundings: Channels | None = None) -> np.ndarray:
+    """
+    Return what the rate changes by for each uncertain value of the model, shape (m, ...).
+
+    First the fitted values of the model, if it has a covariance, then the `GyroModel.tolerated`
+    errors, then (s, b) of the self-calibration, if there is one; the order of `covariance`. The
+    rate of the model solves ``rate = output - error(rate)``, so that what a value adds to the
+    error is divided by the steepness there: 0.5 for a sine response at 60 degrees of its phase.
+    What cannot be undone is not compensated, and changes nothing.
+
+    """
+    calibration, rows = model.self_calibration, []
+    if model.covariance is not None or model.tolerated:
+        modelled = rate if calibration is None else (rate - calibration.offset) / calibration.scale
+        channels = (Channels(modelled, output, clip(temperature, *model.used_temperatures))
+                    if surroundings is None else surroundings.moving(modelled, output))
+        steepness = model.steepness(channels)
+        if model.covariance is not None:
+            rows = [0.0 if term.effect.undone else row / steepness
+                    for term in model.terms for row in term.sensitivity(channels)]
+        if model.tolerated:
+            faster, warmer = model.beyond(output, temperature)
+            sizes = {'bias': 1.0, 'scale_factor_error': modelled, 'bias_per_kelvin': warmer,
+                     'scale_factor_error_per_kelvin': warmer * modelled, 'per_rate': faster}
+            rows += [sizes[name] / steepness for name in model.tolerated]
+    if calibration is not None:
+        rows += [rate, 1.0]
+    if not isinstance(rate, np.ndarray):
+        return np.array(rows, dtype=float) * (-1.0 if calibration is None else -calibration.scale)
+    sensitivity = np.empty((len(rows), *rate.shape))
+    for index, row in enumerate(rows):
+        sensitivity[index] = row
+    return sensitivity * (-1.0 if calibration is None else -calibration.scale)
+
+
+def covariance(model: GyroModel) -> np.ndarray:
+    """
+    Return the covariance of the uncertain values of a model, shape (m, m); nan is not known.
+
+    The order is that of `rate_sensitivity`.
+
+    """
+    blocks = [] if model.covariance is None else [model.covariance]
+    if model.tolerated:
+        blocks.append(np.diag([getattr(model.tolerance, name) ** 2 for name in model.tolerated]))
+    if model.self_calibration is not None:
+        known = model.self_calibration.covariance
+        blocks.append(np.full((2, 2), np.nan) if known is None else np.array(known))
+    size = sum(map(len, blocks))
+    whole, start = np.zeros((size, size)), 0
+    for block in blocks:
+        whole[start:start + len(block), start:start + len(block)] = block
+        start += len(block)
+    return whole
+
+
+def quadratic_form(matrix: np.ndarray, vectors: np.ndarray) -> Number:
+    """Return v' M v for vectors of shape (m, ...)."""
+    return (vectors * (matrix @ vectors)).sum(axis=0)

@@ -1,0 +1,83 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What stands between the true rate and the output of a gyro: the one place of each formula.
+
+Simulation, calibration, diagnosis and compensation meet here. Most effects add
+``sum(columns(channels, *shapes) * values)`` to the output. Others change the signal itself, such
+as a delay, or rounding.
+
+Reading order, each imports only from those before it: `effect` (the records: channels, parameters,
+effects), `lag` (of first order), `steady` (of rate and temperature alone, as a rate table shows
+them), `polynomial` (of Ojeda, Chung and Borenstein), `thermal` (what temperatures of the past
+leave), `course` (of the time since power-on), `surroundings` (magnetic, mechanical, electrical),
+`signal` (what is done to the signal itself).
+
+"""
+
+from gyro_calibration.logs.log import Number
+from gyro_calibration.model.effects.course import BIAS_STEP, INTERFERENCE_TONE, RATE_RAMP, WARM_UP
+from gyro_calibration.model.effects.effect import Channels, Effect, Parameter
+from gyro_calibration.model.effects.polynomial import (
+    polynomial_from_matrix,
+    polynomial_to_matrix,
+    rate_temperature_polynomial,
+)
+from gyro_calibration.model.effects.signal import (
+    BANDWIDTH,
+    CLOCK_RATE,
+    DEAD_ZONE,
+    QUANTIZATION,
+    SATURATION,
+    TIME_OFFSET,
+)
+from gyro_calibration.model.effects.steady import (
+    BIAS,
+    BIAS_TEMPERATURE,
+    BIAS_TEMPERATURE_QUADRATIC,
+    CUBIC_NONLINEARITY,
+    QUADRATIC_NONLINEARITY,
+    SCALE_FACTOR_ASYMMETRY,
+    SCALE_FACTOR_ERROR,
+    SCALE_FACTOR_TEMPERATURE,
+    SINE_RESPONSE,
+)
+from gyro_calibration.model.effects.surroundings import (
+    ACCELERATION_SENSITIVITY,
+    HEADING_SENSITIVITY,
+    SUPPLY_SENSITIVITY,
+    VIBRATION_RECTIFICATION,
+)
+from gyro_calibration.model.effects.thermal import (
+    BIAS_TEMPERATURE_RATE,
+    THERMAL_HYSTERESIS,
+    THERMAL_LAG,
+)
+
+#: Those of rate and temperature alone, which dwells of a rate table can show.
+STEADY = {effect.name: effect for effect in (
+    BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY,
+    SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
+#: All that a model may hold, beside the polynomial.
+CATALOGUE = STEADY | {effect.name: effect for effect in (
+    BIAS_TEMPERATURE_RATE, THERMAL_LAG, THERMAL_HYSTERESIS, WARM_UP, RATE_RAMP, BIAS_STEP,
+    HEADING_SENSITIVITY, ACCELERATION_SENSITIVITY, VIBRATION_RECTIFICATION, SUPPLY_SENSITIVITY,
+    INTERFERENCE_TONE, BANDWIDTH, TIME_OFFSET, CLOCK_RATE, DEAD_ZONE, SATURATION, QUANTIZATION)}
+
+__all__ = [
+    'ACCELERATION_SENSITIVITY', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE',
+    'BIAS_TEMPERATURE_QUADRATIC', 'BIAS_TEMPERATURE_RATE', 'CATALOGUE', 'CLOCK_RATE',
+    'CUBIC_NONLINEARITY', 'DEAD_ZONE', 'HEADING_SENSITIVITY', 'INTERFERENCE_TONE',
+    'QUADRATIC_NONLINEARITY', 'QUANTIZATION', 'RATE_RAMP', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY',
+    'SCALE_FACTOR_ERROR', 'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STEADY',
+    'SUPPLY_SENSITIVITY', 'THERMAL_HYSTERESIS', 'THERMAL_LAG', 'TIME_OFFSET',
+    'VIBRATION_RECTIFICATION', 'WARM_UP', 'Channels', 'Effect', 'Number', 'Parameter',
+    'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']

@@ -1,0 +1,486 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""A gyro's model: its effects with values and their covariance, and the last self-calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+import math
+from typing import Any
+
+from gyro_calibration.logs.log import Array, DEGREE, Mask
+from gyro_calibration.model.channels import clip, History
+from gyro_calibration.model.effects import Channels, Effect, Number
+from gyro_calibration.model.noise import Noise
+import numpy as np
+
+#: Largest plausible output, rad/s, where no valid range of rates is stated. Where one is: so many
+#: times its farther end, but at least what robots reach, for a model may have been fitted at rest.
+_FASTEST, _MARGIN, _REACHED = 100.0, 2.0, 10.0
+#: Plausible temperatures, degC, where no valid range is stated.
+_TEMPERATURES = (-100.0, 200.0)
+#: A correction is extrapolated over the width of the valid temperatures, K, and at least over so
+#: much, which is what a robot warms up by after a cold start; from there on it is held.
+_EXTRAPOLATED = 20.0
+#: The response is inverted where the output grows by at least so much with the rate, 1.
+_FLATTEST = 0.1
+#: Numbers of Python overflow without a word, and to say so for each sample would take time.
+_AS_IT_IS = nullcontext()
+#: Largest last step of the repetition for a solution, as a part of 1 rad/s plus the rate; the
+#: error is far smaller.
+_SETTLED = 1e-10
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect of a model with the values of its parameters, shapes first."""
+
+    effect: Effect
+    values: tuple[float, ...]
+
+    def columns(self, channels: Channels) -> Sequence[Number]:
+        """Return one column a coefficient."""
+        return self.effect.columns(channels, *self.values[:len(self.effect.shapes)])
+
+    def error(self, channels: Channels) -> Number:
+        """Return what the effect adds to the output, rad/s."""
+        return self.adding(channels)
+
+    @cached_property
+    def adding(self) -> Callable[[Channels], Number]:
+        """Return the function of the channels that gives the error of the effect, rad/s."""
+        return self.effect.adding(self.values)
+
+    @cached_property
+    def fitted(self) -> tuple[int, ...]:
+        """Return the places of the values that a fit finds: parameters without a default."""
+        return tuple(place for place, parameter in enumerate(self.effect.parameters)
+                     if parameter.default is None)
+
+    def sensitivity(self, channels: Channels) -> list[Number]:
+        """Return the derivative of the error for each fitted value; 0 where nothing is added."""
+        columns, shapes = self.columns(channels), len(self.effect.shapes)
+        return [self._derivative(place, channels) if place < shapes else columns[place - shapes]
+                for place in self.fitted]
+
+    def _derivative(self, place: int, channels: Channels) -> Number:
+        step = 1e-5 * abs(self.values[place]) or 1e-9
+        below, above = (replace(self, values=(*self.values[:place], self.values[place] + change,
+                                              *self.values[place + 1:]))
+                        for change in (-step, step))
+        return (above.error(channels) - below.error(channels)) / (2.0 * step)
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """
+    Scale factor error s and bias b that a run found behind the model (Hong and Park, eq. 1 to 3).
+
+    Attributes
+    ----------
+    scale_factor_error : s, 1
+    bias : b, rad/s
+    covariance : of (s, b), shape (2, 2); None where it is not known
+    time : when, ISO 8601
+    temperature : at which, degC; None where it was not known
+    method : likelihood, heading, rate, turns or rest
+
+    """
+
+    scale_factor_error: float = 0.0
+    bias: float = 0.0
+    covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
+    time: str = ''
+    temperature: float | None = None
+    method: str = ''
+
+    @property
+    def scale(self) -> float:
+        """Return s̄ = 1 / (1 + s) of eq. 3."""
+        return 1.0 / (1.0 + self.scale_factor_error)
+
+    @property
+    def offset(self) -> float:
+        """Return b̄ = -b / (1 + s) of eq. 3, rad/s."""
+        return -self.bias * self.scale
+
+    @property
+    def standard_deviations(self) -> tuple[float, float]:
+        """Return those of s and b, 1 and rad/s; nan where they are not known."""
+        if self.covariance is None:
+            return math.nan, math.nan
+        return math.sqrt(self.covariance[0][0]), math.sqrt(self.covariance[1][1])
+
+    def correct(self, rate: Number) -> Number:
+        """Return the rate, rad/s, from one that the model has compensated (eq. 3)."""
+        return self.scale * rate + self.offset
+
+    def figures(self) -> dict[str, Any]:
+        """Return what there is to know, by name, in SI; None for what is not known."""
+        scale_deviation, bias_deviation = (None if math.isnan(value) else value
+                                           for value in self.standard_deviations)
+        return {'scale_factor_error': self.scale_factor_error,
+                'scale_factor_error_standard_deviation': scale_deviation,
+                'bias': self.bias, 'bias_standard_deviation': bias_deviation,
+                's_bar': self.scale, 'b_bar': self.offset, 'calibration_time': self.time,
+                'calibration_temperature': self.temperature, 'method': self.method}
+
+    def __str__(self) -> str:
+        """Return a sentence for people."""
+        known = self.covariance is not None
+        scale, bias = (f' +- {deviation:.{digits}f}' if known else '' for deviation, digits in zip(
+            (100 * self.standard_deviations[0], self.standard_deviations[1] / DEGREE), (3, 4)))
+        temperature = '' if self.temperature is None else f' at {self.temperature:.1f} degC'
+        return (f'scale factor error {100 * self.scale_factor_error:.3f}{scale} %, '
+                f'bias {self.bias / DEGREE:.4f}{bias} deg/s '
+                f'(s_bar {self.scale:.6f}, b_bar {self.offset:.6f} rad/s){temperature}')
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """
+    What a rate may be off by beside the covariance of the values: standard deviations.
+
+    Attributes
+    ----------
+    bias, scale_factor_error : their change from one run to the next, rad/s and 1; a
+        self-calibration finds these, and they do not count where there is one
+    bias_per_kelvin, scale_factor_error_per_kelvin : for each K beyond the temperatures that were
+        seen, rad/s/K and 1/K
+    per_rate : error of the rate for each rad/s of the output beyond those that were seen, 1
+
+    """
+
+    bias: float = 0.0
+    scale_factor_error: float = 0.0
+    bias_per_kelvin: float = 0.0
+    scale_factor_error_per_kelvin: float = 0.0
+    per_rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class GyroModel:
+    """
+    What is known of one gyro.
+
+    Attributes
+    ----------
+    terms : its effects
+    covariance : of all fitted values in the order of the terms, shape (m, m); None if unknown
+    rate_range, temperature_range : what the values were fitted on, rad/s and degC
+    noise : its noise figures
+    noise_bounds : by name of a noise figure, the bounds that hold it with 95 % confidence
+    gyro : name, serial_number, technology, as text
+    origin : files, date and program that it comes from
+    self_calibration : the last one
+    tolerance : what a rate may be off by beside the covariance
+
+    """
+
+    terms: tuple[Term, ...] = ()
+    covariance: Array | None = None
+    rate_range: tuple[float, float] = (-math.inf, math.inf)
+    temperature_range: tuple[float, float] = (-math.inf, math.inf)
+    reference_temperature: float = 25.0
+    noise: Noise = Noise()
+    gyro: Mapping[str, str] = field(default_factory=dict)
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    self_calibration: SelfCalibration | None = None
+    tolerance: Tolerance = Tolerance()
+    noise_bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def error(self, channels: Channels) -> Number:
+        """Return the sum of all effects, rad/s."""
+        return _sum(self.terms, channels)
+
+    def steepness(self, channels: Channels) -> Number:
+        """Return the derivative of rate plus error by the rate, 1; at least 0.1 (see `rate`)."""
+        sought = self._parted_by_rate[1]
+        if not sought:
+            return 1.0
+        # rad/s; small beside what bends an effect, and large beside the rounding of its error
+        step = 1e-5
+        below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output))
+                        for change in (-step, step))
+        return np.maximum(1.0 + (above - below) / (2.0 * step), _FLATTEST)
+
+    @cached_property
+    def rate_limit(self) -> float:
+        """Return the largest plausible output, rad/s; this gyro reports no sample beyond it."""
+        farther = max(map(abs, self.rate_range))
+        return max(_MARGIN * farther, _REACHED) if farther < math.inf else _FASTEST
+
+    @cached_property
+    def temperature_limits(self) -> tuple[float, float]:
+        """Return plausible temperatures, degC: usual ones, and three times the valid range."""
+        low, high = self.valid_temperatures
+        return min(2.0 * low - high, _TEMPERATURES[0]), max(2.0 * high - low, _TEMPERATURES[1])
+
+    @cached_property
+    def valid_temperatures(self) -> tuple[float, float]:
+        """Return the temperatures, degC, that were seen; plausible ones where none is stated."""
+        low, high = ((value if math.isfinite(value) else usual)
+                     for value, usual in zip(self.temperature_range, _TEMPERATURES))
+        return low, max(low, high)
+
+    @cached_property
+    def used_temperatures(self) -> tuple[float, float]:
+        """Return the temperatures, degC, up to which the correction is extrapolated."""
+        (low, high), (coldest, hottest) = self.valid_temperatures, self.temperature_limits
+        reach = max(high - low, _EXTRAPOLATED)
+        return max(low - reach, coldest), min(high + reach, hottest)
+
+    @cached_property
+    def tolerated(self) -> tuple[str, ...]:
+        """Return the names of the tolerances that count."""
+        found = ('bias', 'scale_factor_error') if self.self_calibration else ()
+        return tuple(name for name, value in vars(self.tolerance).items()
+                     if value > 0.0 and name not in found)
+
+    def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
+        """
+        Return how far outputs and temperatures are outside of those that were seen, rad/s and K.
+
+        A temperature at which the gyro was self-calibrated was seen.
+
+        """
+        low, high = self.valid_temperatures
+        known = self.self_calibration.temperature if self.self_calibration else None
+        if known is not None:
+            low, high = min(low, known), max(high, known)
+        return output - clip(output, *self.rate_range), temperature - clip(temperature, low, high)
+
+    @cached_property
+    def rate_domain(self) -> tuple[float, float]:
+        """
+        Return the rates between which the response is inverted, rad/s.
+
+        From the valid rate nearest to zero they reach as far as the output grows with the rate at
+        all temperatures that are used, and to no rate whose output would not be plausible.
+
+        """
+        low, high = self.rate_range
+        centre = min(max(0.0, low), high)
+        down, up = (self._monotone(centre, side) for side in (-1.0, 1.0))
+        return centre - down, centre + up
+
+    def _monotone(self, centre: float, side: float) -> float:
+        """Return how far from a rate to one side the output grows with the rate, rad/s."""
+        _, sought = self._parted_by_rate
+        low, high = self.used_temperatures
+        distances = self.rate_limit / _FLATTEST * np.geomspace(1e-6, 1.0, 160)
+
+        def grows(begin: Array, end: Array) -> Mask:
+            ends = [[rate + _sum(sought, Channels(rate, rate, temperature))
+                     for rate in (centre + side * begin, centre + side * end)]
+                    for temperature in (low, high)]
+            return np.all([side * (after - before) >= _FLATTEST * (end - begin)
+                           for before, after in ends], axis=0)
+
+        with np.errstate(all='ignore'):
+            steps = np.concatenate([[0.0], distances])
+            good = grows(steps[:-1], steps[1:]) & grows((1.0 - 1e-6) * distances, distances)
+            if good.all():
+                return float(distances[-1])
+            first = int(np.argmin(good))
+            # the bend lies between two of these steps
+            near, far = (np.array([steps[first + place]]) for place in (0, 1))
+            for _ in range(50):
+                middle = 0.5 * (near + far)
+                near, far = ((middle, far) if grows((1.0 - 1e-6) * middle, middle).all()
+                             else (near, middle))
+        return float(near[0])
+
+    def looks_at(self, channel: str) -> bool:
+        """Tell whether an effect uses the channel."""
+        return any(channel in term.effect.looks_at for term in self.terms)
+
+    @cached_property
+    def looks_around(self) -> bool:
+        """Tell whether an effect needs a history: more than rate, output and temperature now."""
+        return any(term.effect.looks_at - {'rate', 'output', 'temperature'} for term in self.terms)
+
+    @cached_property
+    def moves_stamps(self) -> bool:
+        """Tell whether samples were taken at another time than their stamps say."""
+        return any(term.effect.moved is not None for term in self.terms)
+
+    def history(self) -> History:
+        """Return a history that begins now, of the temperatures that the model uses."""
+        return History(self.reference_temperature, *self.used_temperatures)
+
+    def output(self, rate: Number, temperature: Number) -> Number:
+        """
+        Return the output, rad/s, that solves ``output = rate + error(rate, output, temperature)``.
+
+        It has no noise.
+
+        """
+        return self.output_in(Channels(rate, rate, temperature))
+
+    def output_in(self, channels: Channels) -> Number:
+        """Return the output, rad/s, without noise, at the rate and surroundings of channels."""
+        rate, (known, sought) = channels.rate, self._parted_by_output
+        given = rate + _sum(known, channels)
+        return (_repeated(lambda output: given + _sum(sought, channels.moving(rate, output)),
+                          rate)[0] if sought else given)
+
+    def rate(self, output: Number, temperature: Number) -> Number:
+        """
+        Return the rate, rad/s, that solves ``rate = output - error(rate, output, temperature)``.
+
+        Effects that cannot be undone stay in it.
+
+        """
+        return self.rate_in(Channels(output, output, temperature))[0]
+
+    def rate_in(self, channels: Channels) -> tuple[Number, Number]:
+        """
+        Return the rate, rad/s, at the output and the surroundings of channels.
+
+        Their rate does not matter. Also tell whether no rate of the `rate_domain` has this output;
+        the correction at the end of the domain is held there.
+
+        """
+        output, (known, sought) = channels.output, self._parted_by_rate
+        given = output - _sum(known, channels)
+        if not sought:
+            return given, False
+        seen = channels.moving(output, output)
+
+        def added(rate: Number) -> Number:
+            # only here is it known, and new channels would take as long as the computation
+            seen.__dict__['rate'] = rate
+            return _sum(sought, seen)
+
+        return _inverse(added, given, output, self.rate_domain)
+
+    def distorted(self, stage: str, signal: Array, time: Array) -> Array:
+        """Return a whole log's signal after the effects that change it at 'rate' or 'output'."""
+        for term in self.terms:
+            if term.effect.distortion is not None and term.effect.stage == stage:
+                signal = term.effect.distortion(signal, time, *term.values)
+        return signal
+
+    def true_time(self, time: Number) -> Number:
+        """Return when a sample with a stamp of `time` was taken, both in s since power-on."""
+        # the inverse order of `distorted`: the last effect changed a signal that was moved already
+        for term in reversed(self.terms):
+            if term.effect.moved is not None:
+                time = term.effect.moved(time, *term.values)
+        return time
+
+    @cached_property
+    def _parted_by_output(self) -> Parted:
+        return _parted(self.terms, 'output')
+
+    @cached_property
+    def _parted_by_rate(self) -> Parted:
+        return _parted([term for term in self.terms if not term.effect.undone], 'rate')
+
+
+#: Effects that do not look at what is sought, which need no repetition to solve for it; others.
+Parted = tuple[list[Term], list[Term]]
+
+
+def _parted(terms: Sequence[Term], channel: str) -> Parted:
+    known = [term for term in terms if channel not in term.effect.looks_at]
+    return known, [term for term in terms if channel in term.effect.looks_at]
+
+
+def _sum(terms: Sequence[Term], channels: Channels) -> Number:
+    if not terms:
+        return 0.0
+    total = terms[0].adding(channels)
+    for term in terms[1:]:
+        total = total + term.adding(channels)
+    return total
+
+
+def _repeated(g: Callable[[Number], Number], start: Number, low: float = -math.inf,
+              high: float = math.inf) -> tuple[Number, Number]:
+    """
+    Solve x = g(x) for a slope of g well below one; return x, and the last step.
+
+    The plain repetition wins a factor of the slope a pass; along the secant each pass wins more
+    than the one before, and a constant slope is solved at once. The number of passes is fixed, so
+    that a sample and a whole log take the same steps. A single sample skips those that would
+    change nothing, and is held at the bounds.
+
+    """
+    a, b = start, g(start)
+    many, g_a, step = isinstance(b, np.ndarray), b, b - a
+    for _ in range(6):
+        g_b = g(b)
+        if not many and g_b == b:
+            return b, 0.0
+        slope = (g_b - g_a) / (step + (step == 0.0))
+        slope = slope * (slope < 0.9)
+        a, g_a, b = b, g_b, b + (g_b - b) / (1.0 - slope)
+        if not many:
+            b = min(max(b, low), high)
+        step = b - a
+    return b, step
+
+
+def _inverse(added: Callable[[Number], Number], given: Number, start: Number,
+             domain: tuple[float, float]) -> tuple[Number, Number]:
+    """
+    Solve ``rate + added(rate) = given`` in a domain where the left side grows with the rate.
+
+    Parameters
+    ----------
+    added : rate -> what is added to it, rad/s
+    given : rad/s, a number or shape (n,)
+    start : where to begin, rad/s, alike
+    domain : lowest and highest rate, rad/s
+
+    Returns
+    -------
+    the rate, and whether there is none in the domain: the correction at its nearer end is used
+    there
+
+    """
+    low, high = domain
+    many = isinstance(given, np.ndarray)
+    with np.errstate(all='ignore') if many else _AS_IT_IS:
+        # a single sample may step out of the domain and back, but only as far as can be computed
+        rate, step = _repeated(lambda x: given - added(x), start, low - 1.0, high + 1.0)
+        solved = (low <= rate) & (rate <= high) & (abs(step) <= _SETTLED * (1.0 + abs(rate)))
+    if solved.all() if many else solved:
+        return rate, False
+    with np.errstate(all='ignore'):
+        at_low, at_high = added(low), added(high)
+        below, above = given < low + at_low, given > high + at_high
+        if not np.all(solved | below | above):
+            begin, end = low + 0.0 * given, high + 0.0 * given
+            for _ in range(80):
+                middle = 0.5 * (begin + end)
+                higher = middle + added(middle) < given
+                begin, end = np.where(higher, middle, begin), np.where(higher, end, middle)
+            rate = np.where(solved, rate, begin)
+        rate = np.where(below, given - at_low, np.where(above, given - at_high, rate))
+    return (rate, below | above) if many else (float(rate), bool(below or above))
+
+
+def with_self_calibration(model: GyroModel, calibration: SelfCalibration | None) -> GyroModel:
+    """Return the model with another self-calibration."""
+    return replace(model, self_calibration=calibration)
+
+
+def same_effects(model: GyroModel, other: GyroModel) -> bool:
+    """Tell whether two models compensate alike, so that a self-calibration holds for both."""
+    first, second = ([(term.effect.name, term.values) for term in each.terms]
+                     for each in (model, other))
+    return first == second

@@ -1,0 +1,183 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""A known motion about one axis: the profile of a calibration, or the drive of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import csv
+from dataclasses import dataclass
+import io
+import math
+from pathlib import Path
+
+from gyro_calibration.files import InputError, LARGEST, read_bytes, reason
+from gyro_calibration.logs.log import Array, DEGREE, SHORTEST, shown
+import numpy as np
+
+#: Bytes of a motion profile: an hour at 100 Hz has half of it.
+BYTES = 16_000_000
+
+
+class MotionError(InputError):
+    """A file is not a motion profile; the message names file and column."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    A motion, known at some times.
+
+    Between them the rate is linear where the rates are known, and the heading is linear where only
+    headings are known.
+
+    Attributes
+    ----------
+    time : s, increasing, shape (n,), beginning at 0
+    heading : rad, continuous, shape (n,), beginning at 0
+    rate : rad/s, shape (n,); None where the motion was given by its heading
+
+    """
+
+    time: Array
+    heading: Array
+    rate: Array | None = None
+
+    @property
+    def duration(self) -> float:
+        """Return the length, s."""
+        return float(self.time[-1])
+
+    def heading_at(self, time: Array) -> Array:
+        """Return the heading, rad, at any times; before and after, the motion stands."""
+        time = np.clip(time, 0.0, self.duration)
+        if self.rate is None:
+            return np.interp(time, self.time, self.heading)
+        index = np.clip(np.searchsorted(self.time, time, side='right') - 1, 0, len(self.time) - 2)
+        since = time - self.time[index]
+        slope = (np.diff(self.rate) / np.diff(self.time))[index]
+        return self.heading[index] + since * (self.rate[index] + 0.5 * slope * since)
+
+    def rate_at(self, time: Array) -> Array:
+        """Return the rate, rad/s, at any times; before and after it is 0."""
+        rate = np.gradient(self.heading, self.time) if self.rate is None else self.rate
+        return np.interp(time, self.time, rate, left=0.0, right=0.0)
+
+
+def from_rates(time: Array, rate: Array) -> Motion:
+    """Return the motion whose rate, rad/s, is linear between the given times, s."""
+    heading = np.concatenate([[0.0], np.cumsum(np.diff(time) * (rate[1:] + rate[:-1]) / 2.0)])
+    return Motion(np.asarray(time, float) - time[0], heading, np.asarray(rate, float))
+
+
+def from_headings(time: Array, heading: Array) -> Motion:
+    """Return the motion through the given headings, rad, at the given times, s."""
+    return Motion(np.asarray(time, float) - time[0], np.asarray(heading, float) - heading[0])
+
+
+def turns(rates: list[tuple[float, float]], ramp: float = 0.5) -> Motion:
+    """
+    Return a motion of constant rates.
+
+    Parameters
+    ----------
+    rates : (duration s, rate deg/s) of each stretch; the ramp to its rate is at its beginning
+    ramp : s
+
+    """
+    time, rate = [0.0], [0.0]
+    for duration, value in rates:
+        start = time[-1]
+        time += [start + ramp, start + duration]
+        rate += [value * DEGREE] * 2
+    return from_rates(np.array(time), np.array(rate))
+
+
+#: 20 s that separate scale factor error from bias: both signs, two speeds, rests, gentle ramps,
+#: and back to the first heading.
+CALIBRATION = turns([(1, 0), (4, 45), (1, 0), (4, -45), (1, 0), (3.5, 30), (1, 0), (3.5, -30),
+                     (1, 0)])
+#: 160 s of a robot on its way through rooms, half of it standing or going straight.
+ROBOT = turns([(10, 0), (6.5, 15), (6, 0), (6.5, -15), (8, 0), (9.5, -10), (6, 0), (9.5, 10),
+               (6, 0), (5, 20), (8, 0), (5, -20), (7, 0), (5, -20), (8, 0), (5, 20), (7, 0),
+               (9.5, 10), (6, 0), (9.5, -10), (8, 0), (9, 0)])
+NAMED = {
+    'calibration': CALIBRATION,
+    'robot': ROBOT,
+    'rest': from_rates(np.array([0.0, 60.0]), np.zeros(2)),
+}
+
+_WORDS = {'heading_deg': DEGREE, 'heading_rad': 1.0, 'reference_heading_deg': DEGREE,
+          'reference_heading_rad': 1.0, 'rate_dps': DEGREE, 'rate_rad_s': 1.0,
+          'reference_rate_dps': DEGREE, 'reference_rate_rad_s': 1.0}
+
+
+def read_motion(path: str | Path) -> Motion:
+    """
+    Read a motion profile from a CSV file.
+
+    It has time_s and one of heading_deg, heading_rad, rate_dps, rate_rad_s. The reference of a log
+    is a profile too: its heading where it has both, and without the rows where it was lost.
+
+    Raises
+    ------
+    MotionError : the file cannot be read, has other columns, a value that is not a finite number,
+        or times that do not increase
+
+    """
+    try:
+        rows = csv.reader(line for line in _lines(path)
+                          if line.strip() and not line.startswith('#'))
+        header = [name.strip() for name in next(rows, [])]
+        name = _moving_column(path, header)
+        columns = {each: header.index(each) for each in ('time_s', name)}
+        time, values = np.fromiter(_numbers(path, rows, columns), dtype=float).reshape(-1, 2).T
+    except MotionError:
+        raise
+    except (OSError, ValueError, csv.Error) as error:
+        raise MotionError(f'{path}: cannot be read as a motion profile ({reason(error)}); '
+                          'wanted a CSV file with time_s and heading_deg') from error
+    known = np.isfinite(values)
+    time, values = time[known], values[known] * _WORDS[name]
+    if len(time) < 2 or not (np.diff(time) >= SHORTEST).all():
+        raise MotionError(f'{path}: time_s must increase over at least two rows; sort the rows')
+    return from_rates(time, values) if 'rate' in name else from_headings(time, values)
+
+
+def _moving_column(path: str | Path, header: list[str]) -> str:
+    """Return the name of the column that holds the motion."""
+    found = [name for name in _WORDS if name in header]
+    both = (len(found) == 2 and found[0].startswith('reference_heading')
+            and found[1].startswith('reference_rate'))
+    if 'time_s' not in header or not (len(found) == 1 or both):
+        given = shown(','.join(header)) or 'nothing'
+        raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
+                          'heading_deg, heading_rad, rate_dps, rate_rad_s')
+    return found[0]
+
+
+def _lines(path: str | Path) -> io.StringIO:
+    return io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
+
+
+def _numbers(path: str | Path, rows: Iterable[list[str]],
+             columns: dict[str, int]) -> Iterator[float]:
+    """Give time and value of one row after the other, nan where a reference was lost."""
+    for row in rows:
+        for name, place in columns.items():
+            try:
+                value = float(row[place])
+            except (IndexError, ValueError):
+                value = math.inf
+            if not (abs(value) <= LARGEST or math.isnan(value) and name.startswith('reference_')):
+                raise MotionError(f'{path}: column {name} holds something that is not a finite '
+                                  'number; mend or remove the row')
+            yield value

@@ -1,0 +1,137 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Noise of a gyro after IEEE Std 952: angle random walk, bias instability, rate random walk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.logs.log import Array, Number
+import numpy as np
+from scipy.signal import oaconvolve
+
+#: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
+ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
+#: A bias is known as the mean over so long, s, as a self-calibration takes.
+CALIBRATED = 20.0
+#: Time constants, s, a factor of 10 apart, of the processes that stand for flicker from a second
+#: to some hours.
+_FLICKER = np.array([3.0, 30.0, 300.0, 3000.0])
+
+
+@dataclass(frozen=True)
+class Noise:
+    """
+    The noise figures of a gyro.
+
+    Attributes
+    ----------
+    angle_random_walk : N, rad/√s; 0 says that it is not known
+    bias_instability : B, rad/s, so that the floor of the Allan deviation is 0.664 B
+    rate_random_walk : K, rad/s/√s
+
+    """
+
+    angle_random_walk: float = 0.0
+    bias_instability: float = 0.0
+    rate_random_walk: float = 0.0
+
+    def rate_variance(self, interval: float) -> float:
+        """Return the variance of one sample, (rad/s)², that comes every `interval` s."""
+        return self.angle_random_walk ** 2 / interval
+
+    @property
+    def floor(self) -> float:
+        """Return the floor of the Allan deviation that the flicker makes, rad/s."""
+        return ALLAN_FLOOR * self.bias_instability
+
+    def allan_variance(self, duration: Number) -> Number:
+        """Return the Allan variance at an averaging time of `duration` s, (rad/s)²."""
+        return (self.angle_random_walk ** 2 / duration + self.floor ** 2
+                + self.rate_random_walk ** 2 * duration / 3.0)
+
+    def wander(self, age: Number, duration: float) -> Number:
+        """
+        Return the variance of the change of a mean over `duration` s after `age` s, (rad/s)².
+
+        White noise is not included. Flicker of spectrum B² / (2 pi f), on both sides of zero, has
+        the generalized covariance -B² / pi log|t|. For means over T that are a time t apart that
+        gives 2 B² / pi (log(t / T) + 3/2), for t far above T.
+
+        """
+        flicker = 2.0 / math.pi * self.bias_instability ** 2 * (
+            np.log(np.maximum(age / duration, 1.0)) + 1.5)
+        return flicker + self.rate_random_walk ** 2 * np.maximum(age, duration)
+
+    def flicker(self) -> tuple[Array, float]:
+        """
+        Return time constants, s, and variance, (rad/s)², of k Gauss-Markov processes for flicker.
+
+        The constants have shape (k,); all processes have the same variance. With time constants a
+        factor r apart, and B² ln(r) / pi each, the spectrum between them is B² / (2 pi f) on both
+        sides of zero.
+
+        """
+        constants = _FLICKER if self.bias_instability else _FLICKER[:0]
+        return constants, self.bias_instability ** 2 * math.log(10.0) / math.pi
+
+    def drift_variance(self, duration: Number) -> Number:
+        """
+        Return the variance, rad², of a heading after `duration` s without white noise.
+
+        The bias is known as its mean over the `CALIBRATED` s before.
+
+        """
+        variance = self.rate_random_walk ** 2 * (duration ** 3 + CALIBRATED * duration ** 2) / 3.0
+        constants, of_each = self.flicker()
+        for constant in constants:
+            within, shared = known_mean(constant)
+            gone = constant * (1.0 - np.exp(-duration / constant))
+            variance = variance + of_each * (2.0 * constant * (duration - gone)
+                                             + duration ** 2 * within
+                                             - 2.0 * duration * gone * shared)
+        return variance
+
+    def heading_variance(self, duration: Number) -> Number:
+        """Return the variance, rad², of a heading as in `drift_variance`, with white noise."""
+        return self.angle_random_walk ** 2 * duration + self.drift_variance(duration)
+
+
+def known_mean(constant: Number) -> tuple[Number, Number]:
+    """
+    Return the variance of the mean of a process over `CALIBRATED` s, and the covariance after.
+
+    The process is a Gauss-Markov process of unit variance; the covariance is that of the mean with
+    the value after.
+
+    """
+    ratio = CALIBRATED / constant
+    gone = 1.0 - np.exp(-ratio)
+    return 2.0 * (ratio - gone) / ratio ** 2, gone / ratio
+
+
+def simulate_noise(noise: Noise, count: int, interval: float,
+                   generator: np.random.Generator) -> Array:
+    """
+    Return noise of shape (count,), rad/s, for samples every `interval` s.
+
+    Flicker is white noise through the half-integrator of Kasdin (1995), eq. 116; its spectrum is
+    B² / (2 pi f).
+
+    """
+    white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
+    innovations = generator.standard_normal(count) * noise.bias_instability
+    response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))
+    flicker = oaconvolve(innovations, response)[:count] if noise.bias_instability else innovations
+    walk = (np.cumsum(generator.standard_normal(count))
+            * noise.rate_random_walk * math.sqrt(interval))
+    return white + flicker + walk

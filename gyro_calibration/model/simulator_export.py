@@ -1,0 +1,266 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The part of a gyro model that robot simulators can hold, in their own formats.
+
+Gazebo reads the noise of an `<imu>` from SDF, Isaac Lab from a Python configuration, MuJoCo from
+a `<gyro>` sensor. Each holds a few figures; what it cannot hold is listed, so that nobody takes
+the simulated gyro for the modelled one.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from xml.sax.saxutils import escape
+
+from gyro_calibration.logs.log import Array
+from gyro_calibration.model.effects import Channels
+from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
+import numpy as np
+from scipy.optimize import minimize
+
+#: Below this step, rad/s, Gazebo does not quantize.
+_FINEST_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """
+    A first-order Gauss-Markov process.
+
+    Attributes
+    ----------
+    density : of the white noise that drives it, rad/s/√s
+    correlation_time : s
+
+    """
+
+    density: float
+    correlation_time: float
+
+    def allan_variance(self, duration: Array) -> Array:
+        """Return the Allan variance at averaging times, s, of shape (n,) (IEEE 952, C.21)."""
+        ratio = duration / self.correlation_time
+        # the difference of the exponentials loses all digits where the ratio is small
+        series = ratio ** 3 * (2.0 / 3.0 - ratio / 2.0)
+        bracket = 2.0 * ratio + 4.0 * np.expm1(-ratio) - np.expm1(-2.0 * ratio)
+        bracket = np.where(ratio < 1e-3, series, bracket)
+        return self.density ** 2 * self.correlation_time * bracket / (2.0 * ratio ** 2)
+
+
+def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:
+    """
+    Return the process that comes nearest to bias instability and rate random walk.
+
+    The logarithms of the Allan variances, angle random walk included, are compared at one
+    averaging time an octave.
+
+    Parameters
+    ----------
+    noise : noise figures of the gyro
+    interval : between samples, s
+    span : the longest averaging time, s
+
+    Returns
+    -------
+    the process, of density 0 where there is neither; and the largest error of the Allan deviation
+    from one sample to the span, as a ratio, 1
+
+    """
+    floor, walk = noise.bias_instability, noise.rate_random_walk
+    if not floor and not walk:
+        return GaussMarkov(0.0, span), 0.0
+    octaves = interval * 2.0 ** np.arange(math.floor(math.log2(span / interval)) + 1)
+    wanted = noise.allan_variance(octaves)
+    white = noise.angle_random_walk ** 2 / octaves
+
+    def process(logarithms: Array) -> GaussMarkov:
+        return GaussMarkov(*np.exp(logarithms).tolist())
+
+    def errors(logarithms: Array) -> Array:
+        return np.log((white + process(logarithms).allan_variance(octaves)) / wanted)
+
+    longest = math.log(100.0 * span)  # from there on it is a random walk over the span
+    begins = [np.array([math.log(walk + floor / math.sqrt(time)), math.log(time)])
+              for time in np.geomspace(span / 100.0, span, 5)]
+    found = min((minimize(lambda x: float(np.mean(errors(x) ** 2)), begin, method='Nelder-Mead',
+                          bounds=((None, None), (math.log(interval), longest)))
+                 for begin in begins), key=lambda each: float(each.fun))
+    return process(found.x), float(np.expm1(0.5 * np.abs(errors(found.x)).max()))
+
+
+@dataclass(frozen=True)
+class Figures:
+    """
+    What simulators hold of a gyro.
+
+    Attributes
+    ----------
+    bias, bias_deviation : output at rest and its standard deviation, rad/s
+    white_noise : standard deviation of a sample, rad/s
+    wander : of the bias
+    saturation, quantization, time_offset : rad/s, rad/s, s; 0 where there is none
+    interval : between samples, s
+
+    """
+
+    bias: float
+    bias_deviation: float
+    white_noise: float
+    wander: GaussMarkov
+    saturation: float
+    quantization: float
+    time_offset: float
+    interval: float
+
+
+def figures(model: GyroModel, sample_rate: float, temperature: float,
+            span: float) -> tuple[Figures, float]:
+    """
+    Return what simulators hold of a model.
+
+    Parameters
+    ----------
+    model : with its last self-calibration
+    sample_rate : of the simulated gyro, Hz
+    temperature : at which it works, degC
+    span : how long its heading is looked at, s; the wander is made right up to it
+
+    Returns
+    -------
+    the figures, and the largest error of the Allan deviation by the wander, 1
+
+    """
+    interval = 1.0 / sample_rate
+    run = model.self_calibration
+    begin = run.bias if run else 0.0
+    still = {'rate', 'output', 'temperature'}
+    terms = [term for term in model.terms if term.effect.looks_at <= still]
+    channels = Channels(begin, begin, temperature)
+    bias = begin + sum(float(term.error(channels)) for term in terms)
+    deviation = run.standard_deviations[1] if run else math.nan
+    values = {term.effect.name: term.values[0] for term in model.terms}
+    wander, error = gauss_markov(model.noise, interval, span)
+    return Figures(bias, 0.0 if math.isnan(deviation) else deviation,
+                   math.sqrt(model.noise.rate_variance(interval)), wander,
+                   values.get('saturation', 0.0), values.get('quantization', 0.0),
+                   values.get('time_offset', 0.0), interval), error
+
+
+def _sdf(held: Figures) -> tuple[str, set[str]]:
+    """
+    Return the noise of the z axis for an `<imu>` in SDF.
+
+    Gazebo draws the sign of `bias_mean`, and lets it decay with the correlation time; so the bias
+    is the mean of the noise. `dynamic_bias_stddev` is the density of a Gauss-Markov process.
+
+    """
+    quantized = held.quantization >= _FINEST_STEP
+    values = {'mean': held.bias, 'stddev': held.white_noise, 'bias_mean': 0.0,
+              'bias_stddev': held.bias_deviation}
+    if held.wander.density:
+        values |= {'dynamic_bias_stddev': held.wander.density,
+                   'dynamic_bias_correlation_time': held.wander.correlation_time}
+    if quantized:
+        values['precision'] = held.quantization
+    kind = 'gaussian_quantized' if quantized else 'gaussian'
+    lines = [f'        <{name}>{value:.9g}</{name}>' for name, value in values.items()]
+    text = '\n'.join(['<imu>', '  <angular_velocity>', '    <z>', f'      <noise type="{kind}">',
+                      *lines, '      </noise>', '    </z>', '  </angular_velocity>', '</imu>'])
+    return text, {'bias', 'bias_instability', 'rate_random_walk', 'angle_random_walk',
+                  *(['quantization'] if quantized else [])}
+
+
+def _isaac(held: Figures) -> tuple[str, set[str]]:
+    """Return the noise of an observation term of Isaac Lab, which draws the bias at each reset."""
+    return '\n'.join([
+        'from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg', '',
+        'GYRO_NOISE = NoiseModelWithAdditiveBiasCfg(',
+        f'    noise_cfg=GaussianNoiseCfg(mean=0.0, std={held.white_noise:.9g}),',
+        f'    bias_noise_cfg=GaussianNoiseCfg(mean={held.bias:.9g}, '
+        f'std={held.bias_deviation:.9g}),', ')']), {'bias', 'angle_random_walk'}
+
+
+def _mujoco(held: Figures) -> tuple[str, set[str]]:
+    """Return a sensor of MuJoCo; from release 3.1.4 on it stores `noise`, but adds none."""
+    attributes = {'name': 'gyro', 'site': 'imu', 'noise': f'{held.white_noise:.9g}'}
+    names = set()
+    if held.saturation:
+        attributes['cutoff'] = f'{held.saturation:.9g}'
+        names.add('saturation')
+    if held.time_offset > 0.0:
+        attributes |= {'delay': f'{held.time_offset:.9g}', 'interval': f'{held.interval:.9g}',
+                       'nsample': f'{math.ceil(held.time_offset / held.interval) + 2}',
+                       'interp': 'linear'}
+        names.add('time_offset')
+    inside = ' '.join(f'{name}="{value}"' for name, value in attributes.items())
+    return f'<sensor>\n  <gyro {inside}/>\n</sensor>', names | {'angle_random_walk'}
+
+
+_FORMATS: dict[str, Callable[[Figures], tuple[str, set[str]]]] = {
+    'sdf': _sdf, 'isaac': _isaac, 'mujoco': _mujoco}
+#: Names of the simulators.
+SIMULATORS = tuple(_FORMATS)
+_NOISE = {'angle_random_walk': 'rad/√s', 'bias_instability': 'rad/s',
+          'rate_random_walk': 'rad/s/√s'}
+
+
+def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list[str]]:
+    """
+    Write what a simulator can hold of a gyro.
+
+    Parameters
+    ----------
+    held : what `figures` returned
+    model : of the gyro
+    simulator : one of `SIMULATORS`
+
+    Returns
+    -------
+    text for the simulator, with what it cannot hold as a comment; and the same as a list of
+    sentences
+
+    """
+    text, names = _FORMATS[simulator](held)
+    run, noise = model.self_calibration, model.noise
+    found = {term.effect.name: _values(term) for term in model.terms}
+    if run and run.scale_factor_error:
+        found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'
+    if held.bias:
+        found['bias'] = f'{held.bias:.6g} rad/s at rest'
+    found |= {name: f'{getattr(noise, name):.6g} {unit}' for name, unit in _NOISE.items()
+              if getattr(noise, name)}
+    left_out = [f'{name}: {value}' for name, value in found.items() if name not in names]
+    if simulator == 'mujoco' and held.white_noise:
+        left_out.append('angle_random_walk: stored as noise; MuJoCo 3.1.4 and later add none')
+    return _commented(text, left_out, simulator), left_out
+
+
+def _values(term: Term) -> str:
+    """Return the values of an effect with their units."""
+    return ', '.join(f'{parameter.name} = {value:.6g} {parameter.unit}'
+                     for parameter, value in zip(term.effect.parameters, term.values))
+
+
+def _commented(text: str, left_out: list[str], simulator: str) -> str:
+    """Return a text with what is not in it as a comment before it."""
+    if not left_out:
+        return f'{text}\n'
+    lines = ['Not held by this simulator:', *(f'  {each}' for each in left_out)]
+    if simulator == 'isaac':
+        return '\n'.join([*(f'# {line}' for line in lines), text, ''])
+    # two hyphens would end a comment of XML
+    inside = escape('\n'.join(lines)).replace('--', '- -')
+    return f'<!-- {inside} -->\n{text}\n'
