@@ -32,7 +32,7 @@ DRIVER = {
     'frame_id': ('frame_id', 'frame of the gyro, whose z is its input axis'),
 }
 COMPENSATION = {
-    'model_file': ('model_file', 'model of the gyro, see docs/error_model.md'),
+    'model_file': ('model_file', 'model of the gyro, see docs/explanation/error_model.md'),
     'calibration_file': ('calibration_file', 'where the last self-calibration is kept'),
     'profile_file': ('calibration.profile_file', 'motion profile of the self-calibration'),
     'wheels': ('wheels', 'what feeds the detection of standstill: none, odom, cmd_vel or both'),
@@ -43,7 +43,8 @@ OTHERS = {
     'cmd_vel_topic': ('cmd_vel', "commands to the robot's base"),
     'use_sim_time': ('false', 'whether both nodes follow /clock'),
     'respawn': ('false', 'whether a node that ends is started again after 2 s'),
-    'driver_enclave': ('', 'enclave of driver_node in a secured graph, see docs/security.md'),
+    'driver_enclave': (
+        '', 'enclave of driver_node in a secured graph, see docs/reference/security.md'),
     'compensation_enclave': ('', 'enclave of compensation_node'),
 }
 

@@ -21,8 +21,9 @@ from gyro_calibration.model.model_file import POLYNOMIAL, read_model
 import pytest
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / 'docs'
 DOCUMENTS = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'CHANGELOG.rst',
-             *sorted((ROOT / 'docs').glob('*.md'))]
+             *sorted(DOCS.rglob('*.md'))]
 LINK = re.compile(r'\[[^\]]*\]\(([^)\s]+)\)')
 FILE = re.compile(r'`((?:docs|config|launch|test|benchmarks|gyro_calibration)/[\w./]+\.\w+|'
                   r'[A-Z]+\.(?:md|rst)|Makefile|setup\.py)`')
@@ -88,7 +89,7 @@ def number(value):
 
 
 def row(parameter):
-    """Return a parameter as a row of the table in docs/on_a_robot.md."""
+    """Return a parameter as a row of the table in docs/reference/on_a_robot.md."""
     default = parameter.default
     if isinstance(default, str):
         text = f'`{default}`' if default else 'empty'
@@ -106,7 +107,8 @@ def row(parameter):
 
 def test_the_tables_of_parameters_are_those_of_the_nodes(parameters):
     table = '\n'.join(map(row, parameters))
-    assert table in (ROOT / 'docs/on_a_robot.md').read_text(), f'put this table there:\n{table}'
+    assert table in (DOCS / 'reference/on_a_robot.md').read_text(), (
+        f'put this table there:\n{table}')
 
 
 def flat(values, group=''):
@@ -129,7 +131,8 @@ def test_the_configuration_holds_every_parameter_with_its_default(parameters):
 
 
 def test_the_models_in_the_documents_can_be_read(tmp_path):
-    texts = re.findall(r'```yaml\n(.*?)```', (ROOT / 'docs/error_model.md').read_text(), re.DOTALL)
+    page = (DOCS / 'explanation/error_model.md').read_text()
+    texts = re.findall(r'```yaml\n(.*?)```', page, re.DOTALL)
     models = []
     for number, text in enumerate(texts):
         path = tmp_path / f'{number}.yaml'
@@ -150,7 +153,7 @@ def headline(text):
 
 
 def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path, monkeypatch):
-    page = (ROOT / 'docs/diagnosis.md').read_text()
+    page = (DOCS / 'explanation/diagnosis.md').read_text()
     monkeypatch.chdir(tmp_path)
     for name in ('gyro.yaml', 'real.yaml', 'profile.csv'):
         block = re.search(rf'`{name}`[^`]*?:\n\n((?:    .*\n)+)', page)[1]
@@ -170,10 +173,10 @@ def test_the_example_of_a_diagnosis_still_says_what_the_pages_show(run, tmp_path
 
 @pytest.mark.parametrize('effect', [*CATALOGUE, POLYNOMIAL])
 def test_the_error_model_describes_every_effect(effect):
-    assert f'`{effect}`' in (ROOT / 'docs/error_model.md').read_text()
+    assert f'`{effect}`' in (DOCS / 'explanation/error_model.md').read_text()
 
 
-@pytest.mark.parametrize('document', ['README.md', 'docs/wire_formats.md'])
+@pytest.mark.parametrize('document', ['README.md', 'docs/reference/wire_formats.md'])
 def test_every_wire_format_is_in_the_tables(document):
     text = (ROOT / document).read_text()
     assert not [name for name in PROTOCOLS

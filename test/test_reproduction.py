@@ -112,7 +112,8 @@ def test_every_number_of_a_contradiction_is_in_its_sentence(source):
     pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
     for source in SOURCES])
 def test_the_page_holds_what_the_program_prints(source):
-    assert page(reproduced(source, MANY)) in (ROOT / 'docs/reproduction.md').read_text(), (
+    shown = (ROOT / 'docs/explanation/reproduction.md').read_text()
+    assert page(reproduced(source, MANY)) in shown, (
         'run gyro_calibration reproduce and put it there')
 
 

@@ -54,7 +54,7 @@ def test_of_one_gyro_only_one_thing_is_fused_and_nothing_twice(parameters):
 
 
 def test_the_launch_file_in_the_documentation_can_be_read():
-    page = (CONFIG.parents[1] / 'docs' / 'nav2.md').read_text()
+    page = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
     code = page.partition('```python\n')[2].partition('```')[0]
     assert ('generate_launch_description' in compile(code, 'launch', 'exec').co_names
             and CONFIG.name in code)
@@ -72,11 +72,11 @@ def arguments_of(launch_file):
 
 def test_the_launch_arguments_that_the_documents_name_are_those_of_the_launch_file():
     declared = arguments_of(CONFIG.parents[1] / 'launch' / 'gyro.launch.py')
-    page = (CONFIG.parents[1] / 'docs' / 'on_a_robot.md').read_text()
+    page = (CONFIG.parents[1] / 'docs/reference/on_a_robot.md').read_text()
     table = page.partition('| launch argument |')[2].partition('\n\n')[0]
     rows = [line.split('|')[1] for line in table.splitlines()[2:]]
     assert {name for row in rows for name in re.findall(r'`(\w+)`', row)} == declared
-    other = (CONFIG.parents[1] / 'docs' / 'nav2.md').read_text()
+    other = (CONFIG.parents[1] / 'docs/how_to/nav2.md').read_text()
     used = set(re.findall(r"'(\w+)': '", other)) | set(re.findall(r'`(\w+):=', other))
     assert used <= declared
 

@@ -32,7 +32,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
     parser.add_argument('--seed', type=whole, default=0,
-                        help='of the noise; default: 0, as in docs/reproduction.md')
+                        help='of the noise; default: 0, as in docs/explanation/reproduction.md')
     return parser
 
 

@@ -128,7 +128,8 @@ def _tolerance(value: Any) -> Tolerance:
 def _mapping(place: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise _PlaceError(place, value,
-                          'names with values (see docs/error_model.md), or calibrate again')
+                          'names with values (see docs/explanation/error_model.md), '
+                          'or calibrate again')
     return value
 
 
