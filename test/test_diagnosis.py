@@ -147,7 +147,7 @@ def test_random_effects_are_found():
         log, = hide([name], 5.0, generator, noise=str(generator.choice(KINDS)), **SHORT)
         found = diagnosis_of([log], generator)
         wrong += [] if judged_diagnosis(log, found).right else [told(log, found)]
-    # right in 92 % at 5 times the minimum detectable effect (docs/explanation/benchmarks.md), so
+    # right in 92 % at 5 times the minimum detectable effect (docs/benchmarks.md), so
     # 4 of 8 are wrong once in 500 runs
     assert len(wrong) <= 3, '\n'.join(wrong)
 

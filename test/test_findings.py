@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What docs/explanation/findings.md says of measured recordings is what the program finds in them.
+What docs/findings.md says of measured recordings is what the program finds in them.
 
 The tables of the document are read, and its commands are run. A size may differ a little, for
 noise that is drawn to fill lost samples differs between releases of numpy; an error by a quarter
@@ -26,7 +26,7 @@ from gyro_calibration.diagnosis.finding import Estimate
 from gyro_calibration.diagnosis.units import amount, quantity
 import pytest
 
-TEXT = (Path(__file__).parents[1] / 'docs/explanation/findings.md').read_text()
+TEXT = (Path(__file__).parents[1] / 'docs/findings.md').read_text()
 COMMANDS = re.findall(r'^ +gyro_calibration (.+)$', TEXT, re.MULTILINE)
 NUMBER = re.compile(r'−?\d+(?:\.\d+)?(?:e[+-]\d+)?')
 
