@@ -14,6 +14,13 @@ Calibrate a gyro against an encoder: scale factor error, bias and the residual h
 The input is a log in time with a reference heading. There are two methods: the likelihood of the
 headings, and the regression of the encoder's rate on the gyro, sample by sample.
 
+The error of an encoder is constant as long as its reading is, and known where the reading changes
+by a step; so readings are used at their steps. An error of step / sqrt(12) at each sample would
+give rests too much weight: with 0.088 deg and a gyro of low noise the variance of the scale was 58
+times the Cramer-Rao bound. The interval of the scale is the scatter between pieces of the log,
+since what a swing leaves in each period is no noise of the fit; that of the bias is its wander
+between pieces.
+
 """
 
 from __future__ import annotations

@@ -16,6 +16,9 @@ that of its sweep's bias, and that of its sweep's scale factor (a bias that wand
 that the sensor does not show). Their sizes are found by restricted likelihood, so that thirty
 dwells of one sweep do not count as thirty independent ones.
 
+The sizes are found about a smooth surface over rate and temperature, before any effect is fitted.
+Found beside too few effects, they would absorb what a missing effect leaves.
+
 """
 
 from __future__ import annotations

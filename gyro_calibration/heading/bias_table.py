@@ -24,6 +24,10 @@ present bias with an error, and these errors have a known covariance: the answer
 generalized least squares mean. How large coefficient and turn-on scatter are is learned too, by
 restricted likelihood over a few sizes.
 
+The table is frozen while a tracker runs, whose state holds a temperature coefficient of its own in
+units of what the table did not know. What a run has learned counts when the tracker is reset, at a
+rest more than 5 K away; both at once would compensate twice.
+
 """
 
 from __future__ import annotations

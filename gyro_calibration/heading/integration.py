@@ -8,7 +8,14 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""From rates to a heading and its error: threshold filter, and integration on the stamps."""
+"""
+From rates to a heading and its error: threshold filter, and integration on the stamps.
+
+The threshold decides on the mean over a window: single samples of a cheap gyro cross it half of
+the time. A window of 0 is the published decision. Rates are integrated by trapezoids on the
+stamps: the rectangle rule is half a sample late, and a nominal interval is a scale error.
+
+"""
 
 from __future__ import annotations
 

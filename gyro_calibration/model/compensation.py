@@ -8,7 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""From the output of a gyro to the rate, the same for one sample and for a whole log."""
+"""
+From the output of a gyro to the rate, the same for one sample and for a whole log.
+
+Where an effect is a function of the true rate, the equation of the model is solved by repetition
+along the secant, with a fixed number of passes, so that a sample and a log take the same steps. A
+constant slope is solved in one pass; a model of output alone needs none. There is no inverse
+formula that could differ from the simulation.
+
+"""
 
 from __future__ import annotations
 

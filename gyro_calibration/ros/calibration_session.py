@@ -15,6 +15,10 @@ Samples, odometry and commands go in with the time of the steady clock; commands
 `send`. Every guard of a drive looks at the steady clock, whatever ROS time does. A run ends with
 `Run.reason` set ('' where its samples are complete); `CalibrationSession.conclude` then fits it.
 
+A foreign command is one that was not sent here: the own commands come back on `cmd_vel` in the
+order in which they were sent, and any other command is that of another node, also a zero beside
+zeros.
+
 """
 
 from __future__ import annotations

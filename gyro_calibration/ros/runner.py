@@ -14,6 +14,10 @@ How a node declares its parameters, which qualities its topics have, and how it 
 A node is a subclass of `rclpy.node.Node` that declares its table of parameters in its constructor
 and joins its threads in `destroy_node`. Its ``main`` is ``return run(TheNode)``.
 
+Signals set an event, the loop of `spin_once` ends, threads are joined, and then the node is
+destroyed. The handlers of rclpy invalidate the context while a callback still publishes, which
+ends some runs in a traceback.
+
 """
 
 from __future__ import annotations

@@ -8,7 +8,14 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The state of a robot in files: the gyro model, the last self-calibration, biases at rest."""
+"""
+The state of a robot in files: the gyro model, the last self-calibration, biases at rest.
+
+The calibration file is a whole model file: it is read and checked in the same way and holds the
+effects behind which it was found. Where those differ from the model in use, the self-calibration
+is not used.
+
+"""
 
 from __future__ import annotations
 

@@ -8,7 +8,20 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""An effect, its parameters, and what it may look at: the records."""
+"""
+An effect, its parameters, and what it may look at: the records.
+
+An effect is a record and a model is a tuple of them, without subclasses or a registry: effects are
+combined in any way since each only adds columns. Effects on the signal (a delay, a lag, rounding)
+are no function of one instant and add no column; they are simulated where they happen, and
+`undone` says what compensation leaves of them.
+
+A parameter with a default is a convention (a temperature to count from, a centre, a scale) and is
+not fitted. One without a default is a property of the gyro, is fitted, and has a place in the
+covariance. `nested` gives the sum of an effect beside its columns, which takes less time than to
+make all columns first; a test compares both.
+
+"""
 
 from __future__ import annotations
 

@@ -8,7 +8,14 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The error polynomial over output and temperature, and its matrix as the paper has it."""
+"""
+The error polynomial over output and temperature, and its matrix as the paper has it.
+
+The polynomial is one of the output, not of the true rate: Ojeda, Chung and Borenstein regress the
+error on the output, so that compensation is one subtraction (their eq. 13). Its powers are centred
+and scaled, since the condition number of raw powers of deg/s and degC is about 1e11.
+
+"""
 
 from __future__ import annotations
 
