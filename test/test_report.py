@@ -296,8 +296,8 @@ def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
 
 def test_a_set_is_named_with_the_experiment_that_parts_it():
     text = ' '.join(' '.join(lines(extended())).split())
-    assert 'bias temperature or rate ramp, which these data cannot tell apart' in text
-    assert 'To part them: heat and cool the gyro within one log.' in text
+    assert 'bias temperature or rate ramp, which these data cannot distinguish' in text
+    assert 'To distinguish them: heat and cool the gyro within one log.' in text
 
 
 def test_among_several_causes_a_set_is_in_brackets():
@@ -344,15 +344,15 @@ def test_noise_is_in_the_units_of_data_sheets():
 
 
 @pytest.mark.parametrize('probability, words',
-                         [(0.0, 'less than 1 in a million'), (1 / 250, '1 in 250'), (0.3, '30 %'),
+                         [(0.0, 'below 1 in 10 000'), (1 / 250, '1 in 250'), (0.3, '30 %'),
                           (np.nan, 'not known')])
 def test_a_chance_is_said_in_words(probability, words):
     assert chance(probability) == words
 
 
 @pytest.mark.parametrize('interval, words',
-                         [((0.01, 0.02), 'down from'), ((-0.01, 0.02), 'too few or too uneven'),
-                          ((-0.02, -0.01), 'worse'), (None, 'no interval')])
+                         [((0.01, 0.02), 'reduces'), ((-0.01, 0.02), 'within the scatter'),
+                          ((-0.02, -0.01), 'increases'), (None, 'no interval')])
 def test_a_gain_is_called_what_it_is(interval, words):
     whole = extended()
     gain = replace(whole.gain, heading=replace(whole.gain.heading, interval=interval))

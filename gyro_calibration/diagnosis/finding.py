@@ -21,6 +21,8 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 
 SCHEMA = 'gyro_calibration/diagnosis/2'
+#: Smaller probabilities are not stated: the assumptions on the noise do not carry them.
+LEAST_PROBABILITY = 1e-4
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,8 @@ class Finding:
         """Return it as data."""
         return {'effect': self.effect, 'cause': self.cause,
                 'parameters': {name: value.figures() for name, value in self.parameters.items()},
-                'p_value': self.p_value, 'minimum_detectable': self.minimum_detectable,
+                'p_value': max(self.p_value, LEAST_PROBABILITY),
+                'minimum_detectable': self.minimum_detectable,
                 'ambiguous_with': list(self.ambiguous_with), 'separate_by': self.separate_by,
                 'evidence': self.evidence, 'status': self.status,
                 'probability': dict(self.probability),
@@ -128,7 +131,7 @@ class Unexplained:
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'along': self.along, 'share_of_variance': self.share_of_variance,
-                'p_value': self.p_value}
+                'p_value': max(self.p_value, LEAST_PROBABILITY)}
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ _SPOKEN = {
     'gyro': 'another gyro',
 }
 _REMEDIES = {
-    'gyro': 'it is in the extended model',
+    'gyro': 'add it to the model of the gyro',
     'reference': 'mend or replace the reference, or see that it does not enter a calibration',
     'record': 'mend the recording',
     'noise': 'take the figures of the extended model',

@@ -51,8 +51,7 @@ def named_finding(search: Search, found: Outcome, place: int, p_value: float,
 
 def _evidence(size: Estimate, half: float, run: int | None, logs: int) -> str:
     where = '' if run is None or logs == 1 else f'in log {run + 1}, '
-    return (f'{where}the estimate is {abs(size.estimate) / half:.3g} standard deviations from '
-            'nothing' if half > 0.0 else '')
+    return f'{where}{abs(size.estimate) / half:.3g} sigma from zero' if half > 0.0 else ''
 
 
 def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tuple[str, ...]:

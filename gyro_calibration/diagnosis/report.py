@@ -33,22 +33,22 @@ from gyro_calibration.diagnosis.finding import (
 from gyro_calibration.diagnosis.markup import element, joined, Markup
 from gyro_calibration.diagnosis.units import amount, for_people, number, quantity, span
 from gyro_calibration.diagnosis.words import (
+    alternatives,
     certainty,
     change,
     clean,
-    doubt,
+    heading_shares,
     headline,
     hidden,
-    is_inside,
     listed,
     noise_figures,
     offered,
+    remedy,
     sentence,
     shown_by,
     sizes,
     smallest,
     spoken,
-    todo,
     unknown,
 )
 from gyro_calibration.logs.log import Array, DEGREE
@@ -62,9 +62,9 @@ _PARTS = 90
 _SLOW = 2e-3 * DEGREE
 #: The curve that holds amplitudes in place of means.
 SPECTRUM = 'frequency'
-_VERDICTS = {'adequate': 'Adequate: nothing was found',
-             'extended': 'Extended: all that was found has a name',
-             'unexplained': 'Unexplained: something is left without a name',
+_VERDICTS = {'adequate': 'Adequate: no cause was found',
+             'extended': 'Extended: each difference has a cause',
+             'unexplained': 'Unexplained: a difference has no known cause',
              'mismatched': 'Mismatched: gyro and reference do not belong together'}
 
 _METHOD = (
@@ -79,7 +79,7 @@ _METHOD = (
     'taken back where another one explains more.',
     'Those that explain the same are given as a set, of which the simplest is in the model. Bias '
     'and scale factor are fitted in any case.',
-    'What is won was measured on parts that took no part in this; intervals are of 95 %.')
+    'The gain was measured on parts that took no part in this; intervals are of 95 %.')
 
 
 def report(diagnosis: Diagnosis) -> str:
@@ -124,7 +124,8 @@ def _tile(what: str, errors: Change, unit: str) -> Markup:
                       number(errors.after * factor), element('span', f' {name}', class_='quiet'),
                       class_='big')
     return element('div', element('p', what), numbers,
-                   element('p', f'won {_gained(errors, unit)}', class_='quiet'), class_='tile')
+                   element('p', f'reduced by {_gained(errors, unit)}', class_='quiet'),
+                   class_='tile')
 
 
 def _gained(errors: Change, unit: str) -> str:
@@ -137,9 +138,11 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     yield _section('Simulation and measurement', _misfit(diagnosis, guilty or others))
     yield _section('Causes', [_cause(place, found, diagnosis)
                               for place, found in enumerate(diagnosis.findings, 1)])
-    yield _section('Without a name', [_items([unknown(each) for each in diagnosis.unexplained])]
-                   if diagnosis.unexplained else [])
-    yield _section('What is won' if diagnosis.gain is not None else 'Heading', _gain(diagnosis))
+    yield _section('Structure that no cause explains',
+                   [_items(map(unknown, diagnosis.unexplained))] if diagnosis.unexplained else [])
+    yield _section('Shares of the heading error', _shares(diagnosis))
+    yield _section('Gain on held-out parts' if diagnosis.gain is not None else 'Heading',
+                   _gain(diagnosis))
     measured = diagnosis.noise_curve is not None or diagnosis.noise != Noise()
     yield _section('Noise', _noise(diagnosis) if measured else [])
     rest = others if guilty else []
@@ -303,10 +306,8 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
 # causes
 
 def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
-    inside = is_inside(found, diagnosis)
-    facts = [*certainty(found), smallest(found),
-             'It is in the extended model.' if inside else '', todo(found)]
-    uncertain = element('p', doubt(found), class_='doubt') if found.ambiguous_with else None
+    facts = [*certainty(found), smallest(found), remedy(found, diagnosis)]
+    uncertain = element('p', alternatives(found), class_='doubt') if found.ambiguous_with else None
     title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect),
                     ' ', _code(found.effect))
     return element('article', title, *(element('p', text) for text in shown_by(found)),
@@ -339,7 +340,13 @@ def _row(heads: Sequence[str], row: Sequence[str]) -> Markup:
     return element('tr', element('th', row[0], scope='row'), *cells)
 
 
-# what is won, noise
+# heading, gain, noise
+
+def _shares(diagnosis: Diagnosis) -> Iterator[Markup]:
+    if diagnosis.heading_shares:
+        yield element('p', 'Parts of the mean square of the heading error over 60 s.')
+        yield _folding(['', 'share'], heading_shares(diagnosis))
+
 
 def _gain(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     if diagnosis.gain is not None:
@@ -357,14 +364,14 @@ def _errors(gain: Gain) -> list[tuple[str, Change, str]]:
 
 
 def _gain_sentences(gain: Gain) -> str:
-    changes = [f'The extension {change(errors, unit, f"the {what}")}.'
+    changes = [f'The extended model {change(errors, unit, f"the {what}")}.'
                for what, errors, unit in _errors(gain)]
     return ' '.join([f'Measured on {clean(gain.held_out)}, which took no part in the choice or '
                      'the fit.', *changes])
 
 
 def _gain_table(gain: Gain) -> Markup:
-    return _folding(['rms', 'before', 'after', 'won, 95 % interval'], [
+    return _folding(['rms', 'before', 'after', 'reduction, 95 % interval'], [
         [what, amount(errors.before, unit), amount(errors.after, unit), _gained(errors, unit)]
         for what, errors, unit in _errors(gain)])
 
@@ -374,7 +381,7 @@ def _heading(curve: HeadingCurve) -> Chart:
     unit, factor = span(float(np.ptp(time)) if len(time) else 0.0)
     lines = _before_and_after(before / DEGREE, after / DEGREE)
     return Chart('heading', 'Heading error over the log',
-                 f'Error of the heading if the simulation is believed{_when(lines)}.', 'time',
+                 f'Heading error of the simulation{_when(lines)}.', 'time',
                  unit, factor * time, 'heading error', 'deg', lines)
 
 

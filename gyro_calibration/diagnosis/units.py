@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import math
 import re
 
-from gyro_calibration.diagnosis.finding import Estimate
+from gyro_calibration.diagnosis.finding import Estimate, LEAST_PROBABILITY
 from gyro_calibration.logs.log import DEGREE
 
 _HOUR = 3600.0
@@ -156,11 +156,11 @@ def span(seconds: float) -> tuple[str, float]:
 
 
 def chance(probability: float) -> str:
-    """Return a chance in words."""
+    """Return a probability in words."""
     if math.isnan(probability):
         return 'not known'
-    if probability < 1e-6:
-        return 'less than 1 in a million'
+    if probability < LEAST_PROBABILITY:
+        return f'below 1 in {1.0 / LEAST_PROBABILITY:,.0f}'.replace(',', ' ')
     if probability >= 0.1:
         return f'{100.0 * probability:.0f} %'
     return f'1 in {float(f"{1.0 / probability:.2g}"):,.0f}'.replace(',', ' ')

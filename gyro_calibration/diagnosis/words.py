@@ -54,17 +54,17 @@ def sentence(text: str) -> str:
 # the finding in two sentences
 
 def headline(diagnosis: Diagnosis) -> tuple[str, str]:
-    """Return the finding in two sentences: what is wrong, and what is won by mending it."""
+    """Return two sentences: what the simulation gets wrong, and what the extended model gains."""
     if diagnosis.verdict == 'mismatched':
         (found,) = diagnosis.findings
-        return found.cause, f'Nothing else can be named before that is mended: {found.remedy}.'
+        return found.cause, f'Nothing else can be named before that is corrected: {found.remedy}.'
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
-                'The model is left as it is; of logs without any cause, '
-                f'{100.0 * diagnosis.false_alarm_rate:.2g} % would give an alarm by chance.')
-    named = [f'because of {_named(diagnosis.findings)}'] if diagnosis.findings else []
+                _gained(diagnosis))
+    established = [each for each in diagnosis.findings if each.status == 'established']
+    named = [f'because of {_named(established)}'] if established else []
     left = [_left(diagnosis.unexplained, bool(named))] if diagnosis.unexplained else []
-    return f'Simulation and measurement differ {", and ".join(named + left)}.', _won(diagnosis)
+    return f'Simulation and measurement differ {", and ".join(named + left)}.', _gained(diagnosis)
 
 
 def _named(findings: Sequence[Finding]) -> str:
@@ -78,7 +78,7 @@ def _named(findings: Sequence[Finding]) -> str:
         return spoken(found.effect) + ('' if size is None else f': {size}')
     taken = '' if size is None else f'; taken as {spoken(found.effect)} it is {size}'
     names = listed([spoken(name) for name in (found.effect, *found.ambiguous_with)], 'or')
-    return f'{names}, which these data cannot tell apart{taken}'
+    return f'{names}, which these data cannot distinguish{taken}'
 
 
 def _beside_others(found: Finding) -> str:
@@ -103,7 +103,8 @@ def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
 
 def _share(share: float) -> str:
     """Return a part of the whole in percent; the smallest ones read alike."""
-    return 'less than 0.1 %' if share < 1e-3 else f'{number(100.0 * share, 2)} %'
+    return ('less than 0.1 %' if share < 1e-3 else f'{100.0 * share:.0f} %' if share >= 0.1
+            else f'{number(100.0 * share, 2)} %')
 
 
 def offered(diagnosis: Diagnosis) -> bool:
@@ -128,17 +129,20 @@ def _has_shapes(term: Term, found: Finding) -> bool:
                for name, value in values.items() if name in found.parameters)
 
 
-def _won(diagnosis: Diagnosis) -> str:
+def _gained(diagnosis: Diagnosis) -> str:
     gain = diagnosis.gain
-    if not offered(diagnosis):
-        return 'No extended model is offered, so that the model is left as it is.'
+    if not offered(diagnosis) and (gain is None or gain.models.get('given')
+                                   == gain.models.get('extended')):
+        return 'No extended model is offered: the model is unchanged.'
+    model = ('The extended model' if offered(diagnosis)
+             else 'The model, of bias and scale factor error alone,')
     if gain is None:
-        return 'An extended model is offered; what it wins was not measured.'
+        return 'An extended model is offered; its gain was not measured.'
     if gain.heading is None:
-        return (f'The extended model {change(gain.rate, "rad/s", "the rate error")}, measured on '
+        return (f'{model} {change(gain.rate, "rad/s", "the rate error")}, measured on '
                 f'{clean(gain.held_out)}.')
     what = f'the heading error over {gain.window:g} s'
-    return (f'The extended model {change(gain.heading, "rad", what)}, measured on '
+    return (f'{model} {change(gain.heading, "rad", what)}, measured on '
             f'{clean(gain.held_out)}.')
 
 
@@ -146,13 +150,14 @@ def change(errors: Change, unit: str, what: str) -> str:
     """Return what becomes of an error, as the end of a sentence."""
     before, after = (amount(value, unit) for value in (errors.before, errors.after))
     if errors.interval is None:
-        return f'brings {what} from {before} to {after} rms, with one part only and so no interval'
+        return (f'changes {what} from {before} to {after} rms; one part was held out, so there '
+                'is no interval')
     if errors.interval[0] > 0.0:
-        return f'brings {what} down from {before} to {after} rms'
+        return f'reduces {what} from {before} to {after} rms'
     if errors.worse:
-        return f'makes {what} worse, from {before} to {after} rms'
-    return (f'brings {what} from {before} to {after} rms, over parts too few or too uneven to '
-            'promise that for others')
+        return f'increases {what} from {before} to {after} rms'
+    return (f'changes {what} from {before} to {after} rms, which is within the scatter between '
+            'the parts')
 
 
 # one by one
@@ -163,43 +168,53 @@ def shown_by(found: Finding) -> list[str]:
 
 
 def certainty(found: Finding) -> list[str]:
-    """Return whether a cause is confirmed, and its chance by noise alone; nothing for units."""
-    if not found.p_value and found.remedy:
-        return []
-    suspected = ['It is suspected, not established.'] if found.status == 'suspected' else []
-    return [*suspected, f'By noise alone: {chance(found.p_value)}.']
+    """Return whether a cause is confirmed, its probability by noise alone, and where it is."""
+    status = 'Suspected' if found.status == 'suspected' else 'Established'
+    where = '' if found.where is None else ' in {:.4g} to {:.4g} s of the log'.format(*found.where)
+    if not found.p_value:  # seen in the samples themselves, without a test
+        return [f'{status}{where}.'] if where or found.status == 'suspected' else []
+    return [f'{status}{where}; probability by noise alone: {chance(found.p_value)}.']
 
 
-def todo(found: Finding) -> str:
+def remedy(found: Finding, diagnosis: Diagnosis) -> str:
     """Return what to do about a cause, as a sentence; empty where nothing is known."""
-    return f'What to do: {clean(found.remedy).rstrip(".")}.' if found.remedy else ''
+    if is_inside(found, diagnosis):
+        return 'It is in the extended model.'
+    return f'Remedy: {clean(found.remedy).rstrip(".")}.' if found.remedy else ''
 
 
-def doubt(found: Finding) -> str:
-    """Return what else it could be, and what would part them; empty where it is sure."""
+def alternatives(found: Finding) -> str:
+    """Return what else it could be, and what would distinguish them; empty where it is sure."""
     if not found.ambiguous_with:
         return ''
     others = listed([spoken(name) for name in found.ambiguous_with], 'or')
     experiment = clean(found.separate_by).rstrip('.')
-    remedy = (f'To part them: {experiment}.' if experiment
-              else 'No experiment is known that would part them.')
-    return f'These data cannot rule out that it is {others} instead. {remedy}'
+    way = (f' To distinguish them: {experiment}.' if experiment
+           else ' No experiment is known that would distinguish them.')
+    stated = experiment and experiment in found.remedy
+    return f'These data do not exclude {others} instead.{"" if stated else way}'
 
 
 def smallest(found: Finding) -> str:
-    """Return what would have been found, as a sentence; empty where that has no meaning."""
+    """Return the smallest detectable size, as a sentence; empty where that has no meaning."""
     if found.minimum_detectable is None or not found.parameters:
         return ''
     name, first = next(iter(found.parameters.items()))
-    return (f'From {amount(found.minimum_detectable, first.unit, name, 2)} on it would have been '
-            'found.')
+    return f'Smallest detectable: {amount(found.minimum_detectable, first.unit, name, 2)}.'
 
 
 def unknown(each: Unexplained) -> str:
-    """Return what is known of structure without a name."""
+    """Return what is known of structure that no cause explains."""
     share = _share(each.share_of_variance)
-    return (f'Along {spoken(each.along)}: {share} of the variance of the residual; by noise alone '
-            f'{chance(each.p_value)}.')
+    return (f'Along {spoken(each.along)}: {share} of the variance of the residual; probability by '
+            f'noise alone: {chance(each.p_value)}.')
+
+
+def heading_shares(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Return each cause, the reference and the rest with their parts of the heading error."""
+    names = {'reference': 'errors of the reference', 'left': 'not explained'}
+    return [(names.get(name, spoken(name)), _share(share))
+            for name, share in sorted(diagnosis.heading_shares.items(), key=lambda each: -each[1])]
 
 
 def noise_figures(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
@@ -226,29 +241,31 @@ def lines(diagnosis: Diagnosis) -> Iterator[str]:
     yield from map(_wrapped, headline(diagnosis))
     for place, found in enumerate(diagnosis.findings, 1):
         yield ''
-        yield from _finding_lines(f'{place}. ', found)
+        yield from _finding_lines(f'{place}. ', found, diagnosis)
     for title, items in _lists(diagnosis):
         if items:
             yield from ('', title, *(_wrapped(f'- {item}', 2) for item in items))
 
 
-def _finding_lines(mark: str, found: Finding) -> Iterator[str]:
+def _finding_lines(mark: str, found: Finding, diagnosis: Diagnosis) -> Iterator[str]:
     indent = len(mark)
     parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}'
                   for name, size in sizes(found).items()]
     yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}'
                    f'{", ".join(parameters)}', indent)
     for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]),
-                 doubt(found), todo(found)):
+                 alternatives(found), remedy(found, diagnosis)):
         if text:
             yield _wrapped(' ' * indent + text, indent)
 
 
 def _lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
-    yield 'Without a name:', [unknown(each) for each in diagnosis.unexplained]
+    yield 'Structure that no cause explains:', [unknown(each) for each in diagnosis.unexplained]
+    yield 'Shares of the mean square heading error over 60 s:', [
+        f'{name}: {share}' for name, share in heading_shares(diagnosis)]
     yield 'These data cannot show:', [f'{listed(names)}: {reason}'
                                       for reason, names in hidden(diagnosis.cannot_show).items()]
-    yield 'To know:', [sentence(remark) for remark in diagnosis.remarks]
+    yield 'Remarks:', [sentence(remark) for remark in diagnosis.remarks]
 
 
 def _wrapped(text: str, indent: int = 0) -> str:
