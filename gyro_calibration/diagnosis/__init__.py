@@ -17,13 +17,13 @@ Reading order, each imports only from those before it: `finding` (what is found,
 belong together), `door` (where logs are refused), `hygiene` (of a record), `reference` (its kind),
 `spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what
 has no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes),
-`units` (of people), `menu` (of experiments), `experiment` (that parts causes), `outcome` (of a
-search, in values), `figures` (of noise), `extension` (of the model), `gain` (on what was held
-out), `curves` (for people to see), `naming` (of findings); where the reference limits what is
-known, `regression` (on spans), `confirmation` (of causes), `heading_reference` (the diagnosis of
-such a log); `steps` (of a diagnosis, in order), `dwell_fit` (of what a model leaves of a rate
-table), `dwell_sets` (that dwells cannot part), `dwell_rest` (what has no name), `dwell_gain` (on
-sweeps left out), `table` (the diagnosis of a rate table), `words` (for people), `markup` (of
-pages), `charts` (in pages), `report` (the page).
+`units` (of people), `candidate_experiments` (that distinguish causes), `outcome` (of a search, in
+values), `figures` (of noise), `extension` (of the model), `gain` (on what was held out), `curves`
+(for people to see), `naming` (of findings); where the reference limits what is known, `regression`
+(on spans), `confirmation` (of causes), `noisy_reference` (the diagnosis of such a log); `steps`
+(of a diagnosis, in order), `dwell_fit` (of what a model leaves of a rate table), `dwell_sets`
+(that dwells cannot part), `dwell_rest` (what has no name), `dwell_gain` (on sweeps left out),
+`table` (the diagnosis of a rate table), `words` (for people), `markup` (of pages), `charts` (in
+pages), `report` (the page).
 
 """

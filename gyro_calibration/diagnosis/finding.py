@@ -33,6 +33,11 @@ class Estimate:
     interval: tuple[float, float]
     unit: str
 
+    @classmethod
+    def about(cls, value: float, half: float, unit: str) -> Estimate:
+        """Return a value with an interval of half a length on each side."""
+        return cls(value, (value - half, value + half), unit)
+
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}

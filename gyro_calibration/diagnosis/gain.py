@@ -12,11 +12,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gyro_calibration.diagnosis.field import work
-from gyro_calibration.diagnosis.finding import Change, Gain
+from gyro_calibration.diagnosis.finding import Change, Gain, HeadingCurve
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import relaid, Search, searched
@@ -26,6 +26,8 @@ from scipy.stats import t as student
 
 #: The heading is compared over so long, s.
 WINDOW = 60.0
+#: A window is no longer than this part of what is held out.
+WITHIN = 0.75
 #: Of so many blocks one is held out.
 EVERY = 3
 #: A log with fewer samples than this beside what is held out is not fitted.
@@ -120,6 +122,49 @@ def _block(each: Replay, left: Sequence[tuple[Array, Array]], part: Mask) -> _Bl
     heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
                     for _, increments in left)
     return _Block((squares[0], squares[1]), int(np.count_nonzero(part)), (heading[0], heading[1]))
+
+
+def over_windows(change: Array, time: Array, window: float) -> Array:
+    """Return changes over windows from changes between times: shapes (m,), (n,) and (n + 1,)."""
+    whole = np.concatenate([[0.0], np.cumsum(change)])
+    later = np.searchsorted(time, time + window - 0.5 * float(np.median(np.diff(time))))
+    inside = np.flatnonzero(later < len(time))
+    return np.asarray(whole[later[inside]] - whole[inside])
+
+
+def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
+           own: float = 0.0) -> dict[str, float]:
+    """
+    Return which part of the mean square of the heading error over a minute each cause explains.
+
+    Parameters
+    ----------
+    logs : of each, what causes add to the change of heading between times, with what is 'left',
+        rad, shape (n,), and the times, s, shape (n + 1,)
+    own : mean square that is of the reference, rad²
+
+    """
+    over: dict[str, list[Array]] = {}
+    for parts, time in logs:
+        window = min(WINDOW, WITHIN * float(time[-1] - time[0]))
+        for name, part in parts.items():
+            over.setdefault(name, []).append(over_windows(part, time, window))
+    found = {name: np.concatenate(each) for name, each in over.items()}
+    total = sum(found.values(), np.zeros(len(found['left'])))
+    square = float(np.mean(total ** 2)) if len(total) else 0.0
+    if not square > 0.0:
+        return {}
+    part_of = {name: float(np.mean(part * total)) / square for name, part in found.items()}
+    left = part_of.pop('left')
+    return {**part_of, 'reference': min(own / square, max(left, 0.0)),
+            'left': max(left - own / square, 0.0)}
+
+
+def heading_curve(parts: Mapping[str, Array], time: Array) -> HeadingCurve:
+    """Return the heading error over a log, of all parts and of what is left (see `shares`)."""
+    total = sum(parts.values(), 0.0 * parts['left'])
+    before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in (total, parts['left']))
+    return HeadingCurve(time, before, after)
 
 
 def change_over(squares: Array, count: Array) -> Change:

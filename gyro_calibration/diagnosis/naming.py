@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.factors import unit_of_offset
@@ -30,6 +31,20 @@ _POWER = 0.95
 _DEVIATIONS = 1.96
 #: Names of what has no other.
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
+
+
+_REMEDIES = {
+    'gyro': 'add it to the model of the gyro',
+    'reference': 'mend or replace the reference, or see that it does not enter a calibration',
+    'record': 'mend the recording',
+    'noise': 'take the figures of the extended model'}
+
+
+def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float]) -> list[Finding]:
+    """Return findings with their share of the heading error, and what to do about them."""
+    return [replace(each, share_of_heading_error=shares.get(each.effect),
+                    remedy=each.remedy or _REMEDIES[CAUSES[each.effect].of])
+            for each in findings]
 
 
 def named_finding(search: Search, found: Outcome, place: int, p_value: float,

@@ -284,6 +284,16 @@ class Fitted:
         prior = self.spans.treatment.prior
         return min(half, 1.96 * prior[place]) if place < len(prior) else half
 
+    def places(self, cause: Column) -> slice:
+        """Return the places of the values of a cause."""
+        start = len(PLAIN)
+        for each in self.causes:
+            width = self.spans.columns(each).shape[1]
+            if each == cause:
+                break
+            start += width
+        return slice(start, start + width)
+
     def size(self, name: str) -> float:
         """Return the likeliest size of a part of the noise."""
         return float(self.fit.likely.get(name, 0.0))

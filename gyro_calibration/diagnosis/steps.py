@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
+from gyro_calibration.diagnosis.candidate_experiments import distinguishing
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
 from gyro_calibration.diagnosis.curves import (
@@ -27,7 +28,6 @@ from gyro_calibration.diagnosis.curves import (
     what_is_left,
 )
 from gyro_calibration.diagnosis.door import model_gate, refuse, rests
-from gyro_calibration.diagnosis.experiment import separating
 from gyro_calibration.diagnosis.extension import (
     calibrated,
     doubts_scale,
@@ -41,9 +41,9 @@ from gyro_calibration.diagnosis.figures import NAMES, noise_figures, NoiseFigure
 from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
 from gyro_calibration.diagnosis.gain import gain
 from gyro_calibration.diagnosis.gates import gates, mismatch
-from gyro_calibration.diagnosis.heading_reference import diagnose_heading
 from gyro_calibration.diagnosis.hygiene import decided, Hygiene, inspect
 from gyro_calibration.diagnosis.naming import named_finding, unexplained
+from gyro_calibration.diagnosis.noisy_reference import diagnose_beside
 from gyro_calibration.diagnosis.outcome import Outcome
 from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.reference import limits, reference_of
@@ -125,7 +125,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     told = [reference_of(log, kind) for log in logs]
     if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], told[0]):
         say('search')
-        answer = diagnose_heading(logs[0], told[0], model, rate)
+        answer = diagnose_beside(logs[0], told[0], model, rate)
         return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
     say('hygiene')
     hygiene = [decided(inspect(log, model)) for log in logs]
@@ -359,7 +359,7 @@ def _separated(search: Search, found: Outcome, place: int, members: Sequence[Nam
     """Return the experiment that parts the members of a set."""
     known = found.named[place]
     others = [each for each in members if each.candidate.cause != known.candidate.cause]
-    return (separating(search.field, found.named, known, others, generator).sentence if others
+    return (distinguishing(search.field, found.named, known, others, generator).sentence if others
             else '')
 
 

@@ -14,11 +14,15 @@ from dataclasses import replace
 import re
 import zlib
 
+from gyro_calibration.diagnosis.candidate_experiments import (
+    candidate_experiments,
+    distinguishing,
+    ENOUGH,
+    observed_range,
+)
 from gyro_calibration.diagnosis.candidates import Candidate, effect
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.experiment import ENOUGH, separating
 from gyro_calibration.diagnosis.field import field, Named
-from gyro_calibration.diagnosis.menu import menu, reach
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import alternatives, begin, searched
 from gyro_calibration.logs.log import DEGREE, Log
@@ -127,7 +131,7 @@ def test_two_that_are_alike_are_parted_by_what_physics_would_have(pair):
     known = Named(put(pair[0], hidden), (size,) if given else ())
     rival = Named(put(pair[1], hidden), alike.get(pair[1], ()))
     whole = field([laid(hidden)])
-    found = separating(whole, [known], known, [rival], np.random.default_rng(3))
+    found = distinguishing(whole, [known], known, [rival], np.random.default_rng(3))
     if not PROPOSED[pair]:
         assert found.conditions is None and found.sentence == CAUSES[pair[0]].separate_by
         return
@@ -144,8 +148,8 @@ def _log():
 
 def test_experiments_keep_within_what_the_log_has_shown_or_say_that_they_go_beyond(log):
     whole = laid(log)
-    seen = reach([whole])
-    for plan in menu(seen, [whole]):
+    seen = observed_range([whole])
+    for plan in candidate_experiments(seen, [whole]):
         inside = (np.abs(plan.rate).max() <= np.abs(whole.channels.rate).max() * (1.0 + 1e-9)
                   and plan.temperature.min() >= whole.channels.temperature.min() - 1e-9
                   and plan.temperature.max() <= whole.channels.temperature.max() + 1e-9)
@@ -155,7 +159,7 @@ def test_experiments_keep_within_what_the_log_has_shown_or_say_that_they_go_beyo
 
 def test_words_of_an_experiment_give_its_numbers(log):
     whole = laid(log)
-    for plan in menu(reach([whole]), [whole]):
+    for plan in candidate_experiments(observed_range([whole]), [whole]):
         minutes = [int(found) for found in re.findall(r'(\d+) min\b', plan.to_do)]
         assert not minutes or abs(max(minutes) - plan.minutes) <= 1.0, plan.to_do
         rates = [float(found) for found in re.findall(r'up to ([\d.]+) deg/s', plan.to_do)]
@@ -169,10 +173,11 @@ def test_words_of_an_experiment_give_its_numbers(log):
 
 def test_an_experiment_can_be_simulated(log):
     whole = laid(log)
-    plan = next(each for each in menu(reach([whole]), [whole]) if each.name == 'reversals')
+    plan = next(each for each in candidate_experiments(observed_range([whole]), [whole])
+                if each.name == 'reversals')
     simulated = simulate(GyroModel(()), from_rates(plan.time, plan.rate),
                          1.0 / (plan.time[1] - plan.time[0]))
-    assert simulated.output == pytest.approx(plan.log().reference_rate, abs=1e-5)
+    assert simulated.output == pytest.approx(plan.rate, abs=1e-5)
     assert plan.replay(np.random.default_rng(0)).duration == pytest.approx(60.0 * plan.minutes,
                                                                            rel=0.05)
 
@@ -182,8 +187,8 @@ def test_a_cause_that_none_of_the_experiments_parts_is_said_to_stay():
                   sample_rate=20.0)
     known, rival = Named(FIRST['bias_temperature']), Named(FIRST['supply_sensitivity'])
     same = Named(Candidate('bias_temperature_quadratic', (), known.candidate.columns))
-    found = separating(field([laid(hidden)]), [known], known, [rival, same],
-                       np.random.default_rng(3))
+    found = distinguishing(field([laid(hidden)]), [known], known, [rival, same],
+                           np.random.default_rng(3))
     assert (found.name
             and found.sentence.endswith('; bias_temperature_quadratic would stay possible'))
 
@@ -229,7 +234,8 @@ def test_a_set_becomes_one_name_by_the_experiment_that_is_proposed(pair):
     for _ in range(ROUNDS):
         if len(named) != 1 or not rivals[0]:
             break
-        proposed = separating(search.field, named, named[0], rivals[0], np.random.default_rng(3))
+        proposed = distinguishing(search.field, named, named[0], rivals[0],
+                                  np.random.default_rng(3))
         replays.append(laid(carried_out(proposed.conditions, hidden, generator)))
         search, named, rivals = answer(replays)
     assert names(named) == [true] and rivals == [[]], (true, proposed.sentence)
