@@ -69,7 +69,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
 from diagnosed import diagnosis_of, Judged, judged, won  # noqa: E402
-from gyro_calibration.diagnosis.finding import Finding  # noqa: E402
+from gyro_calibration.diagnosis.findings import Finding  # noqa: E402
 from hidden import Cause, FORMS, HiddenLog, hide, OUTSIDE, twin, TWINS  # noqa: E402
 from hidden.effects import AGAINST_A_MODEL  # noqa: E402
 from hidden.reference import hide_beside, Imperfect  # noqa: E402

@@ -32,8 +32,8 @@ import os
 from pathlib import Path
 import time
 
-from gyro_calibration.diagnosis.finding import Diagnosis, Finding
-from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.findings import Diagnosis, Finding
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, QUANTITIES, read_log
 import numpy as np

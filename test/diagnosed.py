@@ -16,8 +16,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 import itertools
 
-from gyro_calibration.diagnosis.finding import Diagnosis, Finding
-from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.findings import Diagnosis, Finding
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import COLUMNS, Log
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term

@@ -22,7 +22,7 @@ from gyro_calibration.diagnosis.candidate_experiments import (
 )
 from gyro_calibration.diagnosis.candidates import Candidate, effect
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.field import field, Named
+from gyro_calibration.diagnosis.regression_problem import Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import alternatives, begin, searched
 from gyro_calibration.logs.log import DEGREE, Log
@@ -130,7 +130,7 @@ def test_two_that_are_alike_are_parted_by_what_physics_would_have(pair):
     alike = {'reference_scale': (-size,), 'thermal_lag': (-size / FIRST['thermal_lag'].shapes[0],)}
     known = Named(put(pair[0], hidden), (size,) if given else ())
     rival = Named(put(pair[1], hidden), alike.get(pair[1], ()))
-    whole = field([laid(hidden)])
+    whole = regression_problem([laid(hidden)])
     found = distinguishing(whole, [known], known, [rival], np.random.default_rng(3))
     if not PROPOSED[pair]:
         assert found.conditions is None and found.sentence == CAUSES[pair[0]].separate_by
@@ -187,7 +187,7 @@ def test_a_cause_that_none_of_the_experiments_parts_is_said_to_stay():
                   sample_rate=20.0)
     known, rival = Named(FIRST['bias_temperature']), Named(FIRST['supply_sensitivity'])
     same = Named(Candidate('bias_temperature_quadratic', (), known.candidate.columns))
-    found = distinguishing(field([laid(hidden)]), [known], known, [rival, same],
+    found = distinguishing(regression_problem([laid(hidden)]), [known], known, [rival, same],
                            np.random.default_rng(3))
     assert (found.name
             and found.sentence.endswith('; bias_temperature_quadratic would stay possible'))
@@ -234,7 +234,7 @@ def test_a_set_becomes_one_name_by_the_experiment_that_is_proposed(pair):
     for _ in range(ROUNDS):
         if len(named) != 1 or not rivals[0]:
             break
-        proposed = distinguishing(search.field, named, named[0], rivals[0],
+        proposed = distinguishing(search.problem, named, named[0], rivals[0],
                                   np.random.default_rng(3))
         replays.append(laid(carried_out(proposed.conditions, hidden, generator)))
         search, named, rivals = answer(replays)

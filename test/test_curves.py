@@ -11,8 +11,8 @@
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
 from gyro_calibration.diagnosis.curves import curves, what_is_left
-from gyro_calibration.diagnosis.field import field, work
-from gyro_calibration.diagnosis.outcome import Outcome
+from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.regression_problem import fitted, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.noise import Noise, simulate_noise
@@ -36,7 +36,7 @@ def record(noise, generator, duration, interval):
 def inside(log, generator):
     """Return which bins of all curves but the spectrum are within their bands, and how many."""
     laid = replay(log, np.ones(len(log.time), dtype=bool), generator)
-    found = Outcome(work(field([laid]), []), (laid,))
+    found = FittedValues(fitted(regression_problem([laid]), []), (laid,))
     shown = [each for each in curves(what_is_left(found), found) if each.along != 'frequency']
     off = np.concatenate([np.abs(each.after) / each.deviation for each in shown])
     assert ({'time', 'rate', 'heading', 'temperature', 'specific_force'}

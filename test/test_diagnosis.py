@@ -23,13 +23,23 @@ import secrets
 from diagnosed import described as told
 from diagnosed import diagnosis_of, held, judged_diagnosis, log_of, model_of, won
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import model_text, read_model
 from gyro_calibration.model.simulation import respond
-from hidden import described, draw_gyro, FORMS, hide, KINDS, NoiseFigures, OUTSIDE, record, session
+from hidden import (
+    described,
+    draw_gyro,
+    FORMS,
+    hide,
+    KINDS,
+    NoiseFigures,
+    OUTSIDE,
+    record,
+    session,
+)
 from hidden.effects import AGAINST_A_MODEL
 import numpy as np
 import pytest

@@ -22,7 +22,7 @@ from pathlib import Path
 import re
 import shlex
 
-from gyro_calibration.diagnosis.finding import Estimate
+from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.units import amount, quantity
 import pytest
 

@@ -13,7 +13,7 @@
 from dataclasses import replace
 
 from gyro_calibration.diagnosis.gates import gates
-from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DEGREE, Log
 import numpy as np

@@ -10,14 +10,14 @@
 
 """Noise within the bounds that a model states is that of the model, and no finding."""
 
-from gyro_calibration.diagnosis.figures import NoiseFigures
-from gyro_calibration.diagnosis.steps import _of_noise
+from gyro_calibration.diagnosis.noise_parameters import NoiseParameters
+from gyro_calibration.diagnosis.pipeline import _of_noise
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import pytest
 
-FIGURES = NoiseFigures(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
-                       {'angle_random_walk': 1e-9})
+FIGURES = NoiseParameters(Noise(1.1e-3), {'angle_random_walk': (1.05e-3, 1.15e-3)},
+                          {'angle_random_walk': 1e-9})
 
 
 @pytest.mark.parametrize('bounds, found', [

@@ -12,9 +12,9 @@
 
 from dataclasses import replace
 
-from gyro_calibration.diagnosis.door import refuse
+from gyro_calibration.diagnosis.input_validation import refuse
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term

@@ -21,7 +21,7 @@ import signal
 import subprocess
 import time
 
-from gyro_calibration.diagnosis.finding import (
+from gyro_calibration.diagnosis.findings import (
     Change,
     Curve,
     Diagnosis,

@@ -21,11 +21,11 @@ from gyro_calibration.diagnosis.candidates import (
     fitted_shapes,
     with_shape,
 )
-from gyro_calibration.diagnosis.field import field, Named, work
-from gyro_calibration.diagnosis.probes import is_named, probes
+from gyro_calibration.diagnosis.generic_terms import generic_terms, is_named
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.regression_problem import fitted, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin, evidence_of, searched
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from hidden import hide
@@ -57,7 +57,7 @@ def found_in(replays):
 
 
 def gained(search, named):
-    return work(search.field, named).score - work(search.field, []).score
+    return fitted(search.problem, named).score - fitted(search.problem, []).score
 
 
 # sets and prices
@@ -105,16 +105,17 @@ def test_a_shape_that_is_fitted_stays_within_what_a_model_may_hold(name, value):
 
 def test_a_shape_at_its_bound_has_a_deviation():
     rate = np.sin(0.7 * TIME) * np.sin(0.11 * TIME)
-    whole = field([laid(Log(output=rate + NOISE * np.random.default_rng(
+    whole = regression_problem([laid(Log(output=rate + NOISE * np.random.default_rng(
         0).standard_normal(len(rate)), time=TIME, reference_rate=rate))])
-    assert (0, -1) in work(whole, [Named(effect('time_offset', 1.0), (1.0,))]).owner
+    assert (0, -1) in fitted(whole, [Named(effect('time_offset', 1.0), (1.0,))]).owner
 
 
 def test_what_a_tone_changes_by_with_its_frequency_is_its_derivative_in_a_long_log():
     time, frequency = np.arange(45_000) / 50.0, 20.0
     each = laid(resting(time=time))
-    done = work(field([each]), [Named(effect('interference_tone', frequency, run=0), (1.0, 0.0))])
-    column = done.columns[done.owner.index((0, -1))] * done.field.deviation
+    done = fitted(regression_problem([each]),
+                  [Named(effect('interference_tone', frequency, run=0), (1.0, 0.0))])
+    column = done.columns[done.owner.index((0, -1))] * done.problem.deviation
     phase = Candidate('', (), lambda replayed: (
         2.0 * np.pi * replayed.channels.time * np.cos(2.0 * np.pi * frequency * time),))
     assert column == pytest.approx(columns_of(phase, [each])[0], abs=0.02 * np.abs(column).max())
@@ -204,7 +205,7 @@ def test_what_a_log_cannot_show_is_not_searched_for():
             'thermal_lag'} <= {name for name in shown if 'hardly' in shown[name]}
     assert 'bias' in shown['scale_factor_asymmetry'] and 'quadratic_nonlinearity' not in shown
     replays = [laid(log)]
-    searched_for = {each.cause for each in (*candidates(replays), *probes(replays))}
+    searched_for = {each.cause for each in (*candidates(replays), *generic_terms(replays))}
     assert not [name for name in searched_for if 'temperature' in name
                 or shown.get(name, '').endswith('changes')]
     assert 'rate_ramp' in {each.cause for each in candidates(replays) if is_named(each)}

@@ -10,7 +10,7 @@
 
 """Stamps that a host gives on arrival: delayed samples are not lost, and lost ones are counted."""
 
-from gyro_calibration.diagnosis.hygiene import inspect
+from gyro_calibration.diagnosis.data_quality import inspect
 from gyro_calibration.logs.log import Log
 from gyro_calibration.logs.stamps import number_stamps
 import numpy as np

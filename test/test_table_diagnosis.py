@@ -19,9 +19,9 @@ import runpy
 from gyro_calibration.calibration.dwells import join
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.scatter import rms, Scatter
-from gyro_calibration.diagnosis import dwell_rest
-from gyro_calibration.diagnosis import table as diagnosis
-from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.diagnosis import dwell_structure
+from gyro_calibration.diagnosis import rate_table as diagnosis
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 from gyro_calibration.model.effects import (
     BIAS,
@@ -243,10 +243,12 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     table = Table().measure(GyroModel(LINEAR), generator)
     table = replace(table, output=table.output + 0.03 * DEGREE * np.sin(6.0 * table.rate + 1.0))
     fit = fit_effects(table, [term.effect for term in LINEAR])
-    certain, probes = np.zeros((np.count_nonzero(fit.scatter.kept), 1)), dwell_rest._probes(table)
-    found = dwell_rest.what_is_left(fit, 1e-3, certain).found[0]
-    monkeypatch.setattr(dwell_rest, '_probes', lambda dwells: {found.along: probes[found.along]})
-    alone = dwell_rest.what_is_left(fit, 1e-3, certain).found[0]
+    certain = np.zeros((np.count_nonzero(fit.scatter.kept), 1))
+    probes = dwell_structure._probes(table)
+    found = dwell_structure.what_is_left(fit, 1e-3, certain).found[0]
+    monkeypatch.setattr(dwell_structure, '_probes',
+                        lambda dwells: {found.along: probes[found.along]})
+    alone = dwell_structure.what_is_left(fit, 1e-3, certain).found[0]
     tried = sum(columns.shape[1] > 0 for columns in probes.values())
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 

@@ -21,8 +21,8 @@ The logs are simulated here, so that the truth is known. With logs of your own:
 from pathlib import Path
 import sys
 
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.heading.log_compensation import compensate_log

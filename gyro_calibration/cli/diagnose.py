@@ -29,12 +29,12 @@ from gyro_calibration.cli.verb import (
     verb,
     whole,
 )
-from gyro_calibration.diagnosis.extension import calibrated
-from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.extended_model import calibrated
+from gyro_calibration.diagnosis.findings import Diagnosis
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.reference import KINDS
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import write_atomically
 from gyro_calibration.logs.log import Log

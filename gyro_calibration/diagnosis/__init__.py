@@ -11,19 +11,20 @@
 """
 Diagnosis: what a simulation of a gyro gets wrong, why, and what extending its model improves.
 
-Reading order, each imports only from those before it: `finding` (what is found, as records),
-`causes` (that can be named), `compared` (output and reference), `codes` (of a digital output),
-`stuck` (samples), `wild` (samples), `factors` (of units), `gates` (whether gyro and reference
-belong together), `door` (where logs are refused), `hygiene` (of a record), `reference` (its kind),
-`spectrum` (of the noise), `replay` (of a log), `candidates` (columns of causes), `probes` (of what
-has no name), `evidence` (for causes), `field` (logs as a regression), `search` (for causes),
-`units` (of people), `candidate_experiments` (that distinguish causes), `outcome` (of a search, in
-values), `figures` (of noise), `extension` (of the model), `gain` (on what was held out), `curves`
-(for people to see), `naming` (of findings); where the reference limits what is known, `regression`
-(on spans), `confirmation` (of causes), `noisy_reference` (the diagnosis of such a log); `steps`
-(of a diagnosis, in order), `dwell_fit` (of what a model leaves of a rate table), `dwell_sets`
-(that dwells cannot part), `dwell_rest` (what has no name), `dwell_gain` (on sweeps left out),
-`table` (the diagnosis of a rate table), `words` (for people), `markup` (of pages), `charts` (in
-pages), `report` (the page).
+Reading order, each imports only from those before it: `findings` (what is found, as records),
+`causes` (that can be named), `expected_output` (by the reference), `quantization` (codes and
+limits of an output), `repeated_samples`, `outliers`, `unit_confusion`, `gates` (whether gyro and
+reference belong together), `input_validation` (which logs are refused), `data_quality` (of a
+record), `reference` (its kind), `spectrum` (of the noise), `replay` (of a log), `candidates`
+(columns of causes), `generic_terms` (of what has no name), `noise_likelihood` (with a cause, under
+every noise), `regression_problem` (logs as a regression), `search` (for causes), `units` (of
+people), `candidate_experiments` (that distinguish causes), `fitted_values` (of what was found),
+`noise_parameters`, `extended_model`, `cross_validation` (on what was held out), `curves` (for
+people to see), `build_findings`; where the reference limits what is known, `spans` (of heading, as
+a regression), `confirmation` (of causes), `noisy_reference` (the diagnosis of such a log);
+`pipeline` (of a diagnosis, in order), `dwell_fit` (of what a model leaves of a rate table),
+`dwell_confounders` (that dwells cannot distinguish), `dwell_structure` (what has no name),
+`dwell_cross_validation` (on sweeps left out), `rate_table` (the diagnosis of a rate table),
+`words` (for people), `markup` (of pages), `charts` (in pages), `report` (the page).
 
 """

@@ -29,7 +29,14 @@ import math
 
 from gyro_calibration.diagnosis.candidates import columns_of, with_shape
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.field import Field, free_shapes, is_of_the_rate, Named, seen, work
+from gyro_calibration.diagnosis.regression_problem import (
+    fitted,
+    free_shapes,
+    is_of_the_rate,
+    Named,
+    RegressionProblem,
+    seen,
+)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.spectrum import angles, Shape
 from gyro_calibration.diagnosis.units import number
@@ -397,8 +404,8 @@ def _cycles(seen: ObservedRange) -> Iterator[Conditions]:
 
 # how far they distinguish causes
 
-def distinguishing(whole: Field, named: Sequence[Named], known: Named, rivals: Sequence[Named],
-                   generator: np.random.Generator) -> Experiment:
+def distinguishing(whole: RegressionProblem, named: Sequence[Named], known: Named,
+                   rivals: Sequence[Named], generator: np.random.Generator) -> Experiment:
     """
     Return the shortest experiment that tells a named cause from its rivals, or else the best.
 
@@ -414,10 +421,10 @@ def distinguishing(whole: Field, named: Sequence[Named], known: Named, rivals: S
     """
     others = tuple(each for each in named if each is not known)
     members = tuple(_valued(whole, others, each, known) for each in (known, *rivals))
-    done = work(whole, [*others, members[0]])
-    best = int(done.judged.likelihood[0].argmax())
-    question = _Question(others, members, done.field.shapes[best],
-                         float(done.judged.squares[0, best]) / done.by.freedom,
+    done = fitted(whole, [*others, members[0]])
+    best = int(done.by_noise.likelihood[0].argmax())
+    question = _Question(others, members, done.problem.shapes[best],
+                         float(done.by_noise.squares[0, best]) / done.marginalized.freedom,
                          min(each.step for each in whole.replays))
     have = _root(question, whole.replays)
     # what happens once does not happen in another log
@@ -461,7 +468,8 @@ def _gone(known: Named) -> Named:
     return replace(known, candidate=replace(known.candidate, run=-1)) if once else known
 
 
-def _valued(whole: Field, others: tuple[Named, ...], rival: Named, known: Named) -> Named:
+def _valued(whole: RegressionProblem, others: tuple[Named, ...], rival: Named,
+            known: Named) -> Named:
     """Return a cause with the values that fit best, where it has none."""
     candidate = rival.candidate
     if rival.values:
@@ -471,7 +479,7 @@ def _valued(whole: Field, others: tuple[Named, ...], rival: Named, known: Named)
     if known.candidate.cause == 'bias':
         column = np.concatenate([candidate.columns(each)[0] for each in whole.replays])
         return replace(rival, values=(known.values[0] / float(column.mean()),))
-    done = work(whole, [*others, rival])
+    done = fitted(whole, [*others, rival])
     found = dict(zip(done.owner, done.estimates[0]))
     width = len(candidate.columns(whole.replays[0]))
     return replace(rival, values=tuple(float(found.get((len(others), place), 0.0))

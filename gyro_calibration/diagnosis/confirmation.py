@@ -26,11 +26,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.diagnosis.regression import (
+from gyro_calibration.diagnosis.spans import (
     Column,
     FEWEST_STRETCHES,
-    Fitted,
-    fitted,
+    fit_spans,
+    SpanFit,
     Whitened,
     whitened,
 )
@@ -77,7 +77,7 @@ class Confirmed:
     probability: dict[str, float]
 
 
-def candidates(done: Fitted) -> Iterator[Column]:
+def candidates(done: SpanFit) -> Iterator[Column]:
     """Give the causes that headings over spans can show, for the channels that the log has."""
     log, duration = done.spans.log, float(done.spans.time[-1] - done.spans.time[0])
     fine = done.spans.fine
@@ -116,13 +116,13 @@ def candidates(done: Fitted) -> Iterator[Column]:
         yield Column('supply_sensitivity', (5.0,))
 
 
-def search(done: Fitted, level: float) -> tuple[Fitted, list[Confirmed]]:
+def search(done: SpanFit, level: float) -> tuple[SpanFit, list[Confirmed]]:
     """Add one cause after the other, each confirmed, and fit again with those established."""
     found: list[Confirmed] = []
     offered = list(candidates(done))
     # beside one column of each cause, so that the noise does not swallow what a cause leaves
     columns = {each.cause: each for each in offered if not each.once}
-    rich = fitted(done.spans, list(columns.values()))
+    rich = fit_spans(done.spans, list(columns.values()))
     while len(found) < MOST:
         taken = {each.column.cause for each in found}
         open_ones = [each for each in offered if each.cause not in taken]
@@ -131,12 +131,12 @@ def search(done: Fitted, level: float) -> tuple[Fitted, list[Confirmed]]:
             break
         found.append(best)
     inside = [each.column for each in found if each.established and not each.column.once]
-    return (fitted(done.spans, inside) if inside else done), found
+    return (fit_spans(done.spans, inside) if inside else done), found
 
 
 def _best(
-    done: Fitted,
-    rich: Fitted,
+    done: SpanFit,
+    rich: SpanFit,
     open_ones: Sequence[Column],
     beside: Sequence[Column],
     level: float,

@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from gyro_calibration.allan import allan_deviation
-from gyro_calibration.diagnosis.field import Work
-from gyro_calibration.diagnosis.finding import Curve, HeadingCurve, NoiseCurve
-from gyro_calibration.diagnosis.outcome import joined, Outcome
+from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
+from gyro_calibration.diagnosis.fitted_values import FittedValues, joined
+from gyro_calibration.diagnosis.regression_problem import Fitted
 from gyro_calibration.diagnosis.replay import Replay, white_deviation
 from gyro_calibration.diagnosis.spectrum import transform
 from gyro_calibration.logs.log import Array
@@ -31,7 +31,7 @@ BINS, POINTS = 40, 600
 _ALLAN_SAMPLES = 1 << 18
 
 
-def what_is_left(found: Outcome) -> list[Array]:
+def what_is_left(found: FittedValues) -> list[Array]:
     """Return what is left of each log without its bias, rad/s, shape (n,)."""
     return [residual - bias for residual, bias in zip(found.residuals, found.biases)]
 
@@ -41,7 +41,7 @@ def beside_model(replays: Sequence[Replay]) -> list[Array]:
     return [each.channels.output - each.reference for each in replays]
 
 
-def curves(before: Sequence[Array], after: Outcome) -> list[Curve]:
+def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
     """
     Return the mean residual in bins of each variable that changes in the logs.
 
@@ -82,7 +82,7 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
 
 
 def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
-           after: Outcome) -> Curve:
+           after: FittedValues) -> Curve:
     """Bin evenly between the quantiles that hold nearly all, without bins of few samples."""
     at = joined(parts)
     low, high = np.quantile(at, [0.001, 0.999])
@@ -99,7 +99,7 @@ def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array]
                  np.sqrt(_variances(after, bins)[enough]) / count[enough], simulated)
 
 
-def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
+def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     Return the variance by noise of the sum of the residual in each bin, (rad/s)², shape (BINS,).
 
@@ -109,7 +109,7 @@ def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
     """
     total = np.zeros(BINS)
     for each, residual, variance, place in zip(after.replays, after.residuals,
-                                               _spectra(after.work), bins):
+                                               _spectra(after.fitted), bins):
         point = np.minimum(each.place // each.every, each.points - 1)
         held = np.bincount(place * each.points + point, minlength=BINS * each.points).reshape(
             BINS, each.points).astype(float)
@@ -119,17 +119,17 @@ def _variances(after: Outcome, bins: Sequence[NDArray[np.intp]]) -> Array:
     return total
 
 
-def _spectra(done: Work) -> list[Array]:
+def _spectra(done: Fitted) -> list[Array]:
     """Return each log's variances of coefficients, averaged over noises, shape (points - 1,)."""
-    whole, judged = done.field, done.judged
-    relative = (judged.probability[0] * judged.squares[0] / done.by.freedom) @ (
+    whole, judged = done.problem, done.by_noise
+    relative = (judged.probability[0] * judged.squares[0] / done.marginalized.freedom) @ (
         1.0 / whole.noises.weights)
     count = np.diff(np.append(whole.starts, len(whole.deviation)))
     variance = whole.deviation ** 2 * np.repeat(relative, count)
     return np.split(variance, np.cumsum([each.points - 1 for each in whole.replays])[:-1])
 
 
-def _spectrum(before: Sequence[Array], after: Outcome) -> Curve:
+def _spectrum(before: Sequence[Array], after: FittedValues) -> Curve:
     """Return the largest amplitude of the first log's residual in bins of frequency."""
     each = after.replays[0]
     series = [each.on_grid(left[0]) for left in (before, what_is_left(after))]
@@ -145,7 +145,7 @@ def _spectrum(before: Sequence[Array], after: Outcome) -> Curve:
     return Curve('frequency', 'Hz', middle, largest[0], largest[1], usual, np.zeros(len(middle)))
 
 
-def heading_curve(before: Sequence[Array], after: Outcome) -> HeadingCurve:
+def heading_curve(before: Sequence[Array], after: FittedValues) -> HeadingCurve:
     """Return the heading error over the first log, by its residual before and after extension."""
     each = after.replays[0]
     lines = [np.cumsum(each.on_grid(left[0])) * each.step
@@ -154,7 +154,7 @@ def heading_curve(before: Sequence[Array], after: Outcome) -> HeadingCurve:
     return HeadingCurve(some * each.step, lines[0][some], lines[1][some])
 
 
-def noise_curve(after: Outcome, fitted: Noise, expected: Noise) -> NoiseCurve:
+def noise_curve(after: FittedValues, fitted: Noise, expected: Noise) -> NoiseCurve:
     """Return Allan deviations: of the residual of the first log, of fitted and simulated noise."""
     each = after.replays[0]
     chart = allan_deviation(each.on_grid(after.residuals[0])[:_ALLAN_SAMPLES], each.step)

@@ -32,7 +32,7 @@ from gyro_calibration.calibration.rate_table import (
 )
 from gyro_calibration.calibration.scatter import Scatter, Uncertainty, Whitener
 from gyro_calibration.calibration.selection import part_twins, supported_effects, TECHNOLOGIES
-from gyro_calibration.diagnosis.extension import origins_before, wider
+from gyro_calibration.diagnosis.extended_model import origins_before, wider
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.effects import (
     BIAS,

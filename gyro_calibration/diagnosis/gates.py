@@ -24,9 +24,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.diagnosis.compared import bridged, scale_of
-from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
-from gyro_calibration.diagnosis.finding import Estimate, Finding, Gate
+from gyro_calibration.diagnosis.expected_output import bridged, scale_of
+from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
+from gyro_calibration.diagnosis.unit_confusion import FACTORS, is_far, unit_of_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np

@@ -17,10 +17,20 @@ from collections.abc import Iterator
 from dataclasses import replace
 import math
 
+from gyro_calibration.diagnosis.build_findings import with_remedies
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.confirmation import candidates, Confirmed, LEAST_CHANCE, search
-from gyro_calibration.diagnosis.extension import with_terms
-from gyro_calibration.diagnosis.finding import (
+from gyro_calibration.diagnosis.cross_validation import (
+    change_over,
+    heading_curve,
+    over_windows,
+    shares,
+    WINDOW,
+    WITHIN,
+)
+from gyro_calibration.diagnosis.data_quality import inspect
+from gyro_calibration.diagnosis.extended_model import with_terms
+from gyro_calibration.diagnosis.findings import (
     Curve,
     Diagnosis,
     Estimate,
@@ -29,24 +39,14 @@ from gyro_calibration.diagnosis.finding import (
     Reference,
     Trace,
 )
-from gyro_calibration.diagnosis.gain import (
-    change_over,
-    heading_curve,
-    over_windows,
-    shares,
-    WINDOW,
-    WITHIN,
-)
-from gyro_calibration.diagnosis.hygiene import inspect
-from gyro_calibration.diagnosis.naming import with_remedies
-from gyro_calibration.diagnosis.regression import (
+from gyro_calibration.diagnosis.spans import (
     all_columns,
     Column,
     FEWEST_STRETCHES,
-    Fitted,
-    fitted,
+    fit_spans,
     PLAIN,
     shared_noise,
+    SpanFit,
     spans_of,
     whitened,
 )
@@ -100,7 +100,7 @@ def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
     record = inspect(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
     mended = replace(log, output=np.where(record.trusted, log.output, np.nan))
-    plain = fitted(spans_of(mended if model is None else replace(
+    plain = fit_spans(spans_of(mended if model is None else replace(
         mended, output=compensate_log(model, mended)), reference.kind))
     extended, found = search(plain, _OF_SEARCH * rate)
     gain = _gain(plain, extended)
@@ -147,7 +147,7 @@ def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
 
 # values
 
-def _of_values(done: Fitted, model: GyroModel | None, rate: float,
+def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
                reference: Reference) -> Iterator[Finding]:
     """Give delay, and beside a model bias and scale factor error, where they are established."""
     lag = next((each for each in done.causes if each.cause == 'bandwidth'), None)
@@ -190,7 +190,7 @@ def _of_values(done: Fitted, model: GyroModel | None, rate: float,
             evidence=f'it rests on {effective:.0f} stretches', along=cause.along, remedy=remedy)
 
 
-def _may_lag(done: Fitted, delay: float) -> bool:
+def _may_lag(done: SpanFit, delay: float) -> bool:
     """Tell whether a lag explains the log as well as the delay does."""
     if not done.spans.fine:
         return True
@@ -201,7 +201,7 @@ def _may_lag(done: Fitted, delay: float) -> bool:
     return abs(square - 0.5 * delay ** 2) < _RULED_OUT * math.sqrt(inverse[place, place])
 
 
-def _wander_of(done: Fitted, model: GyroModel) -> float:
+def _wander_of(done: SpanFit, model: GyroModel) -> float:
     """Return the variance of the mean of a log about the bias of a model, by their wander."""
     duration = float(done.spans.time[-1] - done.spans.time[0])
     return max(2.0 / math.pi * each.bias_instability ** 2
@@ -209,9 +209,9 @@ def _wander_of(done: Fitted, model: GyroModel) -> float:
                for each in (_noise(done), model.noise))
 
 
-def _finding(each: Confirmed, extended: Fitted, plain: Fitted) -> Finding:
+def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
     """Return a cause that the search found, with its values from a fit that holds it."""
-    done = extended if each.established else fitted(plain.spans, [each.column])
+    done = extended if each.established else fit_spans(plain.spans, [each.column])
     name, known, places = each.column.cause, CAUSES[each.column.cause], done.places(each.column)
     values = done.values[places]
     half = np.array([done.half(place) for place in range(places.start, places.stop)])
@@ -248,7 +248,7 @@ def _lag(square: float, half: float) -> Estimate:
     return Estimate(size, (low, high), 's')
 
 
-def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
+def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
     """Return a model with scale factor error, bias, and the causes of the gyro that are fitted."""
     own = 1.0 + sum(term.values[0] for term in given.terms if term.effect is SCALE_FACTOR_ERROR)
     scale, bias = (own * float(value) for value in done.values[:2])
@@ -274,7 +274,7 @@ def _model(given: GyroModel, done: Fitted, log: Log) -> GyroModel:
     return new if given.noise.angle_random_walk else replace(new, noise=_noise(done))
 
 
-def _noise(done: Fitted) -> Noise:
+def _noise(done: SpanFit) -> Noise:
     """Return the noise of the gyro; a wander that the log does not show is none."""
     # at the edge of the grid nothing bounds it from below
     return Noise(done.size('angle_random_walk'), **{
@@ -285,7 +285,7 @@ def _noise(done: Fitted) -> Noise:
 
 # what is won
 
-def _contributions(done: Fitted) -> dict[str, Array]:
+def _contributions(done: SpanFit) -> dict[str, Array]:
     """Return what each cause adds to the change of heading over spans, and what is left, rad."""
     values = done.values.copy()
     values[2] -= done.spans.delay
@@ -297,7 +297,7 @@ def _contributions(done: Fitted) -> dict[str, Array]:
     return {name: part[:len(done.spans.time) - 1] for name, part in found.items()}
 
 
-def _gain(plain: Fitted, extended: Fitted) -> Gain | None:
+def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     """Hold out each part of a log in turn, fit the others, and predict heading and rate there."""
     time, spans = plain.spans.time, plain.spans
     duration, count = float(time[-1] - time[0]), len(time) - 1
@@ -343,7 +343,7 @@ def _gain(plain: Fitted, extended: Fitted) -> Gain | None:
 
 # for people
 
-def _cannot_show(plain: Fitted) -> dict[str, str]:
+def _cannot_show(plain: SpanFit) -> dict[str, str]:
     """Say of each cause that was not searched for why such a reference cannot show it."""
     seen = {each.cause for each in candidates(plain)} | _ALWAYS_SEEN
     missing = {channel for channel in ('temperature', 'specific_force', 'supply')
@@ -357,7 +357,7 @@ def _cannot_show(plain: Fitted) -> dict[str, str]:
     return shown
 
 
-def _remarks(reference: Reference, plain: Fitted) -> Iterator[str]:
+def _remarks(reference: Reference, plain: SpanFit) -> Iterator[str]:
     yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); say so with '
            '--reference-kind if it is another. It errs by '
            f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and by '
@@ -377,7 +377,7 @@ def _method(reference: Reference) -> str:
             'are of 95 %.')
 
 
-def _pictures(done: Fitted, parts: dict[str, Array]) -> tuple[Curve, Trace]:
+def _pictures(done: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:
     """Return what is left along the rate, and the rate as it is measured and simulated."""
     steps, time = np.diff(done.spans.time), done.spans.time
     assert done.spans.log.output is not None

@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 
 from gyro_calibration.calibration.dwells.samples import where_lost
-from gyro_calibration.diagnosis.compared import bridged, white_noise
-from gyro_calibration.diagnosis.finding import Reference
-from gyro_calibration.diagnosis.hygiene import encoder_step
+from gyro_calibration.diagnosis.data_quality import encoder_step
+from gyro_calibration.diagnosis.expected_output import bridged, white_noise
+from gyro_calibration.diagnosis.findings import Reference
 from gyro_calibration.logs.log import Array, DEGREE, Log
 import numpy as np
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 import math
 
-from gyro_calibration.diagnosis.door import evened, FEWEST, prepared
+from gyro_calibration.diagnosis.input_validation import evened, FEWEST, prepared
 from gyro_calibration.diagnosis.spectrum import angles, differentiated, inverse, level, transform
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
 from gyro_calibration.logs.stamps import number_stamps

@@ -19,7 +19,7 @@ from string import Template
 
 import gyro_calibration
 from gyro_calibration.diagnosis.charts import Chart, draw, Line
-from gyro_calibration.diagnosis.finding import (
+from gyro_calibration.diagnosis.findings import (
     Change,
     Curve,
     Diagnosis,

@@ -37,28 +37,28 @@ from gyro_calibration.diagnosis.candidates import (
     spacing_of_steps,
     with_shape,
 )
-from gyro_calibration.diagnosis.evidence import (
-    beside,
+from gyro_calibration.diagnosis.generic_terms import generic_terms, is_named
+from gyro_calibration.diagnosis.noise_likelihood import (
     drawn,
     evidence,
-    judge,
     log_sum,
+    marginalized,
+    noise_likelihood,
     Places,
     sample,
     sums,
 )
-from gyro_calibration.diagnosis.field import (
-    Field,
-    field,
+from gyro_calibration.diagnosis.regression_problem import (
+    Fitted,
+    fitted,
     is_of_the_rate,
     Named,
+    regression_problem,
+    RegressionProblem,
     seen,
     with_columns,
     with_one_more,
-    Work,
-    work,
 )
-from gyro_calibration.diagnosis.probes import is_named, probes
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.spectrum import inverse, transform
 from gyro_calibration.logs.log import Array, DataRefused
@@ -146,7 +146,8 @@ def averaged(found: Array) -> Array:
     return log_sum(found) - np.log(found.shape[-1])
 
 
-def bank(whole: Field, found: Sequence[Candidate], named: Sequence[Named] = ()) -> Bank:
+def bank(whole: RegressionProblem, found: Sequence[Candidate],
+         named: Sequence[Named] = ()) -> Bank:
     """Make the columns of candidates."""
     if not found:
         return Bank((), (), np.empty((0, len(whole.deviation))))
@@ -168,7 +169,7 @@ class Search:
 
     Attributes
     ----------
-    field : the logs
+    problem : the logs
     bank : all candidates, where nothing changes the rate
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
@@ -178,7 +179,7 @@ class Search:
 
     """
 
-    field: Field
+    problem: RegressionProblem
     bank: Bank
     chance: Chance
     rate: float
@@ -197,13 +198,13 @@ class Search:
         return found - self.chance.threshold(cause, self.rate)
 
 
-def screen(done: Work, stock: Bank) -> Array:
+def screen(done: Fitted, stock: Bank) -> Array:
     """Return the evidence of all candidates beside what is named, shape (candidates,)."""
-    noises = done.field.noises
-    by = beside(sums(done.columns, stock.columns, stock.groups, done.field.starts), stock.groups,
-                noises)
-    judged = judge(sample(done.residual[None], done.columns, stock.columns, done.field.starts),
-                   noises, by)
+    noises, starts = done.problem.noises, done.problem.starts
+    by = marginalized(sums(done.columns, stock.columns, stock.groups, starts), stock.groups,
+                      noises)
+    judged = noise_likelihood(sample(done.residual[None], done.columns, stock.columns, starts),
+                              noises, by)
     return _priced(evidence(judged, by, stock.groups), stock)[0]
 
 
@@ -212,21 +213,20 @@ def _priced(found: Array, stock: Bank) -> Array:
     return found - PRICE_OF_COLUMN * np.array([len(group) - 1.0 for group in stock.groups])
 
 
-def chances(done: Work, stock: Bank, generator: np.random.Generator) -> Chance:
+def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance:
     """Draw residuals of noise alone for this log, and see what evidence of causes they show."""
-    probable = done.judged.probability[0]
+    probable = done.by_noise.probability[0]
     kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
-    noises = done.field.noises.take(kept)
-    known = sums(done.columns, stock.columns, stock.groups, done.field.starts)
-    by = beside(known, stock.groups, noises)
+    noises = done.problem.noises.take(kept)
+    known = sums(done.columns, stock.columns, stock.groups, done.problem.starts)
+    by = marginalized(known, stock.groups, noises)
     single = done.columns.astype(np.float32), stock.columns.astype(np.float32)
     found = []
     for _ in range(DRAWS // 100):
         residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100,
                           generator)
-        found.append(_priced(
-            evidence(judge(sample(residuals, *single, done.field.starts), noises, by), by,
-                     stock.groups), stock))
+        judged = noise_likelihood(sample(residuals, *single, done.problem.starts), noises, by)
+        found.append(_priced(evidence(judged, by, stock.groups), stock))
     return _chance(np.concatenate(found), by_cause(stock.candidates))
 
 
@@ -244,13 +244,13 @@ def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
 def begin(replays: Sequence[Replay], generator: np.random.Generator,
           rate: float = 0.006) -> Search:
     """Lay out logs and learn what chance shows in them."""
-    found = [*candidates(replays), *probes(replays)]
-    everywhere = field(replays)
+    found = [*candidates(replays), *generic_terms(replays)]
+    everywhere = regression_problem(replays)
     whole = _of_likely_noises(everywhere, found)
-    done, stock = work(whole, []), bank(whole, found)
+    done, stock = fitted(whole, []), bank(whole, found)
     shown, places = screen(done, stock), by_cause(found)
     if shown.max() > STRONG:
-        whole, done = everywhere, work(everywhere, [])
+        whole, done = everywhere, fitted(everywhere, [])
     tied = frozenset(cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
     return Search(whole, stock, chances(done, stock, generator), rate / len(places), tied=tied)
 
@@ -259,19 +259,19 @@ def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
            rate: float) -> Search:
     """Return a search for some causes in other parts of the logs, at a rate of false alarms."""
     found = [each for each in search.candidates if each.cause in causes]
-    whole = field(replays)
-    return replace(search, field=whole, bank=bank(whole, found), rate=rate,
+    whole = regression_problem(replays)
+    return replace(search, problem=whole, bank=bank(whole, found), rate=rate,
                    scanned=SCANNED & frozenset(causes), banks={}, looked={})
 
 
-def _of_likely_noises(whole: Field, found: Sequence[Candidate]) -> Field:
+def _of_likely_noises(whole: RegressionProblem, found: Sequence[Candidate]) -> RegressionProblem:
     """Leave out noises that are out of the question, both with no cause and with many."""
     middle = [places[len(places) // 2]
               for places in by_cause([each for each in found if is_named(each)]).values()]
-    tried = [work(whole, []), work(whole, [], [found[place] for place in middle])]
-    kept = np.flatnonzero(np.any(
-        [each.judged.likelihood[0] > each.judged.likelihood[0].max() - UNLIKELY for each in tried],
-        axis=0))
+    tried = [each.by_noise for each in (fitted(whole, []),
+                                        fitted(whole, [], [found[place] for place in middle]))]
+    kept = np.flatnonzero(np.any([each.likelihood[0] > each.likelihood[0].max() - UNLIKELY
+                                  for each in tried], axis=0))
     if not len(kept):
         raise DataRefused('no noise explains what the simulation leaves, it is so large; see '
                           'whether columns and units are right')
@@ -290,17 +290,17 @@ class _First:
 
 # what happens at any frequency, or at any moment
 
-def _runs(done: Work, cause: str) -> list[int]:
+def _runs(done: Fitted, cause: str) -> list[int]:
     """Return the logs in which one more of a cause is looked for."""
     taken = [known.candidate.run for known in done.named if known.candidate.cause == cause]
-    return [run for run in range(len(done.field.replays)) if taken.count(run) < MOST_OF[cause]]
+    return [run for run in range(len(done.problem.replays)) if taken.count(run) < MOST_OF[cause]]
 
 
-def tones(done: Work) -> list[_First]:
+def tones(done: Fitted) -> list[_First]:
     """Return the strongest tone of all logs; in each, a tone has its own size and phase."""
     found, left = [], done.white()
     for run in _runs(done, 'interference_tone'):
-        each, white = done.field.replays[run], left[run]
+        each, white = done.problem.replays[run], left[run]
         # Twice as long: a tone between two frequencies of the log would lose half of its power.
         power = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2 / len(white)
         lowest = 2 * LEAST_PERIODS
@@ -342,15 +342,15 @@ def _of_the_gyro(each: Replay, frequency: float) -> bool:
     return bool(output > 0.7 * reference)
 
 
-def slips(done: Work) -> list[_First]:
+def slips(done: Fitted) -> list[_First]:
     """Return the clearest jumps of the reference's heading, where it accelerates."""
     found = []
-    parts = np.cumsum([each.points - 1 for each in done.field.replays])[:-1]
-    divided = np.split(done.field.divided(int(done.judged.likelihood[0].argmax()))
-                       / done.field.deviation, parts)
+    parts = np.cumsum([each.points - 1 for each in done.problem.replays])[:-1]
+    divided = np.split(done.problem.divided(int(done.by_noise.likelihood[0].argmax()))
+                       / done.problem.deviation, parts)
     left = done.white()
     for run in _runs(done, 'reference_slip'):
-        each, white, factor = done.field.replays[run], left[run], divided[run]
+        each, white, factor = done.problem.replays[run], left[run], divided[run]
         acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
         moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
@@ -427,7 +427,7 @@ def _stock(search: Search, named: Sequence[Named]) -> Bank:
         return search.bank
     if key not in search.banks:
         search.banks.clear()  # one is hundreds of megabytes
-        search.banks[key] = bank(search.field, search.candidates, changes)
+        search.banks[key] = bank(search.problem, search.candidates, changes)
     return search.banks[key]
 
 
@@ -439,7 +439,7 @@ class Step:
     score: float
 
 
-def refined(before: Work, candidate: Candidate, price: float) -> Step:
+def refined(before: Fitted, candidate: Candidate, price: float) -> Step:
     """
     Add a cause with the best of its shapes near those given.
 
@@ -495,12 +495,12 @@ def _around(replays: Sequence[Replay], begin: Candidate, place: int) -> tuple[fl
 _POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_rate': 1.0}
 
 
-def _unbent(before: Work, candidate: Candidate) -> Candidate:
+def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
     """Return a cause of fixed amplitude with the shape that its free amplitude suggests."""
     power = _POWERS.get(candidate.cause)
     if power is None:
         return candidate
-    own = columns_of(candidate, before.field.replays) / before.field.deviation
+    own = columns_of(candidate, before.problem.replays) / before.problem.deviation
     free = with_columns(before, own)
     values, _ = free.estimates
     ratio = float(values[-1])
@@ -526,7 +526,7 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
 
 
 def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
-    done = work(search.field, named)
+    done = fitted(search.problem, named)
     first = _first(search, done, named)
     if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
         return None, []
@@ -548,7 +548,7 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     return next(beyond, None), steps
 
 
-def _first(search: Search, done: Work, named: Sequence[Named]) -> list[_First]:
+def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]:
     """Return of each cause the first shape that is the best."""
     found = screen(done, _stock(search, named))
     # What has nothing but shapes is there or not: another one is the first, not well refined.
@@ -566,13 +566,13 @@ def polished(search: Search, named: Sequence[Named]) -> tuple[Named, ...]:
     """Refine all shapes together, and find the values, by the method of Gauss and Newton."""
     current = tuple(named)
     for _ in range(3):
-        done = work(search.field, current)
+        done = fitted(search.problem, current)
         values, _ = done.estimates
         current = tuple(_updated(done, place, values) for place in range(len(current)))
     return current
 
 
-def _updated(done: Work, place: int, values: Array) -> Named:
+def _updated(done: Fitted, place: int, values: Array) -> Named:
     known = done.named[place]
     own = dict(zip(done.owner, values))
     free = tuple(float(own.get((place, number), 0.0)) for number in range(done.widths[place]))
@@ -597,11 +597,10 @@ def searched(search: Search) -> tuple[Named, ...]:
     everything = _grown(search)
     if all(is_named(each.candidate) for each in everything):
         return everything
-    named = _grown(replace(search, bank=bank(search.field, [each for each in search.candidates
-                                                            if is_named(each)]),
-                           banks={}, looked={}))
+    nameable = [each for each in search.candidates if is_named(each)]
+    named = _grown(replace(search, bank=bank(search.problem, nameable), banks={}, looked={}))
     return max((everything, named),
-               key=lambda each: work(search.field, each).score - sum(map(_price, each)))
+               key=lambda each: fitted(search.problem, each).score - sum(map(_price, each)))
 
 
 def _price(known: Named) -> float:
@@ -649,7 +648,7 @@ def _exchanged(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
         if step is None:
             return polished(search, others) if others else others
         if (step.named[-1].candidate.cause != known.candidate.cause
-                and step.score > work(search.field, named).score + 1.0):
+                and step.score > fitted(search.problem, named).score + 1.0):
             return polished(search, step.named)
     return named
 
@@ -668,5 +667,5 @@ def alternatives(search: Search, named: tuple[Named, ...],
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
     """Return the evidence of one of the causes beside the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
-    return (work(search.field, named).score - work(search.field, others).score
+    return (fitted(search.problem, named).score - fitted(search.problem, others).score
             - price_of_freedom(named[place]))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import math
 import re
 
-from gyro_calibration.diagnosis.finding import Estimate, LEAST_PROBABILITY
+from gyro_calibration.diagnosis.findings import Estimate, LEAST_PROBABILITY
 from gyro_calibration.logs.log import DEGREE
 
 _HOUR = 3600.0

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import textwrap
 import unicodedata
 
-from gyro_calibration.diagnosis.finding import Change, Diagnosis, Finding, Unexplained
+from gyro_calibration.diagnosis.findings import Change, Diagnosis, Finding, Unexplained
 from gyro_calibration.diagnosis.units import amount, chance, number, Quantity, quantity
 from gyro_calibration.model.gyro_model import same_effects, Term
 

@@ -39,7 +39,7 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
     wander,
 )
-from gyro_calibration.diagnosis.compared import bridged, white_noise
+from gyro_calibration.diagnosis.expected_output import bridged, white_noise
 from gyro_calibration.diagnosis.reference import integral_of
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.model.channels import channels_of
@@ -251,7 +251,7 @@ class Spans:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class SpanFit:
     """
     A regression with its noise.
 
@@ -365,7 +365,7 @@ def _rests(log: Log, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-def fitted(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> Fitted:
+def fit_spans(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
@@ -397,11 +397,11 @@ def fitted(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> Fitt
 
 def _with_deviations(
     spans: Spans, causes: Sequence[Column], outlying: Array, prior: Array
-) -> Fitted:
+) -> SpanFit:
     fit = _likelihood(spans, all_columns(spans, causes), outlying, prior)
     values = fit.values.copy()
     values[2] += spans.delay
-    done = Fitted(
+    done = SpanFit(
         spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior, outlying
     )
     covariance, effective = _cluster_robust(whitened(done, causes), fit)
@@ -571,7 +571,7 @@ class Whitened:
     plain: Array
     stretch: NDArray[np.intp]
     of_log: int
-    _done: Fitted
+    _done: SpanFit
 
     def columns(self, columns: Array) -> Array:
         """Return more columns, shape (n + r, k), in units of the noise, shape (n + r + m, k)."""
@@ -580,7 +580,7 @@ class Whitened:
 
 
 def whitened(
-    done: Fitted, causes: Sequence[Column], noise: Fitted | None = None, most: bool = False
+    done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = None, most: bool = False
 ) -> Whitened:
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.

@@ -149,7 +149,7 @@ def drawn(noises: Noises, count: Array, probability: Array, draws: int,
 
 
 @dataclass(frozen=True)
-class Beside:
+class Marginalized:
     """
     What nuisances leave of the candidates under each noise.
 
@@ -172,7 +172,7 @@ class Beside:
     freedom: float
 
 
-def beside(known: Sums, groups: Sequence[Group], noises: Noises) -> Beside:
+def marginalized(known: Sums, groups: Sequence[Group], noises: Noises) -> Marginalized:
     """Take the nuisances out of all candidates."""
     own = np.tensordot(noises.weights, known.own, 1)
     crossing = np.tensordot(noises.weights, known.towards, 1)
@@ -183,9 +183,9 @@ def beside(known: Sums, groups: Sequence[Group], noises: Noises) -> Beside:
         part = whole - np.swapaxes(crossing[:, :, list(group)], 1, 2) @ towards[:, :, list(group)]
         left.append(part)
         tied.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
-    return Beside(own, towards, tuple(left),
-                  noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
-                  float(known.count.sum()) - own.shape[1])
+    return Marginalized(own, towards, tuple(left),
+                        noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
+                        float(known.count.sum()) - own.shape[1])
 
 
 def _diagonal(matrices: Array) -> Array:
@@ -193,7 +193,7 @@ def _diagonal(matrices: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Judged:
+class NoiseLikelihood:
     """
     Residuals beside the nuisances, under each noise.
 
@@ -216,17 +216,17 @@ class Judged:
         return top / top.sum(axis=1, keepdims=True)
 
 
-def judge(given: Sample, noises: Noises, by: Beside) -> Judged:
+def noise_likelihood(given: Sample, noises: Noises, by: Marginalized) -> NoiseLikelihood:
     """Take the nuisances out of residuals."""
     own = noises.weights @ given.own
     value = np.linalg.solve(by.own, own[..., None])[..., 0]
     squares = given.squared @ noises.weights.T - (value * own).sum(axis=-1)
     likelihood = -0.5 * (by.freedom * np.log(squares) + by.log_determinant)
     pull = noises.weights @ given.crossed - (own[:, :, None, :] @ by.towards)[:, :, 0]
-    return Judged(likelihood, squares, pull)
+    return NoiseLikelihood(likelihood, squares, pull)
 
 
-def evidence(judged: Judged, by: Beside, groups: Sequence[Group]) -> Array:
+def evidence(judged: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
     """Return the evidence of candidates, shape (d, groups), -inf where tied to nuisances."""
     if not groups:
         return np.empty((len(judged.squares), 0))
@@ -234,7 +234,7 @@ def evidence(judged: Judged, by: Beside, groups: Sequence[Group]) -> Array:
                             for place, group in enumerate(groups)])
 
 
-def _evidence(judged: Judged, by: Beside, place: int, group: list[int]) -> Array:
+def _evidence(judged: NoiseLikelihood, by: Marginalized, place: int, group: list[int]) -> Array:
     if by.tied[place]:
         return np.full(len(judged.squares), -np.inf)
     own, pull = by.left[place], judged.pull[:, :, group]
@@ -246,7 +246,8 @@ def _evidence(judged: Judged, by: Beside, place: int, group: list[int]) -> Array
     return _summary(judged, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
 
 
-def _summary(judged: Judged, gained: Array, logarithm: Array, freedom: float, size: int) -> Array:
+def _summary(judged: NoiseLikelihood, gained: Array, logarithm: Array, freedom: float,
+             size: int) -> Array:
     """Average over the noises: see the module."""
     ratio = np.log1p(-np.minimum(gained / judged.squares, 1.0 - 1e-9))
     change = 0.5 * (size * np.log(judged.squares) - (freedom - size) * ratio - logarithm)

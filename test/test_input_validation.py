@@ -13,10 +13,10 @@
 from dataclasses import replace
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.diagnosis.door import MOST_ROWS, prepared, refuse, rests
-from gyro_calibration.diagnosis.hygiene import inspect
-from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.diagnosis.data_quality import inspect
+from gyro_calibration.diagnosis.input_validation import MOST_ROWS, prepared, refuse, rests
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
 import numpy as np
 import pytest
@@ -54,9 +54,9 @@ def test_a_reference_of_nan_alone_is_none():
 def test_a_rate_that_is_known_at_times_gives_way_to_the_heading():
     some = np.where(np.arange(COUNT) < 50, RATE, np.nan)
     log = replace(LOG, reference_rate=some, reference_heading=np.round(HEADING / 1e-3) * 1e-3)
-    hygiene = inspect(log)
-    assert (hygiene.heading_step == pytest.approx(1e-3)
-            and 'known in 50 samples only' in ' '.join(hygiene.remarks))
+    quality = inspect(log)
+    assert (quality.heading_step == pytest.approx(1e-3)
+            and 'known in 50 samples only' in ' '.join(quality.remarks))
     assert prepared(log)[0].reference_rate is None
 
 

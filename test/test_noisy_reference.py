@@ -13,9 +13,9 @@
 from dataclasses import replace
 
 from diagnosed import judged, log_of
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.effects import BIAS

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gyro_calibration.diagnosis.field import Work
+from gyro_calibration.diagnosis.regression_problem import Fitted
 from gyro_calibration.diagnosis.spectrum import angles, differentiated
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
@@ -26,7 +26,7 @@ NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
 
 
 @dataclass(frozen=True)
-class NoiseFigures:
+class NoiseParameters:
     """
     Noise fitted to a residual.
 
@@ -71,7 +71,7 @@ class _Bands:
         return float((self.count * np.log(variance) + self.energy / variance).sum())
 
 
-def noise_figures(done: Work, expected: Noise, rounds: bool = False) -> NoiseFigures:
+def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> NoiseParameters:
     """
     Fit noise figures to the residual, and compare them with those of a model.
 
@@ -92,7 +92,7 @@ def noise_figures(done: Work, expected: Noise, rounds: bool = False) -> NoiseFig
                                   for name, chance in whole.chance.items()})
 
 
-def _compared(bands: _Bands, expected: Noise) -> NoiseFigures:
+def _compared(bands: _Bands, expected: Noise) -> NoiseParameters:
     best, least = _fit(bands, {})
     figures = {name: float(np.exp(0.5 * best[place])) for place, name in enumerate(NAMES)}
     floor = _floors(bands, best)
@@ -105,23 +105,23 @@ def _compared(bands: _Bands, expected: Noise) -> NoiseFigures:
             _, cost = _fit(
                 bands, {place: 2.0 * float(np.log(max(getattr(expected, name), 1e-12)))}, best)
             chance[name] = float(chi2.sf(max(cost - least, 0.0), 1))
-    return NoiseFigures(noise, intervals, chance)
+    return NoiseParameters(noise, intervals, chance)
 
 
-def _bands(done: Work) -> _Bands:
-    field, (angle, step) = done.field, done.field.angles()
-    left = np.concatenate(done.left()) * field.deviation
+def _bands(done: Fitted) -> _Bands:
+    problem, (angle, step) = done.problem, done.problem.angles()
+    left = np.concatenate(done.left()) * problem.deviation
     # The figures of noise behind a filter are those below its cut-off, where the level is still 1.
     used = np.concatenate([angles(each.points) < 1.5 * np.pi / len(each.levels)
-                           for each in field.replays])
+                           for each in problem.replays])
     coarse = np.concatenate([np.full(each.points - 1, each.coarse / each.every)
-                             for each in field.replays])
+                             for each in problem.replays])
     frequency = angle / (2.0 * np.pi * step)
     wave = 2.0 - 2.0 * np.cos(angle)
     parts = [1.0 / step, 1.0 / (2.0 * np.pi * frequency * step), step / wave]
-    if field.first.reference:
+    if problem.first.reference:
         parts.append(differentiated(angle) / step)
-    energy, count, *totals = (np.add.reduceat(part * used, field.starts)
+    energy, count, *totals = (np.add.reduceat(part * used, problem.starts)
                               for part in (left ** 2, np.ones(len(left)), coarse, *parts))
     kept = count > 0.0
     known, *means = (total[kept] / count[kept] for total in totals)

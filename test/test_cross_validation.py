@@ -10,10 +10,10 @@
 
 """The stated improvement by an extended model on held-out blocks: the state before, and limits."""
 
-from gyro_calibration.diagnosis.gain import change_over, gain
+from gyro_calibration.diagnosis.cross_validation import change_over, gain
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term

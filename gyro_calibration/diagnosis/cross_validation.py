@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from gyro_calibration.diagnosis.field import work
-from gyro_calibration.diagnosis.finding import Change, Gain, HeadingCurve
-from gyro_calibration.diagnosis.outcome import Outcome
+from gyro_calibration.diagnosis.findings import Change, Gain, HeadingCurve
+from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.regression_problem import fitted
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import relaid, Search, searched
 from gyro_calibration.logs.log import Array, Mask
@@ -63,7 +63,7 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     None where the logs are too short to hold anything out, or too little of them is known
 
     """
-    replays = search.field.replays
+    replays = search.problem.replays
     length = min(WINDOW, max(each.duration for each in replays) / 6.0)
     held = [held_out(each, length) for each in replays]
     if (not any(out.any() for out in held)
@@ -71,8 +71,8 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
                    for each, out in zip(replays, held))):
         return None
     rest = relaid(search, [_without(each, out) for each, out in zip(replays, held)], causes, _RATE)
-    before = None if given else Outcome(work(rest.field, ()), rest.field.replays)
-    after = Outcome(work(rest.field, searched(rest)), rest.field.replays)
+    before = None if given else FittedValues(fitted(rest.problem, ()), rest.problem.replays)
+    after = FittedValues(fitted(rest.problem, searched(rest)), rest.problem.replays)
     blocks = [block for run, (each, out) in enumerate(zip(replays, held))
               for block in _blocks(each, out, length,
                                    [_left(each, run, found) for found in (before, after)])]
@@ -103,7 +103,7 @@ def _without(each: Replay, out: Mask) -> Replay:
                    filling=each.filling[place[0]:])
 
 
-def _left(each: Replay, run: int, found: Outcome | None) -> tuple[Array, Array]:
+def _left(each: Replay, run: int, found: FittedValues | None) -> tuple[Array, Array]:
     """Return the residuals of rate and of heading increments in a whole log; all without a fit."""
     added = 0.0 if found is None else found.explains(each, run) + found.biases[run]
     return (each.channels.output - each.channels.rate - added,

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Stuck samples: the last value once more, beyond the honest repeats of coarse codes."""
+"""RepeatedSamples samples: the last value once more, beyond the honest repeats of coarse codes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.diagnosis.codes import Codes, DeadBand, doubt_of, steps_about
-from gyro_calibration.diagnosis.compared import Compared
+from gyro_calibration.diagnosis.expected_output import Compared
+from gyro_calibration.diagnosis.quantization import Codes, DeadBand, doubt_of, steps_about
 from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ _NARROW = 1e-5
 
 
 @dataclass(frozen=True)
-class Stuck:
+class RepeatedSamples:
     """
     Samples that repeat the one before.
 
@@ -91,8 +91,8 @@ def _lengths(marked: Mask) -> NDArray[np.int_]:
     return edges[1::2] - edges[::2]
 
 
-def stuck_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
-                  level: float) -> Stuck | None:
+def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
+                     level: float) -> RepeatedSamples | None:
     """
     Find samples that are stuck, or return None.
 
@@ -121,7 +121,8 @@ def stuck_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mas
     for start, stop, unlikely in _runs(same, honest, expected, doubt_of(seen)):
         if unlikely * len(good) < level:
             repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
-    return Stuck(repeats, float(honest.chance[looked].sum()), p_value) if repeats.any() else None
+    return (RepeatedSamples(repeats, float(honest.chance[looked].sum()), p_value)
+            if repeats.any() else None)
 
 
 def _expected_change(expected: Array | None, count: int) -> Array:

@@ -8,20 +8,21 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Wild samples: single ones far from their neighbours, and not because the gyro moves."""
+"""Outliers samples: single ones far from their neighbours, and not because the gyro moves."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gyro_calibration.diagnosis.compared import bridged, Compared
+from gyro_calibration.diagnosis.expected_output import bridged, Compared
 from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 from scipy.ndimage import maximum_filter1d
 
-#: Wild is beyond so many standard deviations, or more where so many samples reach that by chance.
+#: An outlier is beyond so many standard deviations, or more where so many samples reach that by
+#: chance.
 _WILD = 6.0
 #: Samples on each side that one is compared with.
 _SIDE = 3
@@ -45,7 +46,7 @@ _NEAR = 4.5
 
 
 @dataclass(frozen=True)
-class Wild:
+class Outliers:
     """
     Samples that are wild.
 
@@ -62,7 +63,7 @@ class Wild:
     p_value: float
 
 
-def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild | None:
+def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> Outliers | None:
     """
     Find wild samples, or return None.
 
@@ -90,7 +91,7 @@ def wild_samples(seen: Compared, good: Mask, floor: float, level: float) -> Wild
             0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen)):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
-    return Wild(wild, float(far[wild].max()), p_value) if p_value < level else None
+    return Outliers(wild, float(far[wild].max()), p_value) if p_value < level else None
 
 
 def _neighbours(values: Array | Mask, side: int) -> Array:

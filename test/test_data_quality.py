@@ -8,20 +8,20 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Hygiene: faults are found at stated sizes, good records pass, and useless ones are refused."""
+"""Quality of data: faults of stated sizes are found, good records pass, useless are refused."""
 
 from dataclasses import replace
 import math
 import os
 import re
 
-from gyro_calibration.diagnosis.codes import codes_of
-from gyro_calibration.diagnosis.compared import compare
-from gyro_calibration.diagnosis.door import refuse, rests
-from gyro_calibration.diagnosis.factors import FACTORS, unit_of_offset, unit_of_scale
-from gyro_calibration.diagnosis.hygiene import encoder_step, inspect, LEVEL, update_interval
-from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.diagnosis.stuck import stuck_samples
+from gyro_calibration.diagnosis.data_quality import encoder_step, inspect, LEVEL, update_interval
+from gyro_calibration.diagnosis.expected_output import compare
+from gyro_calibration.diagnosis.input_validation import refuse, rests
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.quantization import codes_of
+from gyro_calibration.diagnosis.repeated_samples import repeated_samples
+from gyro_calibration.diagnosis.unit_confusion import FACTORS, unit_of_offset, unit_of_scale
 from gyro_calibration.logs.log import COLUMNS, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -161,11 +161,11 @@ def test_wild_samples_are_told_from_others(generator):
     log = swing(generator)
     wild = generator.choice(np.arange(20, 5980), 8, replace=False)
     log.output[wild] += 12.0 * SIGMA * generator.choice([-1.0, 1.0], 8)
-    hygiene = inspect(log)
-    assert [finding.effect for finding in hygiene.findings] == ['outliers']
+    quality = inspect(log)
+    assert [finding.effect for finding in quality.findings] == ['outliers']
     # two that are neighbours may hide each other
-    assert (np.count_nonzero(~hygiene.trusted[wild]) >= 6
-            and np.count_nonzero(~hygiene.trusted) <= 9)
+    assert (np.count_nonzero(~quality.trusted[wild]) >= 6
+            and np.count_nonzero(~quality.trusted) <= 9)
 
 
 @pytest.mark.parametrize('rough', ['steps', 'jolts', 'heavy tails'])
@@ -196,10 +196,10 @@ def test_a_wild_reference_is_not_blamed_on_the_gyro(generator):
 def test_a_single_repeat_of_exact_values_is_seen_and_left_out(generator):
     log = swing(generator)
     log.output[1000:1003] = log.output[999]
-    hygiene = inspect(log)
-    assert ([finding.effect for finding in hygiene.findings] == ['stuck_samples']
-            and value(hygiene.findings[0]) == 3.0)
-    assert not hygiene.trusted[1000:1003].any() and hygiene.trusted[999] and hygiene.trusted[1003]
+    quality = inspect(log)
+    assert ([finding.effect for finding in quality.findings] == ['stuck_samples']
+            and value(quality.findings[0]) == 3.0)
+    assert not quality.trusted[1000:1003].any() and quality.trusted[999] and quality.trusted[1003]
 
 
 @pytest.mark.parametrize('step', [0.3, 1.0, 3.0, 30.0])
@@ -218,8 +218,8 @@ def test_codes_as_wide_as_the_noise_are_stuck_as_seldom_as_said(generator):
     """200 logs at rest in the middle of a code at 2 % each; 26 alarms if each repeat counted."""
     logs = [compare(np.round(generator.standard_normal(2000) / 1.05) * 1.05, None, None)
             for _ in range(200)]
-    assert sum(stuck_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool),
-                             0.02) is not None for log in logs) <= 10
+    assert sum(repeated_samples(log, codes_of(log.output), None, np.ones(2000, dtype=bool),
+                                0.02) is not None for log in logs) <= 10
 
 
 @pytest.mark.parametrize('noise', [1e-4, 1e-5])
@@ -253,9 +253,9 @@ def test_zeros_in_a_turn_are_stuck_samples_beside_a_dead_band(generator):
     log = zeroed(swing(generator), 10.0 * SIGMA)
     places = np.flatnonzero(np.abs(log.reference_rate[:5900]) > 0.5)[:1] + np.arange(10)
     log.output[places] = 0.0
-    hygiene = inspect(log)
-    assert 'stuck_samples' in [finding.effect for finding in hygiene.findings]
-    assert not hygiene.trusted[places[1:]].any() and np.count_nonzero(~hygiene.trusted) <= 12
+    quality = inspect(log)
+    assert 'stuck_samples' in [finding.effect for finding in quality.findings]
+    assert not quality.trusted[places[1:]].any() and np.count_nonzero(~quality.trusted) <= 12
 
 
 def test_a_dead_band_of_the_driver_is_found_as_a_dead_zone():
@@ -279,12 +279,12 @@ def test_a_moving_average_of_coarse_codes_is_not_stuck(generator):
 @pytest.mark.parametrize('low, high', [(-0.8, 0.8), (-math.inf, 0.7), (-0.9, math.inf)])
 def test_a_limit_is_found_on_the_sides_that_have_one(low, high, generator):
     log = swing(generator)
-    hygiene = inspect(replace(log, output=np.clip(log.output, low, high)))
-    assert ([finding.effect for finding in hygiene.findings] == ['saturation']
-            and hygiene.limit == min(-low, high))
+    quality = inspect(replace(log, output=np.clip(log.output, low, high)))
+    assert ([finding.effect for finding in quality.findings] == ['saturation']
+            and quality.limit == min(-low, high))
     beyond = (log.output > high) | (log.output < low)
-    assert (not hygiene.trusted[beyond].any()
-            and hygiene.trusted[np.abs(log.reference_rate) < 0.6].all())
+    assert (not quality.trusted[beyond].any()
+            and quality.trusted[np.abs(log.reference_rate) < 0.6].all())
 
 
 def test_a_limit_that_is_a_code_further_on_one_side_has_the_size_of_the_smaller(generator):
@@ -317,10 +317,10 @@ def test_what_the_model_knows_is_no_finding(generator):
                                   if 1e-2 < abs(factor) < 100.0 and name != '1000000/1048576'])
 def test_a_wrong_unit_is_named_and_mended(name, generator):
     log = swing(generator, scale=1.0)
-    hygiene = inspect(replace(log, output=log.output * FACTORS[name]))
-    assert [finding.effect for finding in hygiene.findings] == ['unit_error']
-    assert (f'and {name} is' in hygiene.findings[0].evidence
-            and hygiene.factor * FACTORS[name] == pytest.approx(1.0))
+    quality = inspect(replace(log, output=log.output * FACTORS[name]))
+    assert [finding.effect for finding in quality.findings] == ['unit_error']
+    assert (f'and {name} is' in quality.findings[0].evidence
+            and quality.factor * FACTORS[name] == pytest.approx(1.0))
 
 
 @pytest.mark.parametrize('factor, deviation, name', [
@@ -480,9 +480,9 @@ RECORDINGS = {
 def test_measured_records_show_what_is_known_of_them(name, data):
     log = read_log(data / name)
     refuse(log)
-    hygiene = inspect(log)
-    assert [finding.effect for finding in hygiene.findings] == RECORDINGS[name]
+    quality = inspect(log)
+    assert [finding.effect for finding in quality.findings] == RECORDINGS[name]
     if 'turntable' in name:
-        assert hygiene.heading_step == pytest.approx(360.0 / 4096 * DEGREE * 351 / 360, rel=0.03)
-        lost = {finding.effect: finding for finding in hygiene.findings}['dropped_samples']
+        assert quality.heading_step == pytest.approx(360.0 / 4096 * DEGREE * 351 / 360, rel=0.03)
+        lost = {finding.effect: finding for finding in quality.findings}['dropped_samples']
         assert value(lost) == number_stamps(log.time).lost.sum() > 15

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-Hygiene: what is wrong with a record before any gyro is blamed.
+DataQuality: what is wrong with a record before any gyro is blamed.
 
 It is reported, and what it touches is not used; nothing of it is fitted.
 
@@ -26,8 +26,7 @@ from dataclasses import dataclass, replace
 
 from gyro_calibration.calibration.dwells.samples import output_of
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.codes import Codes, codes_of, dead_band, Limit, limit_of
-from gyro_calibration.diagnosis.compared import (
+from gyro_calibration.diagnosis.expected_output import (
     compare,
     Compared,
     Line,
@@ -35,11 +34,12 @@ from gyro_calibration.diagnosis.compared import (
     reference_rate,
     scale_of,
 )
-from gyro_calibration.diagnosis.door import evened, prepared
-from gyro_calibration.diagnosis.factors import FACTORS, is_far, unit_of_scale
-from gyro_calibration.diagnosis.finding import Estimate, Finding
-from gyro_calibration.diagnosis.stuck import Stuck, stuck_samples
-from gyro_calibration.diagnosis.wild import Wild, wild_samples
+from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.input_validation import evened, prepared
+from gyro_calibration.diagnosis.outliers import Outliers, outlying_samples
+from gyro_calibration.diagnosis.quantization import Codes, codes_of, dead_band, Limit, limit_of
+from gyro_calibration.diagnosis.repeated_samples import repeated_samples, RepeatedSamples
+from gyro_calibration.diagnosis.unit_confusion import FACTORS, is_far, unit_of_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
@@ -60,7 +60,7 @@ _DISORDER = 0.1
 
 
 @dataclass(frozen=True)
-class Hygiene:
+class DataQuality:
     """
     What is wrong with a record, and what of it is to be used.
 
@@ -87,7 +87,7 @@ class Hygiene:
     update_interval: float | None = None
 
 
-def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
+def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     """
     Look for what is wrong with a record.
 
@@ -104,7 +104,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
     unit = ([] if rate is None or line is None
             else list(_unit(line, 1.0 if model is None else scale_of(model, rate))))
     factor = 1.0 / FACTORS[unit[0][0]] if unit else 1.0
-    found = Hygiene(tuple(finding for _, finding in unit), said, known, factor)
+    found = DataQuality(tuple(finding for _, finding in unit), said, known, factor)
     if log.time is None:
         return found
     found = _of_stamps(found, log, known)
@@ -113,7 +113,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> Hygiene:
                        None if line is None else _mended(line, factor), model, known, log)
 
 
-def decided(clean: Hygiene) -> Hygiene:
+def decided(clean: DataQuality) -> DataQuality:
     """Say what is done about the unit; a factor that may be of the gyro is a scale error."""
     if clean.factor == 1.0:
         return clean
@@ -162,7 +162,7 @@ def _unit(line: Line, own: float) -> Iterator[tuple[str, Finding]]:
                         chance, said, twins)
 
 
-def _of_stamps(found: Hygiene, log: Log, known: Mask) -> Hygiene:
+def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     """Look at the clock: lost samples are a finding; jitter, bursts and pace are remarks."""
     assert log.time is not None
     without = np.count_nonzero(~known)
@@ -206,7 +206,7 @@ def _said_of_pace(stamps: Stamps) -> Iterator[str]:
                'the last third of the log.')
 
 
-def _of_reference(found: Hygiene, log: Log) -> Hygiene:
+def _of_reference(found: DataQuality, log: Log) -> DataQuality:
     """Look at the reference: steps of its heading, and values that are held."""
     assert log.time is not None
     heading = log.reference_rate is None and log.reference_heading is not None
@@ -245,21 +245,21 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
     return float(gaps[regular].mean() * np.median(np.diff(time))) if regular.mean() > 0.8 else None
 
 
-def _of_samples(found: Hygiene, output: Array, rate: Array | None, line: Line | None,
-                model: GyroModel | None, known: Mask, log: Log) -> Hygiene:
+def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Line | None,
+                model: GyroModel | None, known: Mask, log: Log) -> DataQuality:
     """Look at the samples of the gyro: their codes, their limit, stuck and wild ones."""
     codes, seen = codes_of(output[known]), compare(output, rate, line)
     limit = limit_of(codes, seen, LEVEL)
     at_limit = np.zeros(len(output), dtype=bool) if limit is None else limit.reached(seen.output)
     good, band = known & ~at_limit, dead_band(codes, seen.output)
-    stuck = stuck_samples(seen, codes, band, good, LEVEL)
+    stuck = repeated_samples(seen, codes, band, good, LEVEL)
     if stuck is not None and stuck.has_one_more(at_limit):
         limit, at_limit, good = None, np.zeros_like(at_limit), known
-        stuck = stuck_samples(seen, codes, band, good, LEVEL)
+        stuck = repeated_samples(seen, codes, band, good, LEVEL)
     good = good if stuck is None else good & ~stuck.repeats
     # Single samples that get out of a dead band are not wild.
-    wild = wild_samples(seen, good if band is None else good & ~band.holds(seen.output),
-                        0.5 * codes.step, LEVEL)
+    wild = outlying_samples(seen, good if band is None else good & ~band.holds(seen.output),
+                            0.5 * codes.step, LEVEL)
     good = good if wild is None else good & ~wild.samples
     findings = [*found.findings, *_quantized(codes, seen.white, model),
                 *_limited(limit, at_limit, model), *_stuck(stuck, log), *_wild(wild, log),
@@ -311,7 +311,7 @@ def _count_and_first(samples: Mask, log: Log) -> tuple[int, float]:
     return int(np.count_nonzero(samples)), float(log.time[int(np.argmax(samples))])
 
 
-def _stuck(stuck: Stuck | None, log: Log) -> Iterator[Finding]:
+def _stuck(stuck: RepeatedSamples | None, log: Log) -> Iterator[Finding]:
     if stuck is None:
         return
     count, first = _count_and_first(stuck.repeats, log)
@@ -321,7 +321,7 @@ def _stuck(stuck: Stuck | None, log: Log) -> Iterator[Finding]:
                    'whole log')
 
 
-def _wild(wild: Wild | None, log: Log) -> Iterator[Finding]:
+def _wild(wild: Outliers | None, log: Log) -> Iterator[Finding]:
     if wild is None:
         return
     count, first = _count_and_first(wild.samples, log)

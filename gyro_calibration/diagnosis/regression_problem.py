@@ -16,12 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from gyro_calibration.diagnosis.candidates import Candidate, columns_of, fitted_shapes, with_shape
-from gyro_calibration.diagnosis.evidence import (
-    Beside,
-    beside,
-    judge,
-    Judged,
+from gyro_calibration.diagnosis.noise_likelihood import (
     log_sum,
+    Marginalized,
+    marginalized,
+    noise_likelihood,
+    NoiseLikelihood,
     Noises,
     Places,
     Sample,
@@ -70,7 +70,7 @@ class Named:
 
 
 @dataclass(frozen=True)
-class Field:
+class RegressionProblem:
     """
     The logs and the noises that may be in them.
 
@@ -105,23 +105,24 @@ class Field:
         return np.repeat(np.sqrt(self.noises.weights[noise]), count)
 
 
-def field(replays: Sequence[Replay]) -> Field:
+def regression_problem(replays: Sequence[Replay]) -> RegressionProblem:
     """Lay out the logs with a grid of noises."""
     reference = _rounding(replays) if any(each.rounded for each in replays) else 0.0
-    return _field(tuple(replays), Shape(reference=reference), noise_grid(
+    return _problem(tuple(replays), Shape(reference=reference), noise_grid(
         min(each.step for each in replays), max(each.duration for each in replays), reference))
 
 
 def _rounding(replays: Sequence[Replay]) -> float:
     """Return the likeliest rounding of a reference heading, relative to white noise."""
     shapes = [Shape(reference=ratio) for ratio in (0.0, *np.geomspace(1e-3, 1e4, 43))]
-    tried = _field(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes
-                                             for walk in (0.0, 1e-4, 1e-2)])
-    done = work(tried, [])
-    return tried.shapes[int(done.judged.likelihood[0].argmax())].reference
+    tried = _problem(tuple(replays), Shape(), [replace(shape, walk=walk) for shape in shapes
+                                               for walk in (0.0, 1e-4, 1e-2)])
+    done = fitted(tried, [])
+    return tried.shapes[int(done.by_noise.likelihood[0].argmax())].reference
 
 
-def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -> Field:
+def _problem(replays: tuple[Replay, ...], first: Shape,
+             shapes: Sequence[Shape]) -> RegressionProblem:
     parts = [(angles(each.points), each.step) for each in replays]
     plain = np.concatenate([first.variance(angle, step) / step for angle, step in parts])
     deviation = np.sqrt(plain * np.concatenate([each.level() for each in replays]))
@@ -144,17 +145,17 @@ def _field(replays: tuple[Replay, ...], first: Shape, shapes: Sequence[Shape]) -
     kinds = [(bool(each.walk), bool(each.strength), bool(each.flicker)) for each in shapes]
     rare = [np.log(kinds.count(kind)) for kind in kinds]
     noises = Noises(1.0 / relative, np.log(relative) @ count + 2.0 * np.array(rare))
-    return Field(replays, first, deviation, starts, tuple(shapes), noises)
+    return RegressionProblem(replays, first, deviation, starts, tuple(shapes), noises)
 
 
 @dataclass(frozen=True)
-class Work:
+class Fitted:
     """
     A field with some causes in it.
 
     Attributes
     ----------
-    field : with the rate that the gyro sees, if something happens to it before
+    problem : with the rate that the gyro sees, if something happens to it before
     plain : the logs as they are
     named : causes
     residual : whitened, without what the causes of fixed amplitude make, shape (m,)
@@ -163,11 +164,11 @@ class Work:
     owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus
         one less place of its shape)
     widths : of each cause, how many columns with free values it has
-    sample, by, judged : see `evidence`
+    sample, marginalized, by_noise : see `evidence`
 
     """
 
-    field: Field
+    problem: RegressionProblem
     plain: tuple[Replay, ...]
     named: tuple[Named, ...]
     residual: Array
@@ -175,8 +176,8 @@ class Work:
     owner: tuple[tuple[int, int], ...]
     widths: tuple[int, ...]
     sample: Sample
-    by: Beside
-    judged: Judged
+    marginalized: Marginalized
+    by_noise: NoiseLikelihood
 
     @property
     def score(self) -> float:
@@ -187,8 +188,8 @@ class Work:
         `evidence`.
 
         """
-        judged, best = self.judged, int(self.judged.likelihood[0].argmax())
-        _, logarithm = np.linalg.slogdet(self.by.own[best])
+        judged, best = self.by_noise, int(self.by_noise.likelihood[0].argmax())
+        _, logarithm = np.linalg.slogdet(self.marginalized.own[best])
         return float(log_sum(judged.likelihood)[0] + 0.5 * (
             logarithm - len(self.columns) * np.log(judged.squares[0, best])))
 
@@ -198,8 +199,9 @@ class Work:
 
     def whitened(self) -> list[Array]:
         """Return the whitened coefficients of each log's residual: shape (points - 1,)."""
-        best = int(self.judged.likelihood[0].argmax())
-        factor = self.field.divided(best) * np.sqrt(self.by.freedom / self.judged.squares[0, best])
+        best = int(self.by_noise.likelihood[0].argmax())
+        factor = self.problem.divided(best) * np.sqrt(
+            self.marginalized.freedom / self.by_noise.squares[0, best])
         return [part * own for part, own in zip(self.left(), self._parted(factor))]
 
     def left(self) -> list[Array]:
@@ -209,20 +211,20 @@ class Work:
 
     def _parted(self, coefficients: Array) -> list[Array]:
         return np.split(coefficients,
-                        np.cumsum([each.points - 1 for each in self.field.replays])[:-1])
+                        np.cumsum([each.points - 1 for each in self.problem.replays])[:-1])
 
     @property
     def estimates(self) -> tuple[Array, Array]:
         """Return the values of the independent columns and covariance, averaged over noises."""
-        probable = self.judged.probability[0]
+        probable = self.by_noise.probability[0]
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
-        covariance = np.linalg.inv(self.by.own[kept])
-        crossed = self.field.noises.weights[kept] @ self.sample.own[0]
+        covariance = np.linalg.inv(self.marginalized.own[kept])
+        crossed = self.problem.noises.weights[kept] @ self.sample.own[0]
         values = np.einsum('gpq,gq->gp', covariance, crossed)
         mean = weights @ values
-        inside = np.einsum('g,gpq->pq',
-                           weights * self.judged.squares[0, kept] / self.by.freedom, covariance)
+        variances = weights * self.by_noise.squares[0, kept] / self.marginalized.freedom
+        inside = np.einsum('g,gpq->pq', variances, covariance)
         return mean, inside + np.einsum('g,gp,gq->pq', weights, values - mean, values - mean)
 
 
@@ -242,7 +244,8 @@ def seen(each: Replay, named: Sequence[Named]) -> Replay:
     return each.with_rate(rate)
 
 
-def work(whole: Field, named: Sequence[Named], extra: Sequence[Candidate] = ()) -> Work:
+def fitted(whole: RegressionProblem, named: Sequence[Named],
+           extra: Sequence[Candidate] = ()) -> Fitted:
     """
     Put causes into a field.
 
@@ -313,11 +316,11 @@ def leaping_shapes(candidate: Candidate) -> list[int]:
     return [place for place in fitted_shapes(candidate) if place not in free_shapes(candidate)]
 
 
-def deviation_of_leaping(done: Work, place: int, shape: int) -> float:
+def deviation_of_leaping(done: Fitted, place: int, shape: int) -> float:
     """Return the standard deviation of a shape whose columns leap, by where the score falls."""
     candidate = done.named[place].candidate
-    others = work(replace(done.field, replays=done.plain),
-                  done.named[:place] + done.named[place + 1:])
+    others = fitted(replace(done.problem, replays=done.plain),
+                    done.named[:place] + done.named[place + 1:])
     least = with_one_more(others, candidate).score - _FALL
 
     def falls(by: float) -> bool:
@@ -340,7 +343,7 @@ def _until(falls: Callable[[float], bool], first: float) -> float:
     return abs(far)
 
 
-def filtered(done: Work) -> tuple[Replay, ...]:
+def filtered(done: Fitted) -> tuple[Replay, ...]:
     """
     Return the logs with the levels of their noise, and averaged where a filter left next to none.
 
@@ -361,17 +364,18 @@ def filtered(done: Work) -> tuple[Replay, ...]:
     return done.plain
 
 
-def _again(done: Work, replays: Sequence[Replay]) -> Work:
+def _again(done: Fitted, replays: Sequence[Replay]) -> Fitted:
     """Put the causes of a field into the same logs with other points or levels."""
-    return work(field(replays), done.named)
+    return fitted(regression_problem(replays), done.named)
 
 
-def with_one_more(before: Work, candidate: Candidate) -> Work:
+def with_one_more(before: Fitted, candidate: Candidate) -> Fitted:
     """Put one more cause into a field at its present shapes, and keep what is there already."""
     if is_of_the_rate(candidate.cause):
-        return work(replace(before.field, replays=before.plain), [*before.named, Named(candidate)])
-    own, residual, columns = (columns_of(candidate, before.field.replays) / before.field.deviation,
-                              before.residual, before.columns)
+        return fitted(replace(before.problem, replays=before.plain),
+                      [*before.named, Named(candidate)])
+    own = columns_of(candidate, before.problem.replays) / before.problem.deviation
+    residual, columns = before.residual, before.columns
     owner, place = before.owner, len(before.named)
     if candidate.amplitude is None:
         columns = np.concatenate([columns, own])
@@ -379,27 +383,28 @@ def with_one_more(before: Work, candidate: Candidate) -> Work:
     else:
         residual = residual - candidate.amplitude * own[0]
     widths = (*before.widths, len(own) if candidate.amplitude is None else 0)
-    return _judged(before.field, before.plain, (*before.named, Named(candidate)), residual,
+    return _judged(before.problem, before.plain, (*before.named, Named(candidate)), residual,
                    columns, owner, widths)
 
 
-def with_columns(before: Work, columns: Array) -> Work:
+def with_columns(before: Fitted, columns: Array) -> Fitted:
     """Put whitened columns more into a field, which belong to no cause."""
     owner = (*before.owner, *[(-2, 0)] * len(columns))
-    return _judged(before.field, before.plain, before.named, before.residual,
+    return _judged(before.problem, before.plain, before.named, before.residual,
                    np.concatenate([before.columns, columns]), owner, before.widths)
 
 
-def _judged(whole: Field, plain: tuple[Replay, ...], named: tuple[Named, ...], residual: Array,
-            columns: Array, owner: tuple[tuple[int, int], ...], widths: tuple[int, ...]) -> Work:
+def _judged(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Named, ...],
+            residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
+            widths: tuple[int, ...]) -> Fitted:
     """Sum whitened residual and columns, those that are independent, and judge them."""
     kept = _independent(columns)
     of = columns[kept]
     nothing = np.empty((0, len(residual)))
     given = sample(residual[None], of, nothing, whole.starts)
-    by = beside(sums(of, nothing, (), whole.starts), (), whole.noises)
-    return Work(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths,
-                given, by, judge(given, whole.noises, by))
+    by = marginalized(sums(of, nothing, (), whole.starts), (), whole.noises)
+    return Fitted(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths,
+                  given, by, noise_likelihood(given, whole.noises, by))
 
 
 def _independent(columns: Array) -> list[int]:

@@ -32,7 +32,10 @@ from gyro_calibration.calibration.scatter import (
 )
 from gyro_calibration.calibration.selection import supported_effects, swapped_effects
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.door import refuse
+from gyro_calibration.diagnosis.cross_validation import WINDOW
+from gyro_calibration.diagnosis.data_quality import decided, inspect
+from gyro_calibration.diagnosis.dwell_confounders import alternatives
+from gyro_calibration.diagnosis.dwell_cross_validation import curves, measure_gain
 from gyro_calibration.diagnosis.dwell_fit import (
     change_of,
     doubt,
@@ -44,13 +47,10 @@ from gyro_calibration.diagnosis.dwell_fit import (
     seen,
     tried,
 )
-from gyro_calibration.diagnosis.dwell_gain import curves, measure_gain
-from gyro_calibration.diagnosis.dwell_rest import Left, RATE, SINGLE_RATES, what_is_left
-from gyro_calibration.diagnosis.dwell_sets import alternatives
-from gyro_calibration.diagnosis.extension import notes_of
-from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain
-from gyro_calibration.diagnosis.gain import WINDOW
-from gyro_calibration.diagnosis.hygiene import decided, inspect
+from gyro_calibration.diagnosis.dwell_structure import Left, RATE, SINGLE_RATES, what_is_left
+from gyro_calibration.diagnosis.extended_model import notes_of
+from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.input_validation import refuse
 from gyro_calibration.diagnosis.units import amount
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
 from gyro_calibration.model.effects import (

@@ -17,9 +17,9 @@ import math
 
 from gyro_calibration.calibration.dwells import Dwells, Numbers, take
 from gyro_calibration.calibration.scatter import FEWEST_SWEEPS, parts_of, Scatter, summed
+from gyro_calibration.diagnosis.cross_validation import change_over, WINDOW
 from gyro_calibration.diagnosis.dwell_fit import simulated
-from gyro_calibration.diagnosis.finding import Curve, Gain
-from gyro_calibration.diagnosis.gain import change_over, WINDOW
+from gyro_calibration.diagnosis.findings import Curve, Gain
 from gyro_calibration.logs.log import Array, DataRefused, Mask
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np

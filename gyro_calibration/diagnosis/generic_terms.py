@@ -52,7 +52,7 @@ def along(candidate: Candidate) -> str:
     return candidate.cause[len(UNNAMED):]
 
 
-def probes(replays: Sequence[Replay]) -> list[Candidate]:
+def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
     """Return what may be in these logs without a name."""
     variables = dict(_variables(replays))
     found = [each for name, of in variables.items() for each in _of_one(name, of)]

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 from diagnosed import log_of
 from gyro_calibration.diagnosis.candidates import effect
-from gyro_calibration.diagnosis.extension import calibrated, extended, left_out
-from gyro_calibration.diagnosis.field import field, Named, work
-from gyro_calibration.diagnosis.outcome import Outcome
+from gyro_calibration.diagnosis.extended_model import calibrated, extended, left_out
+from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.regression_problem import fitted, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose
 from gyro_calibration.diagnosis.words import headline, is_inside
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.compensation import compensate
@@ -77,7 +77,8 @@ def on_top(own, found, *shapes, supply=None):
                     covariance=np.diag([1e-10, 1e-8, 1e-12, 1e-12][:2 + len(own.fitted)]))
     log = replace(drive(), supply=supply)
     laid = replay(log, np.ones(len(log), dtype=bool), np.random.default_rng(3), model=model)
-    return model, Outcome(work(field([laid]), [Named(effect(found, *shapes), (1e-4,))]), (laid,))
+    named = [Named(effect(found, *shapes), (1e-4,))]
+    return model, FittedValues(fitted(regression_problem([laid]), named), (laid,))
 
 
 VOLTS = 12.0 + np.sin(0.05 * TIME)

@@ -31,7 +31,7 @@ from gyro_calibration.calibration.scatter import (
     Uncertainty,
     Whitener,
 )
-from gyro_calibration.diagnosis.finding import Unexplained
+from gyro_calibration.diagnosis.findings import Unexplained
 from gyro_calibration.logs.log import Array
 import numpy as np
 from scipy.interpolate import BSpline

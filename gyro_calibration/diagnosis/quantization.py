@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gyro_calibration.diagnosis.compared import Compared
+from gyro_calibration.diagnosis.expected_output import Compared
 from gyro_calibration.logs.log import Array, Mask
 import numpy as np
 from scipy import stats

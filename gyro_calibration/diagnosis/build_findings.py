@@ -16,12 +16,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.factors import unit_of_offset
-from gyro_calibration.diagnosis.field import Named, work
-from gyro_calibration.diagnosis.finding import Estimate, Finding, Unexplained
-from gyro_calibration.diagnosis.outcome import joined, Outcome, Value
-from gyro_calibration.diagnosis.probes import along, is_named
+from gyro_calibration.diagnosis.findings import Estimate, Finding, Unexplained
+from gyro_calibration.diagnosis.fitted_values import FittedValues, joined, Value
+from gyro_calibration.diagnosis.generic_terms import along, is_named
+from gyro_calibration.diagnosis.regression_problem import fitted, Named
 from gyro_calibration.diagnosis.search import evidence_of, MOST_SLIPS, price_of_freedom, Search
+from gyro_calibration.diagnosis.unit_confusion import unit_of_offset
 from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.stats import norm
@@ -47,7 +47,7 @@ def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float]) -> l
             for each in findings]
 
 
-def named_finding(search: Search, found: Outcome, place: int, p_value: float,
+def named_finding(search: Search, found: FittedValues, place: int, p_value: float,
                   rivals: Sequence[Named], separate_by: str) -> Finding:
     """Return what is said of a named cause."""
     candidate = found.named[place].candidate
@@ -69,7 +69,7 @@ def _evidence(size: Estimate, half: float, run: int | None, logs: int) -> str:
     return f'{where}{abs(size.estimate) / half:.3g} sigma from zero' if half > 0.0 else ''
 
 
-def _unit(name: str, parameters: Mapping[str, Estimate], found: Outcome) -> tuple[str, ...]:
+def _unit(name: str, parameters: Mapping[str, Estimate], found: FittedValues) -> tuple[str, ...]:
     """Return 'unit_error' where a delay is one that comes of a confusion."""
     if name != 'time_offset':
         return ()
@@ -87,7 +87,7 @@ def _detectable(search: Search, known: Named, deviation: float) -> float | None:
             if deviation > 0.0 else None)
 
 
-def _parameters(found: Outcome, place: int) -> dict[str, Estimate]:
+def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
     """Return the parameters of a cause, the one that is named like it first."""
     candidate = found.named[place].candidate
     coefficients, shapes = found.coefficients(place), found.shapes(place)
@@ -115,7 +115,7 @@ def _estimate(value: Value, unit: str) -> Estimate:
     return Estimate(value.value, (value.value - half, value.value + half), unit)
 
 
-def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Value],
+def _as_phase(found: FittedValues, place: int, name: str, coefficients: Sequence[Value],
               unit: str) -> dict[str, Estimate]:
     """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
     sine, cosine = (value.value for value in coefficients)
@@ -129,7 +129,8 @@ def _as_phase(found: Outcome, place: int, name: str, coefficients: Sequence[Valu
             'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
 
 
-def unexplained(search: Search, found: Outcome, unnamed: Sequence[Named]) -> list[Unexplained]:
+def unexplained(search: Search, found: FittedValues,
+                unnamed: Sequence[Named]) -> list[Unexplained]:
     """Return the structures without a name, with the part that each explains of what is left."""
     everything = (*found.named, *unnamed)
     variables: dict[str, list[int]] = {}
@@ -149,8 +150,8 @@ def unexplained(search: Search, found: Outcome, unnamed: Sequence[Named]) -> lis
     return told
 
 
-def _variance(search: Search, found: Outcome, named: Sequence[Named]) -> float:
+def _variance(search: Search, found: FittedValues, named: Sequence[Named]) -> float:
     """Return the variance of what some causes leave, on the points that are searched."""
-    left = Outcome(work(search.field, named), found.replays)
+    left = FittedValues(fitted(search.problem, named), found.replays)
     return float(np.var(joined([each.on_grid(rest - bias) for each, rest, bias
                                 in zip(found.replays, left.residuals, left.biases)])))

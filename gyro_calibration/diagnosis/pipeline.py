@@ -17,9 +17,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
+from gyro_calibration.diagnosis.build_findings import named_finding, unexplained
 from gyro_calibration.diagnosis.candidate_experiments import distinguishing
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
+from gyro_calibration.diagnosis.cross_validation import gain
 from gyro_calibration.diagnosis.curves import (
     beside_model,
     curves,
@@ -27,8 +29,8 @@ from gyro_calibration.diagnosis.curves import (
     noise_curve,
     what_is_left,
 )
-from gyro_calibration.diagnosis.door import model_gate, refuse, rests
-from gyro_calibration.diagnosis.extension import (
+from gyro_calibration.diagnosis.data_quality import DataQuality, decided, inspect
+from gyro_calibration.diagnosis.extended_model import (
     calibrated,
     doubts_scale,
     extended,
@@ -36,17 +38,15 @@ from gyro_calibration.diagnosis.extension import (
     noted,
     with_findings,
 )
-from gyro_calibration.diagnosis.field import filtered, Named, work
-from gyro_calibration.diagnosis.figures import NAMES, noise_figures, NoiseFigures
-from gyro_calibration.diagnosis.finding import Diagnosis, Estimate, Finding, Gain, Gate
-from gyro_calibration.diagnosis.gain import gain
+from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gain, Gate
+from gyro_calibration.diagnosis.fitted_values import FittedValues
 from gyro_calibration.diagnosis.gates import gates, mismatch
-from gyro_calibration.diagnosis.hygiene import decided, Hygiene, inspect
-from gyro_calibration.diagnosis.naming import named_finding, unexplained
+from gyro_calibration.diagnosis.generic_terms import along, is_named
+from gyro_calibration.diagnosis.input_validation import model_gate, refuse, rests
+from gyro_calibration.diagnosis.noise_parameters import NAMES, noise_parameters, NoiseParameters
 from gyro_calibration.diagnosis.noisy_reference import diagnose_beside
-from gyro_calibration.diagnosis.outcome import Outcome
-from gyro_calibration.diagnosis.probes import along, is_named
 from gyro_calibration.diagnosis.reference import limits, reference_of
+from gyro_calibration.diagnosis.regression_problem import filtered, fitted, Named
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.search import (
     alternatives,
@@ -128,19 +128,19 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         answer = diagnose_beside(logs[0], told[0], model, rate)
         return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
     say('hygiene')
-    hygiene = [decided(inspect(log, model)) for log in logs]
+    quality = [decided(inspect(log, model)) for log in logs]
     say('replay')
     replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval,
-                      clean.heading_step, clean.step, model) for log, clean in zip(logs, hygiene)]
+                      clean.heading_step, clean.step, model) for log, clean in zip(logs, quality)]
     say('search')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate)
     named, unnamed = _parted(search, everything)
     say('sets')
     named, rivals = _simplest(search, named, unnamed)
-    found = Outcome(work(search.field, named), search.field.replays)
+    found = FittedValues(fitted(search.problem, named), search.problem.replays)
     out = left_out(model or GyroModel(), found)
     say('noise')
-    figures = noise_figures(found.work, *_said_of_noise(model, hygiene))
+    figures = noise_parameters(found.fitted, *_said_of_noise(model, quality))
     say('gain')
     changed = [] if model is None else _of_model(found, model, figures.noise, rate)
     causes = {each.candidate.cause for known, members in zip(named, rivals) if known not in out
@@ -150,7 +150,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     say('report')
     known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won,
                         _cannot_show(search, logs))
-    result = replace(_told(known, hygiene, model, rate, names, generator),
+    result = replace(_told(known, quality, model, rate, names, generator),
                      gates=tuple(gate for each in checked for gate in each),
                      reference=told[0] if len(logs) == 1 else None)
     return _checked_answer(result, model, given)
@@ -190,11 +190,11 @@ class _Conclusion:
     """
 
     search: Search
-    found: Outcome
+    found: FittedValues
     out: Sequence[Named]
     rivals: Sequence[Sequence[Named]]
     unnamed: tuple[Named, ...]
-    figures: NoiseFigures
+    figures: NoiseParameters
     changed: Sequence[Finding]
     won: Gain | None
     cannot_show: Mapping[str, str]
@@ -205,10 +205,10 @@ class _Conclusion:
         return self.won is None or not self.won.worse
 
     @cached_property
-    def inside(self) -> Outcome:
+    def inside(self) -> FittedValues:
         """Return the causes that the model can hold, in values, fitted without the others."""
         kept = [each for each in self.found.named if each not in self.out]
-        return (Outcome(work(self.search.field, kept), self.found.replays) if self.out
+        return (FittedValues(fitted(self.search.problem, kept), self.found.replays) if self.out
                 else self.found)
 
 
@@ -217,22 +217,22 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator,
     """Search, and once more where what is left is filtered noise, which passes for causes."""
     search = begin(replays, generator, rate)
     everything = searched(search)
-    as_filtered = filtered(work(search.field, everything))
-    if as_filtered is search.field.replays:
+    as_filtered = filtered(fitted(search.problem, everything))
+    if as_filtered is search.problem.replays:
         return search, everything
     search = begin(as_filtered, generator, rate)
     return search, searched(search)
 
 
-def _said_of_noise(model: GyroModel | None, hygiene: Sequence[Hygiene]) -> tuple[Noise, bool]:
+def _said_of_noise(model: GyroModel | None, quality: Sequence[DataQuality]) -> tuple[Noise, bool]:
     """Return the noise that a model states, none without one, and whether output is rounded."""
     if model is None:
-        return Noise(), any(each.effect == QUANTIZATION.name for clean in hygiene
+        return Noise(), any(each.effect == QUANTIZATION.name for clean in quality
                             for each in clean.findings)
     return model.noise, any(term.effect is QUANTIZATION for term in model.terms)
 
 
-def _mended(log: Log, clean: Hygiene) -> Log:
+def _mended(log: Log, clean: DataQuality) -> Log:
     assert log.output is not None
     return log if clean.factor == 1.0 else replace(log, output=log.output * clean.factor)
 
@@ -271,9 +271,9 @@ def _is_small(search: Search, known: Named) -> bool:
     if CAUSES[known.candidate.cause].along != 'rate' or known.candidate.amplitude is not None:
         return True
     most = [float(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
-                                      1)).max()) for each in search.field.replays]
+                                      1)).max()) for each in search.problem.replays]
     return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max())
-                                      for each in search.field.replays)
+                                      for each in search.problem.replays)
 
 
 def _same(one: Named, other: Named) -> bool:
@@ -283,13 +283,13 @@ def _same(one: Named, other: Named) -> bool:
 
 def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:
     """Tell whether a cause from a temperature is the same in all logs, but for chance."""
-    candidate, runs = known.candidate, len(search.field.replays)
+    candidate, runs = known.candidate, len(search.problem.replays)
     if (runs == 1 or CAUSES[candidate.cause].along not in _MUST_REPEAT or not known.values
             or candidate.amplitude is not None):
         return True
     alone = [replace(candidate, run=run) for run in range(runs - 1)]
-    more = 2.0 * (work(search.field, everything, alone).score
-                  - work(search.field, everything).score)
+    more = 2.0 * (fitted(search.problem, everything, alone).score
+                  - fitted(search.problem, everything).score)
     return bool(chi2.sf(max(more, 0.0), len(known.values) * len(alone)) > _REPEATS)
 
 
@@ -312,26 +312,27 @@ def _size(search: Search, known: Named) -> int:
     """Return how many values a cause has."""
     candidate = known.candidate
     return len(fitted_shapes(candidate)) + (
-        0 if candidate.amplitude is not None else len(candidate.columns(search.field.replays[0])))
+        0 if candidate.amplitude is not None
+        else len(candidate.columns(search.problem.replays[0])))
 
 
-def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | None, rate: float,
+def _told(known: _Conclusion, quality: Sequence[DataQuality], model: GyroModel | None, rate: float,
           names: Sequence[str], generator: np.random.Generator) -> Diagnosis:
     """Put all that was found into words and records."""
     search, found, noise, simulated = (known.search, known.found, known.figures.noise,
                                        Noise() if model is None else model.noise)
-    of_record = _once([each for clean in hygiene for each in clean.findings])
+    of_record = _once([each for clean in quality for each in clean.findings])
     said = {name for each in of_record for name in each.ambiguous_with}
     findings = [*_named(known, generator), *of_record,
                 *(each for each in known.changed if each.effect not in said)]
     if model is not None:
         findings += _of_noise(known.figures, model, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
-    plain, deviation = (Outcome(work(search.field, []), found.replays),
+    plain, deviation = (FittedValues(fitted(search.problem, []), found.replays),
                         _bias_deviation(known.inside, noise))
     before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise),
-                            GyroModel(), hygiene)
-    after = (with_findings(model, known.inside, hygiene, findings, noise, deviation)
+                            GyroModel(), quality)
+    after = (with_findings(model, known.inside, quality, findings, noise, deviation)
              if known.offered else before)
     # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
     left, shown = (beside_model(found.replays) if known.changed else what_is_left(plain),
@@ -340,7 +341,7 @@ def _told(known: _Conclusion, hygiene: Sequence[Hygiene], model: GyroModel | Non
         tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated,
         known.won, before, after, known.cannot_show,
         curves(left, shown), heading_curve(left, shown), noise_curve(found, noise, simulated),
-        tuple(_remarks(hygiene, names, known, model)), rate, tuple(names))
+        tuple(_remarks(quality, names, known, model)), rate, tuple(names))
 
 
 def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
@@ -354,13 +355,13 @@ def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
     return findings
 
 
-def _separated(search: Search, found: Outcome, place: int, members: Sequence[Named],
+def _separated(search: Search, found: FittedValues, place: int, members: Sequence[Named],
                generator: np.random.Generator) -> str:
     """Return the experiment that parts the members of a set."""
     known = found.named[place]
     others = [each for each in members if each.candidate.cause != known.candidate.cause]
-    return (distinguishing(search.field, found.named, known, others, generator).sentence if others
-            else '')
+    return (distinguishing(search.problem, found.named, known, others, generator).sentence
+            if others else '')
 
 
 def _once(findings: Sequence[Finding]) -> list[Finding]:
@@ -372,14 +373,14 @@ def _once(findings: Sequence[Finding]) -> list[Finding]:
     return list(best.values())
 
 
-def _bias_deviation(found: Outcome, noise: Noise) -> float:
+def _bias_deviation(found: FittedValues, noise: Noise) -> float:
     """Return the standard deviation of the mean bias of the logs, rad/s."""
     each = [noise.heading_variance(replay.duration) / replay.duration ** 2
             for replay in found.replays]
     return float(np.sqrt(np.mean(each) / len(each) + found.bias_variance))
 
 
-def _of_model(found: Outcome, model: GyroModel, noise: Noise, rate: float) -> list[Finding]:
+def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) -> list[Finding]:
     """Return bias and scale factor error as findings, where they are not those of the model."""
     scale, bias = found.scale_factor_error, float(np.mean(found.biases))
     own = [_own_deviation(model, name) for name in ('bias', 'scale_factor_error')]
@@ -416,7 +417,7 @@ def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) 
         'from nothing', cause.along)
 
 
-def _of_noise(figures: NoiseFigures, model: GyroModel, rate: float,
+def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
               replays: Sequence[Replay]) -> list[Finding]:
     """Return the noise figures that are not those of the model, nor within its bounds of them."""
     found, expected = [], model.noise
@@ -438,7 +439,7 @@ def _of_noise(figures: NoiseFigures, model: GyroModel, rate: float,
 
 def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     """Say why these logs cannot show each cause that was not searched for or not found."""
-    replays = search.field.replays
+    replays = search.problem.replays
     has = frozenset.intersection(*(each.has for each in replays)) | {'time', 'output'}
     of_motion = frozenset({'reference', *REFERENCES})
     has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
@@ -466,10 +467,10 @@ def _constant(replays: Sequence[Replay]) -> dict[str, str]:
     return {**quiet, **{other: quiet[name] for name, other in _WITH.items() if name in quiet}}
 
 
-def _remarks(hygiene: Sequence[Hygiene], names: Sequence[str], known: _Conclusion,
+def _remarks(quality: Sequence[DataQuality], names: Sequence[str], known: _Conclusion,
              model: GyroModel | None) -> Iterator[str]:
-    for place, clean in enumerate(hygiene):
-        where = f'{names[place]}: ' if len(hygiene) > 1 and names else ''
+    for place, clean in enumerate(quality):
+        where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
     for name in dict.fromkeys(each.candidate.cause for each in known.unnamed
                               if is_named(each.candidate)):

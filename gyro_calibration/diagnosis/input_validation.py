@@ -16,15 +16,15 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells.samples import between_values, output_of, where_lost
-from gyro_calibration.diagnosis.codes import codes_of
-from gyro_calibration.diagnosis.compared import (
+from gyro_calibration.diagnosis.expected_output import (
     bridged,
     line_between,
     reference_rate,
     scale_of,
     white_noise,
 )
-from gyro_calibration.diagnosis.finding import Gate
+from gyro_calibration.diagnosis.findings import Gate
+from gyro_calibration.diagnosis.quantization import codes_of
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np

@@ -17,15 +17,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from gyro_calibration.diagnosis.candidates import fitted_shapes
-from gyro_calibration.diagnosis.field import (
+from gyro_calibration.diagnosis.generic_terms import is_named
+from gyro_calibration.diagnosis.regression_problem import (
     deviation_of_leaping,
+    Fitted,
     is_of_the_rate,
     leaping_shapes,
     Named,
     seen,
-    Work,
 )
-from gyro_calibration.diagnosis.probes import is_named
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.logs.log import Array
 import numpy as np
@@ -41,40 +41,40 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FittedValues:
     """
     A field with its causes, as values.
 
     Attributes
     ----------
-    work : the causes in the field
+    fitted : the causes in the field
     replays : the logs as they were laid out
 
     """
 
-    work: Work
+    fitted: Fitted
     replays: tuple[Replay, ...]
 
     @property
     def named(self) -> tuple[Named, ...]:
         """Return the causes."""
-        return self.work.named
+        return self.fitted.named
 
     @cached_property
     def _estimates(self) -> tuple[dict[tuple[int, int], int], Array, Array]:
-        values, covariance = self.work.estimates
-        return {owner: rank for rank, owner in enumerate(self.work.owner)}, values, covariance
+        values, covariance = self.fitted.estimates
+        return {owner: rank for rank, owner in enumerate(self.fitted.owner)}, values, covariance
 
     @cached_property
     def _leaping(self) -> dict[tuple[int, int], float]:
         """Return standard deviations of shapes whose columns leap, by cause and place."""
-        return {(place, -1 - shape): deviation_of_leaping(self.work, place, shape)
+        return {(place, -1 - shape): deviation_of_leaping(self.fitted, place, shape)
                 for place, known in enumerate(self.named)
                 for shape in leaping_shapes(known.candidate)}
 
     def place(self, cause: int, number: int) -> int | None:
         """Return the place of a value among the estimates: column from 0, or shape below 0."""
-        ranks = [*self.work.owner, *self._leaping]
+        ranks = [*self.fitted.owner, *self._leaping]
         return ranks.index((cause, number)) if (cause, number) in ranks else None
 
     @property
@@ -146,7 +146,7 @@ class Outcome:
     @cached_property
     def bias_variance(self) -> float:
         """Return the variance of the mean bias by the uncertainty of other values, (rad/s)²."""
-        means = np.array([self._mean_change(place, number) for place, number in self.work.owner])
+        means = np.array([self._mean_change(place, number) for place, number in self.fitted.owner])
         return float(means @ self._estimates[2] @ means)
 
     def _mean_change(self, cause: int, number: int) -> float:

@@ -16,11 +16,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.calibration.self_calibration import Limits
-from gyro_calibration.diagnosis.field import Named, seen
-from gyro_calibration.diagnosis.figures import NAMES
-from gyro_calibration.diagnosis.finding import Finding
-from gyro_calibration.diagnosis.hygiene import Hygiene
-from gyro_calibration.diagnosis.outcome import Outcome
+from gyro_calibration.diagnosis.data_quality import DataQuality
+from gyro_calibration.diagnosis.findings import Finding
+from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.noise_parameters import NAMES
+from gyro_calibration.diagnosis.regression_problem import Named, seen
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
     BIAS,
@@ -42,7 +42,7 @@ _BESIDE: Mapping[str, Effect] = {
     'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
 
 
-def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hygiene],
+def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequence[DataQuality],
                   findings: Sequence[Finding], noise: Noise, bias_deviation: float) -> GyroModel:
     """
     Return the extended model: the one that was given, where no finding is of the gyro.
@@ -51,7 +51,7 @@ def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hyg
     ----------
     model : of the simulation, `calibrated`; None where that was an ideal gyro
     found : the causes and their values, none of them `left_out`
-    hygiene : of each log
+    quality : of each log
     findings : all of them; of a noise that is given, only the figures among them become others
     noise : of what the causes leave
     bias_deviation : standard deviation of the bias, rad/s
@@ -62,7 +62,7 @@ def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hyg
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
               or any(each.candidate.cause in CATALOGUE for each in found.named))
     new = _with_exact(extended(given, found, bias_deviation) if fitted else given,
-                      _of_the_output(hygiene))
+                      _of_the_output(quality))
     figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
                                       for each in findings if each.effect in NAMES})
     if model is not None and same_effects(new, model) and figures == model.noise:
@@ -70,10 +70,10 @@ def with_findings(model: GyroModel | None, found: Outcome, hygiene: Sequence[Hyg
     figures = figures if given.noise.angle_random_walk else noise
     bounds = {name: ends for name, ends in given.noise_bounds.items()
               if getattr(figures, name) == getattr(given.noise, name)}
-    return noted(replace(new, noise=figures, noise_bounds=bounds), given, hygiene, findings)
+    return noted(replace(new, noise=figures, noise_bounds=bounds), given, quality, findings)
 
 
-def extended(model: GyroModel, found: Outcome, bias_deviation: float) -> GyroModel:
+def extended(model: GyroModel, found: FittedValues, bias_deviation: float) -> GyroModel:
     """Return a model with all named effects of the gyro, bias and scale factor put right."""
     new, spread = _values(found, bias_deviation)
     moves = _moves(found) and not doubts_scale(found)
@@ -96,12 +96,12 @@ def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Ar
                    temperature_range=wider(model.temperature_range, known, bool(model.terms)))
 
 
-def noted(new: GyroModel, given: GyroModel, hygiene: Sequence[Hygiene],
+def noted(new: GyroModel, given: GyroModel, quality: Sequence[DataQuality],
           findings: Sequence[Finding] = ()) -> GyroModel:
     """Return a new model whose origin names its ambiguities, output factors and predecessor."""
     used = {term.effect.name for term in new.terms if term not in given.terms}
     notes = notes_of([each for each in findings if each.effect in used],
-                     [clean.factor for clean in hygiene])
+                     [clean.factor for clean in quality])
     return replace(new, origin={**notes, **origins_before(given)})
 
 
@@ -135,7 +135,7 @@ def calibrated(model: GyroModel) -> GyroModel:
                    self_calibration=None)
 
 
-def left_out(model: GyroModel, found: Outcome) -> tuple[Named, ...]:
+def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
     """Return the gyro's causes that its model cannot hold, as a file names each effect once."""
     terms, out = model.terms, []
     for place, known in enumerate(found.named):
@@ -146,7 +146,7 @@ def left_out(model: GyroModel, found: Outcome) -> tuple[Named, ...]:
     return tuple(out)
 
 
-def doubts_scale(found: Outcome) -> bool:
+def doubts_scale(found: FittedValues) -> bool:
     """
     Tell whether a scale factor error was found that is not to be believed.
 
@@ -159,16 +159,16 @@ def doubts_scale(found: Outcome) -> bool:
                               or scale.deviation > LIMITS.scale_standard_deviation)
 
 
-def _moves(found: Outcome) -> bool:
+def _moves(found: FittedValues) -> bool:
     return found.place(-1, 0) is not None
 
 
 # values
 
-def _of_the_output(hygiene: Sequence[Hygiene]) -> list[Term]:
+def _of_the_output(quality: Sequence[DataQuality]) -> list[Term]:
     """Return limit and steps of the output, if they are findings, of the first log with them."""
     found: dict[str, Term] = {}
-    for clean in hygiene:
+    for clean in quality:
         sizes = {'saturation': clean.limit, 'quantization': clean.step}
         for name in (each.effect for each in clean.findings if sizes.get(each.effect)):
             found.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
@@ -182,7 +182,7 @@ def _with_exact(model: GyroModel, terms: Sequence[Term]) -> GyroModel:
                     covariance=_covariance(model, terms, spread)) if terms else model)
 
 
-def _values(found: Outcome, bias_deviation: float) -> tuple[list[Term], Array]:
+def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Array]:
     """Return what was found as terms, and the covariance of all values in a row, 0 if exact."""
     doubtful = doubts_scale(found)
     scale = 0.0 if doubtful else found.scale_factor_error.value
@@ -202,13 +202,13 @@ def _values(found: Outcome, bias_deviation: float) -> tuple[list[Term], Array]:
     return terms, spread
 
 
-def _bias(found: Outcome, scale: float) -> float:
+def _bias(found: FittedValues, scale: float) -> float:
     """Return the mean bias of the logs beside a scale factor error."""
     rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
     return float(np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates))
 
 
-def _term(found: Outcome, place: int) -> Term:
+def _term(found: FittedValues, place: int) -> Term:
     """Return a cause of the gyro as a term."""
     candidate = found.named[place].candidate
     effect = CATALOGUE[candidate.cause]
