@@ -56,6 +56,14 @@ def test_what_a_right_bias_and_scale_factor_win_is_measured_from_the_model_as_it
     curve = next(each for each in found.curves if each.along == 'rate')
     assert np.abs(curve.before - bias - scale * curve.at).max() < 0.1 * max(bias, scale)
     assert np.abs(curve.after).max() < 0.1 * max(bias, scale)
+    # the answer is about heading: what each explains of the error over a minute, and what is left
+    shares, models = found.heading_shares, found.gain.models
+    assert shares['bias'] + shares['scale_factor_error'] > 0.99 and shares['left'] < 0.01
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-3)
+    assert models['given'] == found.gain.heading.before > 10.0 * models['plain']
+    assert models['extended'] == found.gain.heading.after
+    assert all(each.remedy and each.share_of_heading_error == shares[each.effect]
+               for each in found.findings)
 
 
 def test_a_value_beside_a_model_is_what_comes_on_top_of_it():

@@ -88,11 +88,11 @@ def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | No
         found = diagnose_table(logs[0], None if model is None else calibrated(model))
     else:
         with tqdm(total=_STEPS, desc='diagnose', delay=2.0, leave=False, disable=None) as bar:
-            def say(step: str) -> None:
+            def on_progress(step: str) -> None:
                 bar.set_description(step)
                 bar.update()
 
-            found = diagnose(logs, generator, model, names=given.log, say=say,
+            found = diagnose(logs, generator, model, names=given.log, on_progress=on_progress,
                              kind=given.reference_kind)
     return _with_origin(replace(found, logs=tuple(given.log)), model)
 

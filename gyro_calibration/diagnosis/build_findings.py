@@ -14,7 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+import math
 
+from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Unexplained
 from gyro_calibration.diagnosis.fitted_values import FittedValues, joined, Value
@@ -23,9 +25,12 @@ from gyro_calibration.diagnosis.regression_problem import fitted, Named
 from gyro_calibration.diagnosis.search import evidence_of, MOST_SLIPS, price_of_freedom, Search
 from gyro_calibration.diagnosis.unit_confusion import unit_of_offset
 from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy.stats import norm
 
+#: No probability below this is printed: the assumptions carry none.
+LEAST_CHANCE = 1e-4
 #: Power with which an effect of the minimum detectable size is found.
 _POWER = 0.95
 _DEVIATIONS = 1.96
@@ -40,20 +45,27 @@ _REMEDIES = {
     'noise': 'take the figures of the extended model'}
 
 
-def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float]) -> list[Finding]:
+def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
+                  model: GyroModel) -> list[Finding]:
     """Return findings with their share of the heading error, and what to do about them."""
-    return [replace(each, share_of_heading_error=shares.get(each.effect),
-                    remedy=each.remedy or _REMEDIES[CAUSES[each.effect].of])
-            for each in findings]
+    inside = {term.effect.name for term in model.terms}
+    return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
+        '' if CAUSES[each.effect].of == 'gyro' and each.effect not in inside
+        else _REMEDIES[CAUSES[each.effect].of])) for each in findings]
 
 
 def named_finding(search: Search, found: FittedValues, place: int, p_value: float,
-                  rivals: Sequence[Named], separate_by: str) -> Finding:
-    """Return what is said of a named cause."""
+                  members: Sequence[tuple[Named, float]], separate_by: str) -> Finding:
+    """Return what is said of a named cause, and of those that may be in its place."""
     candidate = found.named[place].candidate
     cause = CAUSES[candidate.cause]
     parameters = _parameters(found, place)
-    twins = tuple(dict.fromkeys(each.candidate.cause for each in rivals
+    lacks = {each.candidate.cause: lack for each, lack in reversed(members)}
+    lacks.setdefault(candidate.cause, 0.0)
+    weights = {name: math.exp(-max(lack, 0.0)) for name, lack in lacks.items()}
+    probability = {name: max(weight / sum(weights.values()), LEAST_CHANCE)
+                   for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
+    twins = tuple(dict.fromkeys(each.candidate.cause for each, _ in members
                                 if each.candidate.cause != candidate.cause))
     unit = _unit(candidate.cause, parameters, found)
     size = next(iter(parameters.values()))
@@ -61,7 +73,17 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
     return Finding(candidate.cause, cause.sentence, parameters, p_value,
                    _detectable(search, found.named[place], half), (*twins, *unit),
                    separate_by or (cause.separate_by if twins or unit else ''),
-                   _evidence(size, half, candidate.run, len(found.replays)), cause.along)
+                   _evidence(size, half, candidate.run, len(found.replays)), cause.along,
+                   probability=probability, where=_where(found, candidate))
+
+
+def _where(found: FittedValues, candidate: Candidate) -> tuple[float, float] | None:
+    """Return from when to when a cause is in its log, s; None of the whole log."""
+    if candidate.cause == 'bias_step':
+        return candidate.shapes[0], float(found.replays[candidate.run or 0].channels.time[-1])
+    if candidate.cause == 'reference_slip':
+        return min(candidate.shapes[1:]), max(candidate.shapes[1:])
+    return None
 
 
 def _evidence(size: Estimate, half: float, run: int | None, logs: int) -> str:
@@ -111,8 +133,7 @@ def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
 
 
 def _estimate(value: Value, unit: str) -> Estimate:
-    half = _DEVIATIONS * value.deviation
-    return Estimate(value.value, (value.value - half, value.value + half), unit)
+    return Estimate.about(value.value, _DEVIATIONS * value.deviation, unit)
 
 
 def _as_phase(found: FittedValues, place: int, name: str, coefficients: Sequence[Value],

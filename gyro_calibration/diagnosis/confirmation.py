@@ -26,6 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
+from gyro_calibration.diagnosis.build_findings import LEAST_CHANCE
 from gyro_calibration.diagnosis.spans import (
     Column,
     FEWEST_STRETCHES,
@@ -49,8 +50,6 @@ _SUSPECTED = 5.0
 _SURELY, _BOUND = 1.65, 3.0
 #: Causes explain a log as well as the best of them up to this likelihood ratio.
 _LIKELY = 25.0
-#: No probability below this is printed: the assumptions carry none.
-LEAST_CHANCE = 1e-4
 
 
 @dataclass(frozen=True)

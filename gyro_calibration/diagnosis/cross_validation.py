@@ -12,8 +12,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 from gyro_calibration.diagnosis.findings import Change, Gain, HeadingCurve
 from gyro_calibration.diagnosis.fitted_values import FittedValues
@@ -38,15 +38,6 @@ _RATE = 0.01
 _FEWEST_PARTS = 2
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Squares and count of the rate residual in one block, and its heading: before and after."""
-
-    squares: tuple[float, float]
-    count: int
-    heading: tuple[float, float]
-
-
 def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     """
     Hold out every third block, fit causes chosen anew without it, and predict it.
@@ -54,7 +45,7 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     Parameters
     ----------
     search : in the whole logs
-    causes : those that were named, and their rivals
+    causes : those that were named, and their confounders
     given : tells whether there is a model; before is then what it leaves as it is, otherwise what
         the best bias and scale leave
 
@@ -71,18 +62,29 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
                    for each, out in zip(replays, held))):
         return None
     rest = relaid(search, [_without(each, out) for each, out in zip(replays, held)], causes, _RATE)
-    before = None if given else FittedValues(fitted(rest.problem, ()), rest.problem.replays)
-    after = FittedValues(fitted(rest.problem, searched(rest)), rest.problem.replays)
-    blocks = [block for run, (each, out) in enumerate(zip(replays, held))
-              for block in _blocks(each, out, length,
-                                   [_left(each, run, found) for found in (before, after)])]
+    named = searched(rest)
+    straight, plain, extended = (
+        FittedValues(fitted(rest.problem, some), rest.problem.replays)
+        for some in ((), [each for each in named if each.candidate.cause == 'time_offset'], named))
+    models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
+    squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
+    counts: list[int] = []
+    for run, (each, out) in enumerate(zip(replays, held)):
+        left = {name: _left(each, run, found) for name, found in models.items()}
+        number = _numbers(each, length)
+        for part in (out & (number == place) for place in np.unique(number[out])):
+            counts.append(int(np.count_nonzero(part)))
+            for name, (of_rate, increments) in left.items():
+                turned = float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
+                squares[name].append((float(np.sum(of_rate[part] ** 2)), turned ** 2))
+    both = np.array([squares['given' if given else 'straight'], squares['extended']])
+    rate = change_over(both[:, :, 0].T, np.array(counts, float))
+    heading = change_over(both[:, :, 1].T, np.ones(len(counts))) if length >= WINDOW else None
     words = (f'every third {length:.3g} s of the log' if len(replays) == 1
              else f'every third {length:.3g} s of each log')
-    heading = (change_over(np.array([block.heading for block in blocks]) ** 2,
-                           np.ones(len(blocks))) if length >= WINDOW else None)
-    rate = change_over(np.array([block.squares for block in blocks]),
-                       np.array([block.count for block in blocks], float))
-    return Gain(f'{words}, {len(blocks)} parts', rate, heading, WINDOW)
+    return Gain(f'{words}, {len(counts)} parts', rate, heading, WINDOW, {
+        name: float(np.sqrt(np.mean([turned for _, turned in each])))
+        for name, each in squares.items() if name != 'straight' and heading is not None})
 
 
 def held_out(each: Replay, length: float) -> Mask:
@@ -108,20 +110,6 @@ def _left(each: Replay, run: int, found: FittedValues | None) -> tuple[Array, Ar
     added = 0.0 if found is None else found.explains(each, run) + found.biases[run]
     return (each.channels.output - each.channels.rate - added,
             each.channels.output - each.reference - added)
-
-
-def _blocks(each: Replay, out: Mask, length: float,
-            left: Sequence[tuple[Array, Array]]) -> Iterator[_Block]:
-    number = _numbers(each, length)
-    for place in np.unique(number[out]):
-        yield _block(each, left, out & (number == place))
-
-
-def _block(each: Replay, left: Sequence[tuple[Array, Array]], part: Mask) -> _Block:
-    squares = tuple(float(np.sum(rate[part] ** 2)) for rate, _ in left)
-    heading = tuple(float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
-                    for _, increments in left)
-    return _Block((squares[0], squares[1]), int(np.count_nonzero(part)), (heading[0], heading[1]))
 
 
 def over_windows(change: Array, time: Array, window: float) -> Array:

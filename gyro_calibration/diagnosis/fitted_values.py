@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from gyro_calibration.diagnosis.candidates import fitted_shapes
-from gyro_calibration.diagnosis.generic_terms import is_named
 from gyro_calibration.diagnosis.regression_problem import (
     deviation_of_leaping,
     Fitted,
@@ -115,22 +114,48 @@ class FittedValues:
         """Return what causes and scale add to each log's output, less bias, rad/s, shape (n,)."""
         return [self.explains(each, run) for run, each in enumerate(self.replays)]
 
-    def explains(self, each: Replay, run: int, gyro_only: bool = False) -> Array:
-        """Return what the causes and the scale add to the output of a log."""
-        new = seen(each, self.named)
-        total = ((new.channels.rate - each.channels.rate)
-                 + self.scale_factor_error.value * new.channels.rate)
+    def parts(self, each: Replay, run: int) -> dict[str, Array]:
+        """Return what the scale and each cause add to the output of a log, rad/s, shape (n,)."""
+        found: dict[str, Array | float] = {}
+        new = each
+        for known in self.named:
+            if is_of_the_rate(known.candidate.cause):
+                before, new = new, seen(new, [known])
+                found[known.candidate.cause] = new.channels.rate - before.channels.rate
+        found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.named):
             candidate = known.candidate
-            if is_of_the_rate(candidate.cause) or (candidate.run not in (None, run)):
-                continue
-            if gyro_only and (not is_named(candidate) or candidate.cause.startswith('reference')):
+            if is_of_the_rate(candidate.cause) or candidate.run not in (None, run):
                 continue
             values = ([candidate.amplitude] if candidate.amplitude is not None
                       else [one.value for one in self.coefficients(place)])
-            total = total + sum(value * column
-                                for value, column in zip(values, candidate.columns(new)))
-        return total
+            for value, column in zip(values, candidate.columns(new)):
+                found[candidate.cause] = found.get(candidate.cause, 0.0) + value * column
+        return {name: np.asarray(part) for name, part in found.items()}
+
+    def explains(self, each: Replay, run: int) -> Array:
+        """Return what the causes and the scale add to the output of a log."""
+        return np.asarray(sum(self.parts(each, run).values()))
+
+    def heading_changes(self, run: int,
+                        plain: FittedValues | None) -> tuple[dict[str, Array], Array]:
+        """
+        Return what adds to the change of heading of a log, rad, and its times, s.
+
+        Parameters
+        ----------
+        run : number of the log
+        plain : bias and scale that the simulation has already; None where it has none
+
+        """
+        each = self.replays[run]
+        parts = {**self.parts(each, run), 'bias': np.full(len(each.kept), self.biases[run]),
+                 'left': self.residuals[run] - self.biases[run]}
+        if plain is not None:
+            parts['scale_factor_error'] -= plain.explains(each, run)
+            parts['bias'] -= plain.biases[run]
+        return ({name: each.on_grid(part) * each.step for name, part in parts.items()},
+                np.arange(each.points + 1) * each.step)
 
     @cached_property
     def residuals(self) -> list[Array]:

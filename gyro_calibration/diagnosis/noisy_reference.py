@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 import math
 
-from gyro_calibration.diagnosis.build_findings import with_remedies
+from gyro_calibration.diagnosis.build_findings import LEAST_CHANCE, with_remedies
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.confirmation import candidates, Confirmed, LEAST_CHANCE, search
+from gyro_calibration.diagnosis.confirmation import candidates, Confirmed, search
 from gyro_calibration.diagnosis.cross_validation import (
     change_over,
     heading_curve,
@@ -117,9 +117,8 @@ def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
     rates = extended.spans.rates()
     of_heading = shares([(parts, time)], 2.0 * (
         noise['reference'] ** 2 + noise['motion'] ** 2 * float(np.mean(rates ** 2))))
-    findings = with_remedies([
-        *_of_values(extended, model, rate, reference), *record.findings,
-        *(_finding(each, extended, plain) for each in found)], of_heading)
+    findings = [*_of_values(extended, model, rate, reference), *record.findings,
+                *(_finding(each, extended, plain) for each in found)]
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     of_record = {each.effect for each in record.findings}
     changed = any(each.status == 'established' and CAUSES[each.effect].of == 'gyro'
@@ -137,7 +136,8 @@ def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
                            np.array([[deviation ** 2]]), np.array(after.rate_range), None)
     curve, trace = _pictures(extended, parts)
     return Diagnosis(
-        tuple(findings), (), _noise(extended), Noise() if model is None else model.noise,
+        tuple(with_remedies(findings, of_heading, after)), (), _noise(extended),
+        Noise() if model is None else model.noise,
         None if not changed and model is not None else gain, base, after, _cannot_show(plain),
         [curve], heading_curve(parts, time), None,
         (*record.remarks, *_remarks(reference, plain)), rate, trace=trace,

@@ -8,20 +8,20 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The diagnosis: its steps in order."""
+
+"""The diagnosis of logs in time: its steps in order."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 import math
 
-from gyro_calibration.diagnosis.build_findings import named_finding, unexplained
+from gyro_calibration.diagnosis.build_findings import named_finding, unexplained, with_remedies
 from gyro_calibration.diagnosis.candidate_experiments import distinguishing
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.diagnosis.cross_validation import gain
+from gyro_calibration.diagnosis.cross_validation import gain, shares
 from gyro_calibration.diagnosis.curves import (
     beside_model,
     curves,
@@ -81,11 +81,13 @@ _HARDLY = {'temperature': 'the temperature hardly changes',
            'specific_force': 'the specific force does not change'}
 _WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
-Say = Callable[[str], object]
+#: Causes that may stand in the place of one, itself too, with what each lacks in likelihood.
+Members = Sequence[tuple[Named, float]]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
-             rate: float = 0.01, names: Sequence[str] = (), say: Say = lambda step: None,
+             rate: float = 0.01, names: Sequence[str] = (),
+             on_progress: Callable[[str], object] = lambda step: None,
              kind: str | None = None) -> Diagnosis:
     """
     Say what a simulation gets wrong, and why.
@@ -98,7 +100,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         where it is None
     rate : of false alarms a diagnosis
     names : of the logs, for people
-    say : is told each step as it begins
+    on_progress : is given the name of each step as it begins
     kind : of the reference, one of `reference.KINDS`; found where it is None
 
     Raises
@@ -106,110 +108,108 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : the logs allow no diagnosis
 
     """
-    say('gates')
+    on_progress('gates')
     given, model = model, None if model is None else calibrated(model)
-    checked = [gates(log, model) for log in logs]
-    for place, each in enumerate(checked):
-        if (failed := mismatch(each)) is not None:
-            if failed.effect != 'wrapped_heading':
-                refuse(logs[place])
-            return _mismatched(failed, each, given or GyroModel(), names[place:place + 1], rate)
+    checked: list[Gate] = []
     for place, log in enumerate(logs):
-        refuse(log)
-        if model is None:
-            continue
-        checked[place] = (*checked[place], model_gate(log, model))
-        if (failed := mismatch(checked[place])) is not None:
-            return _mismatched(failed, checked[place], given or GyroModel(),
-                               names[place:place + 1], rate)
-    told = [reference_of(log, kind) for log in logs]
-    if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], told[0]):
-        say('search')
-        answer = diagnose_beside(logs[0], told[0], model, rate)
-        return _checked_answer(replace(answer, logs=tuple(names), gates=checked[0]), model, given)
-    say('hygiene')
+        passed = gates(log, model)
+        failed = mismatch(passed)
+        if failed is None or failed.effect != 'wrapped_heading':
+            refuse(log)
+        if failed is None and model is not None:
+            passed = (*passed, model_gate(log, model))
+            failed = mismatch(passed)
+        if failed is not None:
+            own = given or GyroModel()
+            return Diagnosis((failed,), (), Noise(), own.noise, None, own, own,
+                             false_alarm_rate=rate, logs=tuple(names[place:place + 1]),
+                             gates=passed)
+        checked += passed
+    references = [reference_of(log, kind) for log in logs]
+    if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], references[0]):
+        on_progress('search')
+        found = diagnose_beside(logs[0], references[0], model, rate)
+    else:
+        found = _by_exact_reference(logs, generator, model, rate, names, on_progress)
+        found = replace(found, reference=references[0] if len(logs) == 1 else None)
+    if given is not None and found.model is model:
+        found = replace(found, before=given, model=given)  # in the words given
+    return replace(found, logs=tuple(names), gates=tuple(checked))
+
+
+def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
+                        model: GyroModel | None, rate: float, names: Sequence[str],
+                        on_progress: Callable[[str], object]) -> Diagnosis:
+    """Diagnose logs whose reference errs less than the gyro."""
+    on_progress('data quality')
     quality = [decided(inspect(log, model)) for log in logs]
-    say('replay')
-    replays = [replay(_mended(log, clean), clean.trusted, generator, clean.update_interval,
-                      clean.heading_step, clean.step, model) for log, clean in zip(logs, quality)]
-    say('search')
+    on_progress('replay')
+    replays = [replay(log if clean.factor == 1.0 or log.output is None
+                      else replace(log, output=log.output * clean.factor), clean.trusted,
+                      generator, clean.update_interval, clean.heading_step, clean.step, model)
+               for log, clean in zip(logs, quality)]
+    on_progress('search')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate)
-    named, unnamed = _parted(search, everything)
-    say('sets')
-    named, rivals = _simplest(search, named, unnamed)
+    named, unnamed = _withdrawn(search, everything)
+    on_progress('sets')
+    named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
     out = left_out(model or GyroModel(), found)
-    say('noise')
-    figures = noise_parameters(found.fitted, *_said_of_noise(model, quality))
-    say('gain')
-    changed = [] if model is None else _of_model(found, model, figures.noise, rate)
-    causes = {each.candidate.cause for known, members in zip(named, rivals) if known not in out
-              for each in members}
+    on_progress('noise')
+    # without a model, what rounds the output is a finding or nothing
+    rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
+              if model is None else any(term.effect is QUANTIZATION for term in model.terms))
+    simulated = Noise() if model is None else model.noise
+    figures = noise_parameters(found.fitted, simulated, rounds)
+    noise = figures.noise
+    on_progress('gain')
+    changed = [] if model is None else _of_model(found, model, noise, rate)
+    causes = {each.candidate.cause for known, members in zip(named, sets) if known not in out
+              for each, _ in members}
     won = (gain(search, causes, model is not None)
            if (causes or changed) and not doubts_scale(found) else None)
-    say('report')
-    known = _Conclusion(search, found, out, rivals, unnamed, figures, changed, won,
-                        _cannot_show(search, logs))
-    result = replace(_told(known, quality, model, rate, names, generator),
-                     gates=tuple(gate for each in checked for gate in each),
-                     reference=told[0] if len(logs) == 1 else None)
-    return _checked_answer(result, model, given)
-
-
-def _checked_answer(found: Diagnosis, model: GyroModel | None,
-                    given: GyroModel | None) -> Diagnosis:
-    """Return a diagnosis whose model, where it is left as it is, is in the words given."""
-    return (replace(found, before=given, model=given)
-            if given is not None and found.model is model else found)
-
-
-def _mismatched(failed: Finding, checked: tuple[Gate, ...], model: GyroModel, names: Sequence[str],
-                rate: float) -> Diagnosis:
-    """Return the diagnosis of a gyro and a reference that do not match: the model as it is."""
-    return Diagnosis((failed,), (), Noise(), model.noise, None, model, model,
-                     false_alarm_rate=rate, logs=tuple(names), gates=checked)
-
-
-@dataclass(frozen=True)
-class _Conclusion:
-    """
-    What the search came to.
-
-    Attributes
-    ----------
-    search : in the logs
-    found : the causes that are named, in values
-    out : those of them that the model cannot hold
-    rivals : of each, itself and those that may be in its place
-    unnamed : structure without a name, and causes whose names were withdrawn
-    figures : of the noise that is left
-    changed : bias and scale factor error, where they are not those of the model that was given
-    won : on what was held out
-    cannot_show : causes that these logs cannot show, with the reasons
-
-    """
-
-    search: Search
-    found: FittedValues
-    out: Sequence[Named]
-    rivals: Sequence[Sequence[Named]]
-    unnamed: tuple[Named, ...]
-    figures: NoiseParameters
-    changed: Sequence[Finding]
-    won: Gain | None
-    cannot_show: Mapping[str, str]
-
-    @property
-    def offered(self) -> bool:
-        """Tell whether the extended model is no worse than the one before."""
-        return self.won is None or not self.won.worse
-
-    @cached_property
-    def inside(self) -> FittedValues:
-        """Return the causes that the model can hold, in values, fitted without the others."""
-        kept = [each for each in self.found.named if each not in self.out]
-        return (FittedValues(fitted(self.search.problem, kept), self.found.replays) if self.out
-                else self.found)
+    offered = won is None or not won.worse
+    on_progress('report')
+    findings = []
+    for place, (known, members) in enumerate(zip(named, sets)):
+        chance = search.chance.p_value(known.candidate.cause,
+                                       evidence_of(search, (*named, *unnamed), place))
+        others = [each for each, _ in members if each.candidate.cause != known.candidate.cause]
+        findings.append(named_finding(
+            search, found, place, chance, members,
+            distinguishing(search.problem, named, known, others, generator).sentence
+            if others else ''))
+    best: dict[str, Finding] = {}  # of the records, by the log that shows it best
+    for each in (each for clean in quality for each in clean.findings):
+        if each.effect not in best or each.p_value < best[each.effect].p_value:
+            best[each.effect] = each
+    said = {name for each in best.values() for name in each.ambiguous_with}
+    findings += [*best.values(), *(each for each in changed if each.effect not in said)]
+    if model is not None:
+        findings += _of_noise(figures, model, rate, found.replays)
+    findings.sort(key=lambda each: each.p_value)
+    # the causes that the model can hold, fitted without the others
+    inside = (FittedValues(fitted(search.problem, [each for each in named if each not in out]),
+                           found.replays) if out else found)
+    plain, deviation = (FittedValues(fitted(search.problem, []), found.replays),
+                        _bias_deviation(inside, noise))
+    before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise),
+                            GyroModel(), quality)
+    after = (with_findings(model, inside, quality, findings, noise, deviation) if offered
+             else before)
+    # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
+    left, shown = (beside_model(found.replays) if changed else what_is_left(plain),
+                   inside if offered else plain)
+    of_heading = shares([found.heading_changes(run, plain if model is None else None)
+                         for run in range(len(replays))],
+                        float(np.mean([each.rounded ** 2 for each in replays])) / 6.0)
+    return Diagnosis(
+        tuple(with_remedies(findings, of_heading, after)),
+        tuple(unexplained(search, found, unnamed)), noise, simulated, won, before, after,
+        _cannot_show(search, logs), curves(left, shown), heading_curve(left, shown),
+        noise_curve(found, noise, simulated),
+        tuple(_remarks(quality, names, found, unnamed, out, won, model)), rate,
+        heading_shares=of_heading)
 
 
 def _searched(replays: Sequence[Replay], generator: np.random.Generator,
@@ -224,23 +224,10 @@ def _searched(replays: Sequence[Replay], generator: np.random.Generator,
     return search, searched(search)
 
 
-def _said_of_noise(model: GyroModel | None, quality: Sequence[DataQuality]) -> tuple[Noise, bool]:
-    """Return the noise that a model states, none without one, and whether output is rounded."""
-    if model is None:
-        return Noise(), any(each.effect == QUANTIZATION.name for clean in quality
-                            for each in clean.findings)
-    return model.noise, any(term.effect is QUANTIZATION for term in model.terms)
-
-
-def _mended(log: Log, clean: DataQuality) -> Log:
-    assert log.output is not None
-    return log if clean.factor == 1.0 else replace(log, output=log.output * clean.factor)
-
-
-def _parted(search: Search,
-            everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
+def _withdrawn(search: Search,
+               everything: tuple[Named, ...]) -> tuple[tuple[Named, ...], tuple[Named, ...]]:
     """
-    Part what is named from what is not.
+    Separate what is named from what is not.
 
     A name is withdrawn where there is more along its variable than it explains, where tones are
     many, and where a cause named from a temperature is another one in each log.
@@ -294,83 +281,24 @@ def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> boo
 
 
 def _simplest(search: Search, named: tuple[Named, ...],
-              unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[list[Named]]]:
+              unnamed: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[Members]]:
     """Put the simplest member of each set in its place, and return all members of each."""
-    rivals: list[list[Named]] = []
+    def size(known: Named) -> int:
+        """Return how many values a cause has."""
+        candidate = known.candidate
+        return len(fitted_shapes(candidate)) + (
+            0 if candidate.amplitude is not None
+            else len(candidate.columns(search.problem.replays[0])))
+
+    sets: list[Members] = []
     for place in range(len(named)):
-        members = ([each for each, _ in alternatives(search, (*named, *unnamed), place)]
-                   or [named[place]])
-        sizes = [_size(search, each) for each in members]
-        chosen = members[int(np.argmin(sizes))]
-        if min(sizes) < _size(search, named[place]):
+        members = (alternatives(search, (*named, *unnamed), place) or [(named[place], 0.0)])
+        sizes = [size(each) for each, _ in members]
+        if min(sizes) < size(named[place]):
+            chosen = members[int(np.argmin(sizes))][0]
             named = polished(search, (*named[:place], chosen, *named[place + 1:]))
-        rivals.append(members)
-    return named, rivals
-
-
-def _size(search: Search, known: Named) -> int:
-    """Return how many values a cause has."""
-    candidate = known.candidate
-    return len(fitted_shapes(candidate)) + (
-        0 if candidate.amplitude is not None
-        else len(candidate.columns(search.problem.replays[0])))
-
-
-def _told(known: _Conclusion, quality: Sequence[DataQuality], model: GyroModel | None, rate: float,
-          names: Sequence[str], generator: np.random.Generator) -> Diagnosis:
-    """Put all that was found into words and records."""
-    search, found, noise, simulated = (known.search, known.found, known.figures.noise,
-                                       Noise() if model is None else model.noise)
-    of_record = _once([each for clean in quality for each in clean.findings])
-    said = {name for each in of_record for name in each.ambiguous_with}
-    findings = [*_named(known, generator), *of_record,
-                *(each for each in known.changed if each.effect not in said)]
-    if model is not None:
-        findings += _of_noise(known.figures, model, rate, found.replays)
-    findings.sort(key=lambda each: each.p_value)
-    plain, deviation = (FittedValues(fitted(search.problem, []), found.replays),
-                        _bias_deviation(known.inside, noise))
-    before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise),
-                            GyroModel(), quality)
-    after = (with_findings(model, known.inside, quality, findings, noise, deviation)
-             if known.offered else before)
-    # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
-    left, shown = (beside_model(found.replays) if known.changed else what_is_left(plain),
-                   known.inside if known.offered else plain)
-    return Diagnosis(
-        tuple(findings), tuple(unexplained(search, found, known.unnamed)), noise, simulated,
-        known.won, before, after, known.cannot_show,
-        curves(left, shown), heading_curve(left, shown), noise_curve(found, noise, simulated),
-        tuple(_remarks(quality, names, known, model)), rate, tuple(names))
-
-
-def _named(known: _Conclusion, generator: np.random.Generator) -> list[Finding]:
-    """Return the causes that were named."""
-    search, found, findings = known.search, known.found, []
-    for place, (each, members) in enumerate(zip(found.named, known.rivals)):
-        chance = search.chance.p_value(each.candidate.cause,
-                                       evidence_of(search, (*found.named, *known.unnamed), place))
-        findings.append(named_finding(search, found, place, chance, members,
-                                      _separated(search, found, place, members, generator)))
-    return findings
-
-
-def _separated(search: Search, found: FittedValues, place: int, members: Sequence[Named],
-               generator: np.random.Generator) -> str:
-    """Return the experiment that parts the members of a set."""
-    known = found.named[place]
-    others = [each for each in members if each.candidate.cause != known.candidate.cause]
-    return (distinguishing(search.problem, found.named, known, others, generator).sentence
-            if others else '')
-
-
-def _once(findings: Sequence[Finding]) -> list[Finding]:
-    """Return each cause once, by the log that shows it best."""
-    best: dict[str, Finding] = {}
-    for each in findings:
-        if each.effect not in best or each.p_value < best[each.effect].p_value:
-            best[each.effect] = each
-    return list(best.values())
+        sets.append(members)
+    return named, sets
 
 
 def _bias_deviation(found: FittedValues, noise: Noise) -> float:
@@ -389,11 +317,20 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
                    *(max(getattr(each, name) for each in (noise, model.noise))
                      for name in NAMES[1:]))
     doubts = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
-    told = [('bias', bias, doubts[0], ()),
-            ('scale_factor_error', scale.value, doubts[1], ('reference_scale',))]
-    return [_against(name, value, float(deviation), twins)
-            for name, value, deviation, twins in told
-            if deviation > 0.0 and 2.0 * norm.sf(abs(value) / deviation) < _OF_BIAS * rate]
+    different = []
+    for name, value, deviation, twins in (
+            ('bias', bias, float(doubts[0]), ()),
+            ('scale_factor_error', scale.value, float(doubts[1]), ('reference_scale',))):
+        chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
+        if chance < _OF_BIAS * rate:
+            cause = CAUSES[name]
+            different.append(Finding(
+                name, cause.sentence, {name: Estimate.about(value, 1.96 * deviation,
+                                                            next(iter(cause.units.values())))},
+                chance, 5.4 * deviation, twins, cause.separate_by if twins else '',
+                f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard '
+                'deviations from nothing', cause.along))
+    return different
 
 
 def _own_deviation(model: GyroModel, name: str) -> float:
@@ -403,18 +340,6 @@ def _own_deviation(model: GyroModel, name: str) -> float:
     owners = [term.effect.name for term in model.terms for _ in term.fitted]
     return (float(np.sqrt(model.covariance[owners.index(name), owners.index(name)]))
             if name in owners else 0.0)
-
-
-def _against(name: str, value: float, deviation: float, twins: tuple[str, ...]) -> Finding:
-    cause = CAUSES[name]
-    unit = next(iter(cause.units.values()))
-    return Finding(
-        name, cause.sentence,
-        {name: Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)},
-        float(2.0 * norm.sf(abs(value) / deviation)), 5.4 * deviation, twins,
-        cause.separate_by if twins else '',
-        f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard deviations '
-        'from nothing', cause.along)
 
 
 def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
@@ -452,7 +377,9 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
             told[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
         elif not moves and cause.needs & of_motion:
             told[name] = 'the reference shows no motion'
-    for name, reason in _constant(replays).items():
+    quiet = {name: _HARDLY[name] for name in constant(replays)}
+    quiet |= {other: quiet[name] for name, other in _WITH.items() if name in quiet}
+    for name, reason in quiet.items():
         told.update({cause.name: reason for cause in CAUSES.values()
                      if cause.along == name and cause.name not in told})
     alike = 'in these logs it would look exactly like a bias or a scale factor error'
@@ -460,40 +387,30 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     return told
 
 
-def _constant(replays: Sequence[Replay]) -> dict[str, str]:
-    """Return the variables that stay the same in all logs, with what is said of them."""
-    same = constant(replays)
-    quiet = {name: reason for name, reason in _HARDLY.items() if name in same}
-    return {**quiet, **{other: quiet[name] for name, other in _WITH.items() if name in quiet}}
-
-
-def _remarks(quality: Sequence[DataQuality], names: Sequence[str], known: _Conclusion,
+def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: FittedValues,
+             unnamed: Sequence[Named], out: Sequence[Named], won: Gain | None,
              model: GyroModel | None) -> Iterator[str]:
+    """Give what a person should know: of the records, of withdrawn names, and of the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
         yield from (where + remark for remark in clean.remarks)
-    for name in dict.fromkeys(each.candidate.cause for each in known.unnamed
+    for name in dict.fromkeys(each.candidate.cause for each in unnamed
                               if is_named(each.candidate)):
         why = ('it is at many frequencies' if name == 'interference_tone'
                else 'it differs from log to log, or is not alone')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    yield from _of_what_is_left_out(known, model)
-    if not known.offered:
-        yield ('On the parts held out, the extended model was worse than the one before; it is '
-               'not offered.')
-
-
-def _of_what_is_left_out(known: _Conclusion, model: GyroModel | None) -> Iterator[str]:
-    """Say what was found and is in no model, and why."""
-    scale, own = (known.found.scale_factor_error,
+    scale, own = (found.scale_factor_error,
                   {term.effect.name for term in ([] if model is None else model.terms)})
-    if doubts_scale(known.found):
+    if doubts_scale(found):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is in no model: there is too little motion '
                'beside the noise of gyro and reference for it to be believed; turn faster, and '
                'both ways.')
-    for name in dict.fromkeys(each.candidate.cause for each in known.out):
+    for name in dict.fromkeys(each.candidate.cause for each in out):
         remedy = ('; take that out of the model that is given, and diagnose again' if name in own
                   else '')
         yield (f'A further {name.replace("_", " ")} is not in the extended model, because that '
                f'has one already and the two do not make one{remedy}.')
+    if won is not None and won.worse:
+        yield ('On the parts held out, the extended model was worse than the one before; it is '
+               'not offered.')
