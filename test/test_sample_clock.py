@@ -149,6 +149,28 @@ def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
     assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.35 / rate
 
 
+@pytest.mark.parametrize(('rate', 'begin'), [(1000, 0.0), (1000, 10.0), (5000, 0.5)])
+def test_a_sequence_that_stands_still_loses_no_sample(rate, begin, generator):
+    """Nor when it goes on; what is lost meanwhile is counted by the time that passed."""
+    times = true_times(rate, 0.01, 20.0)
+    stands = sequence(times)[np.searchsorted(times, begin)]
+    said = np.where((times > begin) & (times < 14.0), stands, sequence(times))
+    kept = lose(times, ((12.0, 100),))
+    run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(11.0,)), kept,
+               sequence=said)
+    assert run.clock.lost == pytest.approx(100, abs=2)
+    late = (run.times > 13.0) | (run.times < 12.0)  # a loss without a trace shows after 0.3 s
+    assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < BURST
+    assert (np.diff(run.stamps) > 0.0).all()
+
+
+def test_a_loss_of_one_round_of_the_sequence_is_no_standstill(generator):
+    times = true_times(1000, 0.01, 20.0)
+    run = play(SampleClock(1000.0, 128), times, arrivals_of(times, generator),
+               lose(times, ((10.0, 127),)), sequence=sequence(times))
+    assert run.clock.lost == 127
+
+
 @pytest.mark.parametrize('rate', [10, 100, 1000])
 def test_samples_lost_without_a_trace_are_counted_by_the_time_that_passed(rate, generator):
     times = true_times(rate, 0.02, 80.0)
@@ -226,6 +248,19 @@ def test_times_of_the_device_that_are_often_damaged_lose_no_sample(damage, gener
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), time=said)
     assert run.clock.lost < 0.5 * np.count_nonzero(said != np.round(50.0 + times, 3))
     assert abs(run.stamps - times).max() < 0.1
+
+
+def test_a_long_damaged_field_loses_no_more_samples_than_the_time_has_room_for(generator):
+    """Its bytes are as many as those of 20 lines; the time of the device knows better."""
+    times = true_times(100, 0.0, 30.0)
+    kept = generator.random(times.size) >= 0.01
+    kept[0] = True
+    missing = 20 * (np.diff(np.flatnonzero(kept), prepend=-1) > 1)
+    every = np.zeros(times.size, int)
+    every[kept] = missing
+    run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=every,
+               time=50.0 + times)
+    assert run.clock.lost == run.truly_lost
 
 
 def test_a_first_interval_that_is_too_short_loses_no_sample_later(generator):

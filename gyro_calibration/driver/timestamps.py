@@ -178,7 +178,7 @@ class _Numbers:
     """
 
     def __init__(self, rate: float, modulus: int):
-        self._rate, self._modulus = rate, modulus
+        self._rate, self.modulus = rate, modulus
         self._sequence: int | None = None
         self._time: float | None = None
         self._outlier: float | None = None
@@ -189,29 +189,36 @@ class _Numbers:
         self._odd_advances: list[float] = []
         self._odd_lost = 0
         self._sequence = self._time = self._outlier = None
+        self._stands = False
 
-    def step(self, sample: Sample, most: float = math.inf) -> tuple[float, int]:
+    def step(self, sample: Sample, most: float = math.inf,
+             round_fits: bool = False) -> tuple[float, int]:
         """
         Return how far it is to this sample, and how many were lost before it.
 
         A time of the device that is further than `most` is wrong: the sample came too early.
+        A sequence that repeats stands still, unless a whole round of it fits into the time.
 
         """
-        if self._modulus and sample.sequence is not None:
-            return self._by_sequence(sample.sequence, sample.missing)
+        if self.modulus and sample.sequence is not None:
+            return self._by_sequence(sample.sequence, sample.missing, round_fits)
         if sample.time is not None:
             return self._by_time(sample.time, sample.missing, most)
         advance = self.size * (1 + sample.missing)
         self._time = None if self._time is None else self._time + advance / self._rate
         return advance, sample.missing
 
-    def _by_sequence(self, sequence: int, missing: int) -> tuple[int, int]:
-        last, self._sequence, self.unit = self._sequence, sequence, self._modulus
+    def _by_sequence(self, sequence: int, missing: int, round_fits: bool) -> tuple[int, int]:
+        last, self._sequence, stood = self._sequence, sequence, self._stands
+        self._stands = sequence == last and (stood or not round_fits)
+        self.unit = 1 if self._stands else self.modulus
         if last is None:
             return 1, 0
-        advance = (sequence - last) % self._modulus or self._modulus
+        if self._stands or stood:  # where it stood, it shows only from the next sample on
+            return 1 + missing, missing
+        advance = (sequence - last) % self.modulus or self.modulus
         # Missing is counted from damaged bytes, to a few: enough for how often it wrapped.
-        advance += self._modulus * max(0, round((1 + missing - advance) / self._modulus))
+        advance += self.modulus * max(0, round((1 + missing - advance) / self.modulus))
         return advance, advance - 1
 
     def _by_time(self, time: float, missing: int, most: float) -> tuple[float, int]:
@@ -223,7 +230,10 @@ class _Numbers:
             return advance, missing
         self._time, self._outlier = time, None
         advance = elapsed * self._rate
-        return advance, max(missing, self._lost(advance))
+        lost = self._lost(advance)
+        if lost >= 0:  # damaged bytes show what coarse times do not, up to the time that passed
+            lost = max(lost, min(missing, round(advance / self.size) - 1))
+        return advance, lost
 
     def _elapsed(self, time: float, most: float) -> float | None:
         """Return the time since the last sample, s; None where only this one time shows it."""
@@ -423,7 +433,9 @@ class SampleClock:
         number, before = self._number, self.lost
         numbers: list[float] = []
         for sample in samples:
-            advance, lost = self._numbers.step(sample, self._most(number, arrival))
+            most = self._most(number, arrival)
+            round_fits = self.is_settled and most >= self._numbers.modulus
+            advance, lost = self._numbers.step(sample, most, round_fits)
             number += advance
             self.lost += lost
             numbers.append(number)
