@@ -22,9 +22,9 @@ import signal
 import time
 
 from fake_gyro import FakeGyro, PACE
+from gyro_calibration.logs.cdr import UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
-from gyro_calibration.ros import UNMEASURED_VARIANCE
 import numpy as np
 import pytest
 

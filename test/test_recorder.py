@@ -14,6 +14,7 @@ import gzip
 from pathlib import Path
 
 from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.recorder import (
     about,
     AtomicAppender,
@@ -100,7 +101,12 @@ def test_rosbags_reads_what_is_recorded(tmp_path):
         assert reader.message_count == 600
     assert [message.angular_velocity.z for message in found] == [
         sample.output for _, sample in samples()]
-    assert found[-1].header.frame_id == 'gyro' and found[-1].linear_acceleration.z == 9.8
+    last = found[-1]
+    assert last.header.frame_id == 'gyro' and last.linear_acceleration.z == 9.8
+    assert last.orientation_covariance[0] == -1.0
+    for covariance, deviation in ((last.angular_velocity_covariance, ASSUMED_NOISE),
+                                  (last.linear_acceleration_covariance, ASSUMED_FORCE_NOISE)):
+        assert covariance.tolist() == [1e6, 0.0, 0.0, 0.0, 1e6, 0.0, 0.0, 0.0, deviation ** 2]
 
 
 def test_a_file_that_is_there_is_never_written_to(tmp_path):

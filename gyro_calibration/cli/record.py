@@ -276,6 +276,9 @@ class _PortSession(_Session):
 
     def _take(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
+            protocol = self._connection.protocol
+            if protocol and isinstance(self._recorder, McapRecorder):
+                self._recorder.variance = protocol.variance(self._settings)
             for sample, stamp in zip(chunk.samples, chunk.stamps, strict=True):
                 self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._since, sample)
             tick()

@@ -34,6 +34,7 @@ from typing import Any
 from gyro_calibration import __version__
 from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.driver.protocols import Sample
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.timestamps import MessageClock
 from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.logs.cdr import (
@@ -54,6 +55,7 @@ from gyro_calibration.logs.cdr import (
     serialize,
     TEMPERATURE,
     TWIST,
+    UNMEASURED_VARIANCE,
 )
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.recording import wrong_kind
@@ -161,6 +163,11 @@ class McapRecorder:
     notes : callable
         Returns its notes.
 
+    Attributes
+    ----------
+    variance : float
+        Of the rate of one sample of a port, (rad/s)².
+
     Raises
     ------
     OSError : as `AtomicAppender`
@@ -169,6 +176,7 @@ class McapRecorder:
 
     def __init__(self, path: str, notes: Notes):
         self._file, self._writer, self._notes = AtomicAppender(path), McapWriter(), notes
+        self.variance = ASSUMED_NOISE ** 2
 
     @property
     def size(self) -> int:
@@ -180,10 +188,13 @@ class McapRecorder:
         numbers = 37 * [0.0]
         numbers[3], numbers[ORIENTATION_COVARIANCE] = 1.0, NOT_REPORTED
         numbers[RATE_Z] = sample.output
+        beside = UNMEASURED_VARIANCE, UNMEASURED_VARIANCE
+        numbers[RATE_COVARIANCE:FORCE_Z - 2:4] = *beside, self.variance
         if sample.specific_force is None:
             numbers[FORCE_COVARIANCE] = NOT_REPORTED
         else:
             numbers[FORCE_Z] = sample.specific_force
+            numbers[FORCE_COVARIANCE::4] = *beside, ASSUMED_FORCE_NOISE ** 2
         if sample.temperature is not None:
             self._add_numbers('/imu/temperature', TEMPERATURE, stamp, [sample.temperature, 0.0])
         self._add_numbers('/imu/data_raw', IMU, stamp, numbers)

@@ -34,6 +34,15 @@ ODOMETRY, POSE, TWIST = ('nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped
 #: In element 0 of the covariance of a quantity that the message does not report (REP-145).
 NOT_REPORTED = -1.0
 
+UNMEASURED_VARIANCE = 1e6
+"""
+Variance of what a gyro with one axis does not measure, in (rad/s)², (m/s²)², rad² or m².
+
+All zeros would say that the whole covariance is unknown, z included. A standard deviation of
+1000 rad/s gives these axes no weight in a filter, and the matrix can still be inverted.
+
+"""
+
 #: Places of quantities among the numbers of an Imu: the quaternion x, y, z, w first, each quantity
 #: followed by its covariance.
 ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE = 4, 15, 16, 27, 28

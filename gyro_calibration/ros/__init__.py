@@ -19,15 +19,3 @@ Reading order: `parameters`, `clock`, `runner`, `diagnostics`, `health_monitor`,
 `compensation_report`, `compensation_node`.
 
 """
-
-NOT_REPORTED = -1.0
-"""Element 0 of the covariance of a quantity that a message does not report (REP-145)."""
-
-UNMEASURED_VARIANCE = 1e6
-"""
-Variance of what a gyro with one axis does not measure, in (rad/s)², rad² or m².
-
-All zeros would say that the whole covariance is unknown, z included. A standard deviation of
-1000 rad/s gives these axes no weight in a filter, and the matrix can still be inverted.
-
-"""

@@ -35,8 +35,7 @@ from geometry_msgs.msg import (
     TwistWithCovarianceStamped,
 )
 from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.logs.cdr import NSEC_PER_SEC
-from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
+from gyro_calibration.logs.cdr import NOT_REPORTED, NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import Drive, REST
 from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
 from gyro_calibration.ros.diagnostics import Diagnostics, OK, Report, status_array

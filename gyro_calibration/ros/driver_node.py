@@ -27,9 +27,9 @@ from types import SimpleNamespace
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.decimation import Decimation, Mean
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
+from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import NodeTime, read_together, steady
-from gyro_calibration.logs.cdr import NSEC_PER_SEC
-from gyro_calibration.ros import NOT_REPORTED, UNMEASURED_VARIANCE
+from gyro_calibration.logs.cdr import NOT_REPORTED, NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import Parameter
@@ -72,8 +72,6 @@ PARAMETERS = (
               (1, 10000)),
 )
 
-#: Assumed variance of the specific force, (m/s²)²: 0.01 g, beyond the noise of any such unit.
-FORCE_VARIANCE = 0.1 ** 2
 _REPORT_INTERVAL = 1.0  # s
 _WATCH_INTERVAL = 0.5  # s; between two looks whether the port is still read
 _CLOCK_INTERVAL = 0.01  # s; between two looks at the node's clock, which cost as much as a message
@@ -229,7 +227,7 @@ class Messages:
         if (force is not None) is not self._has_force:
             self._has_force = force is not None
             imu.linear_acceleration_covariance[[0, 4, 8]] = (
-                (UNMEASURED_VARIANCE, UNMEASURED_VARIANCE, FORCE_VARIANCE)
+                (UNMEASURED_VARIANCE, UNMEASURED_VARIANCE, ASSUMED_FORCE_NOISE ** 2)
                 if self._has_force else (NOT_REPORTED, 0.0, 0.0))
 
 

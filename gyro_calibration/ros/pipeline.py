@@ -37,10 +37,9 @@ from gyro_calibration.heading.bias_table import Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator, TEMPERATURE_TIMEOUT
 from gyro_calibration.heading.integration import Threshold
 from gyro_calibration.heading.tracker import Settings
-from gyro_calibration.logs.cdr import NSEC_PER_SEC
+from gyro_calibration.logs.cdr import NSEC_PER_SEC, UNMEASURED_VARIANCE
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.ros import UNMEASURED_VARIANCE
 from gyro_calibration.ros.calibration_session import BLIND, CalibrationSession, REST, STANDING_TIME
 from gyro_calibration.ros.clock import Clock, RosTime
 from gyro_calibration.ros.health_monitor import HealthMonitor

@@ -39,6 +39,9 @@ KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
 ASSUMED_NOISE = math.radians(0.5)
 """rad/s, standard deviation of one sample of a gyro whose data sheet is not known."""
 
+ASSUMED_FORCE_NOISE = 0.1
+"""m/s², standard deviation of a specific force: 0.01 g, beyond the noise of any such unit."""
+
 _TEMPERATURES = -100.0, 300.0  # degC; beyond them no sensor of a gyro reports
 _MOST_DEVIATION = 0.05  # of the sample rate; the clocks of gyros are 2 to 3 % off
 
