@@ -15,8 +15,8 @@ import math
 
 from gyro_calibration.calibration.dwells import dwells, find_dwells, from_table, join
 from gyro_calibration.calibration.dwells.averaging import moderated
-from gyro_calibration.calibration.dwells.samples import code_step
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import turns
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
@@ -242,7 +242,7 @@ def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
-def test_wild_stuck_and_lost_samples_are_said_and_left_out(reference, generator):
+def test_outliers_repeated_and_lost_samples_are_said_and_left_out(reference, generator):
     log = run(generator, **references(generator)[reference])
     output, given = log.output.copy(), next(iter(references(generator)[reference].values())).copy()
     output[[500, 9000, 9001]] += 500.0 * DEGREE
@@ -255,8 +255,8 @@ def test_wild_stuck_and_lost_samples_are_said_and_left_out(reference, generator)
         replace(log, **{'output': output[kept], 'time': TIME[kept], quantity: given[kept]}))
     said = ' '.join(found.remarks)
     assert len(found) == len(RATES) and (np.abs(errors(found)) < 5.0).all()
-    assert 'wild samples, left out: 3, at 5.00 s, 90.00 s, 90.01 s' in said
-    assert 'stuck once, at 120.01 s (79 samples)' in said
+    assert 'outliers, left out: 3, at 5.00 s, 90.00 s, 90.01 s' in said
+    assert 'repeated once, at 120.01 s (79 samples)' in said
     assert 'lost once, for 40 samples, at 250.00 s' in said
     assert 'samples missing within the dwells: 7, after 299.99 s' in said
 
@@ -267,12 +267,12 @@ def test_nothing_is_said_of_a_good_log(generator):
     assert not said
 
 
-def test_a_gyro_of_coarse_codes_is_not_stuck(generator):
+def test_a_coarsely_quantized_output_is_not_taken_for_repeated(generator):
     log = run(generator)
     for step in (0.05, 0.3):
         found = find_dwells(
             replace(log, output=np.round(log.output / (step * DEGREE)) * step * DEGREE))
-        assert not [remark for remark in found.remarks if 'stuck' in remark or 'wild' in remark]
+        assert not [remark for remark in found.remarks if 'repeat' in remark or 'outl' in remark]
 
 
 def test_a_dwell_that_warms_is_divided(generator):
@@ -331,10 +331,10 @@ def test_nothing_is_found_in_a_reference_of_noise(generator):
 
 
 def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
-    assert code_step(np.round(encoder(0.0879, generator) / DEGREE, 2)) == pytest.approx(
+    assert quantization_step(np.round(encoder(0.0879, generator) / DEGREE, 2)) == pytest.approx(
         0.088, abs=0.009)
-    assert code_step(encoder(2.0, generator)) == pytest.approx(2.0 * DEGREE)
-    assert code_step(np.sin(TIME)) < 0.01 * DEGREE
+    assert quantization_step(encoder(2.0, generator)) == pytest.approx(2.0 * DEGREE)
+    assert quantization_step(np.sin(TIME)) < 0.01 * DEGREE
 
 
 # Deviations

@@ -11,6 +11,6 @@
 """
 What was recorded: logs, ROS 2 recordings, and their time stamps.
 
-Reading order: `columns`, `log`, `cdr`, `ros_bag`, `recording`, `stamps`.
+Reading order: `columns`, `log`, `cdr`, `ros_bag`, `recording`, `stamps`, `quality`.
 
 """

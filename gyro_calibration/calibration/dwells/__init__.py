@@ -15,8 +15,8 @@ The rows of a rate table without time are dwells. In a log in time they are foun
 reference is steady, without the ramps and the settling after them.
 
 Reading order, each imports only from those before it: `samples` (those with gyro and reference),
-`steadiness` (of a reference rate), `straightness` (of a reference heading), `cleaning` (of
-outliers and repeated samples), `settling` (after ramps), `stretches` (of a log that are dwells),
+`steadiness` (of a reference rate), `straightness` (of a reference heading), `settling` (after
+ramps), `stretches` (of a log that are dwells, without outliers and repeated samples),
 `averaging` (of each), `sweeps` (to which dwells belong), `table` (of all dwells).
 
 """

@@ -16,15 +16,10 @@ from collections.abc import Callable, Iterable, Sequence
 import math
 from typing import Any
 
-from gyro_calibration.calibration.dwells.samples import (
-    code_step,
-    duration,
-    Numbers,
-    Samples,
-    slope,
-)
+from gyro_calibration.calibration.dwells.samples import duration, Numbers, Samples, slope
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.quality import quantization_step
 import numpy as np
 from scipy.special import digamma, polygamma
 
@@ -73,7 +68,7 @@ def _average_slopes(samples: Samples, dwells: Sequence[Numbers],
 
     """
     assert samples.heading is not None
-    step = code_step(samples.heading)
+    step = quantization_step(samples.heading)
     time, output, heading = ([values[rows] for rows in dwells]
                              for values in (samples.time, samples.output, samples.heading))
     turned = list(map(integrate, time, output))

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
+from gyro_calibration.logs.quality import runs
 from gyro_calibration.logs.stamps import Integers as Numbers
 from gyro_calibration.logs.stamps import lost_samples
 import numpy as np
@@ -136,30 +137,10 @@ def count(time: Array, span: float) -> int:
     return round(span / float(steps[steps < _PAUSE].mean())) if (steps < _PAUSE).any() else 0
 
 
-def code_step(values: Array) -> float:
-    """Return the step of an encoder or another digital output; about 0 where it has none."""
-    # Rounding in the file splits a step in two sizes, and fast turns leave codes out: so it is
-    # neither the smallest nor the median gap.
-    gaps = np.diff(np.unique(values))
-    gaps = gaps[gaps > 1e-9]
-    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
-
-
 def slope(place: Array, values: Array) -> float:
     """Return the slope of the straight line through some values."""
     centred = place - place.mean()
     return float(centred @ values / (centred @ centred))
-
-
-def runs(mask: Mask) -> list[slice]:
-    """Return each run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
-    return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2])]
-
-
-def length(part: slice) -> int:
-    """Return the number of samples in a slice."""
-    return int(part.stop - part.start)
 
 
 def times(number: int) -> str:

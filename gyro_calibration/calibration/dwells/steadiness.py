@@ -16,8 +16,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.dwells.samples import count, runs
+from gyro_calibration.calibration.dwells.samples import count
 from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.quality import runs
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
@@ -40,8 +41,8 @@ class Steadiness:
     gap : in longer gaps the reference is taken as unknown, s
     settling : longest settling time of a gyro, s
     temperature : a dwell that warms by more than this is divided, K
-    wild : a sample this many robust standard deviations from its neighbours, and from the middle
-        of the dwell, is left out
+    outlier : a sample this many robust standard deviations from its neighbours, and from the
+        middle of the dwell, is left out
     share : least share of the log in dwells, 1; a log that swings looks steady now and then
 
     """
@@ -54,7 +55,7 @@ class Steadiness:
     gap: float = 1.0
     settling: float = 3.0
     temperature: float = 1.0
-    wild: float = 6.0
+    outlier: float = 6.0
     share: float = 0.05
 
 

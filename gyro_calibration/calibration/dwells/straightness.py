@@ -15,25 +15,30 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 import math
 
-from gyro_calibration.calibration.dwells.samples import code_step, duration, length, Numbers, slope
+from gyro_calibration.calibration.dwells.samples import duration, Numbers, slope
 from gyro_calibration.calibration.dwells.steadiness import Steadiness
 from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.quality import quantization_step
 import numpy as np
 
 #: Duration of the blocks in which the heading is averaged, s.
 _BLOCK = 0.1
 
 
+def _length(part: slice) -> int:
+    return int(part.stop - part.start)
+
+
 def straight(time: Array, heading: Array, limits: Steadiness) -> list[slice]:
     """Return the stretches whose reference heading is straight."""
-    step = code_step(heading)
+    step = quantization_step(heading)
     edges, times, headings = _blocks(time, heading)
     tolerance = step + _crookedness(headings, limits.heading)
     cones = [cone for cone in _cones(times, headings, 2.0 * tolerance, limits.gap)
              if duration(times, cone) >= 0.5 * limits.duration]
     parts = _apart(_walked(times, headings, cone, tolerance, step) for cone in cones)
     whole = [slice(int(edges[part.start]), int(edges[part.stop]))
-             for part in parts if length(part) > 4]
+             for part in parts if _length(part) > 4]
     return [part for part in whole if _holds_its_slope(time[part], heading[part], step, limits)]
 
 
@@ -73,10 +78,10 @@ def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterato
 
 def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: float) -> slice:
     """Fit a line to the middle of a stretch, extend it while it holds, and cut the ramps off."""
-    fifth = length(cone) // 5
+    fifth = _length(cone) // 5
     middle = slice(cone.start + fifth, cone.stop - fifth)
     # At most by its own length at both ends, so that the work is not quadratic in the log.
-    first, last = max(0, cone.start - length(cone)), min(len(time), cone.stop + length(cone))
+    first, last = max(0, cone.start - _length(cone)), min(len(time), cone.stop + _length(cone))
     line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
         time[first:last] - time[middle].mean())
     stray = np.abs(heading[first:last] - line)
@@ -108,7 +113,7 @@ def _apart(parts: Iterable[slice]) -> list[slice]:
     """Keep the longer of two stretches that overlap: its line is more accurate."""
     kept: list[slice] = []
     for part in parts:
-        if kept and part.start < kept[-1].stop and length(part) > length(kept[-1]):
+        if kept and part.start < kept[-1].stop and _length(part) > _length(kept[-1]):
             kept.pop()
         if not kept or part.start >= kept[-1].stop:
             kept.append(part)

@@ -23,20 +23,23 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from gyro_calibration.calibration.dwells.cleaning import clean, left_out
 from gyro_calibration.calibration.dwells.samples import (
     duration,
     FEWEST,
+    inside,
+    listed,
     missing,
     Numbers,
     Samples,
     slope,
+    times,
     usable,
 )
 from gyro_calibration.calibration.dwells.settling import settled
 from gyro_calibration.calibration.dwells.steadiness import Steadiness, steady
 from gyro_calibration.calibration.dwells.straightness import straight
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.quality import outliers, repeated_samples, runs
 import numpy as np
 
 #: Number of parts of a dwell between which its warming is taken.
@@ -110,15 +113,35 @@ def _found(log: Log, limits: Steadiness) -> Stretches:
     parts = [part for part in _calm(samples, limits)
              if duration(samples.time, part) > limits.duration]
     samples = samples._replace(scale=_scale(samples, parts))
-    cleaned = [clean(samples, part, limits.wild) for part in parts]
-    whole, cut = settled(samples, [part.rows for part in cleaned], limits)
+    outlying, repeated = np.zeros((2, len(samples.time)), dtype=bool)
+    kept = []
+    for part in parts:
+        repeated[part] = repeated_samples(samples.output[part])
+        fresh = np.arange(part.start, part.stop)[~repeated[part]]
+        outlying[fresh] = outliers(samples.error[fresh], limits.outlier)
+        kept.append(fresh[~outlying[fresh]])
+    whole, cut = settled(samples, kept, limits)
     whole, divided = _divided(samples, whole, limits)
     rows = [part for part in whole
             if len(part) >= FEWEST and duration(samples.time, part) >= limits.duration]
     short = _short(len(whole) - len(rows), limits.duration)
     return Stretches(samples, rows, (*lost, *short, cut, *divided,
-                                     *left_out(samples, rows, cleaned),
+                                     *_left_out(samples, rows, outlying, repeated),
                                      *missing(log, samples, rows)))
+
+
+def _left_out(samples: Samples, dwells: list[Numbers], outlying: Mask,
+              repeated: Mask) -> Iterator[str]:
+    """Yield remarks on the outliers and repeated samples within the dwells."""
+    within = inside(samples, dwells)
+    places = [f'{time:.2f} s' for time in samples.time[outlying & within]]
+    if places:
+        yield f'outliers, left out: {len(places)}, at {listed(places)}'
+    places = [f'{samples.time[run.start]:.2f} s ({run.stop - run.start} samples)'
+              for run in runs(repeated & within)]
+    if places:
+        yield (f'the output was repeated {times(len(places))}, at {listed(places)}; '
+               'the repeats are left out')
 
 
 def _calm(samples: Samples, limits: Steadiness) -> list[slice]:
