@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-import reprlib
 from typing import Any
 
 from gyro_calibration.calibration.motion_design import (
@@ -32,7 +31,7 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION, Motion, NAMED, read_motion
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.settings_file import read_settings
+from gyro_calibration.model.settings_file import checked, number, read_settings, WrongValue
 from gyro_calibration.reproduction.hong_park import XV3500
 import numpy as np
 
@@ -116,28 +115,23 @@ def read_limits(path: str) -> Ability:
     except (OSError, ValueError) as error:
         raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); '
                          'begin with a copy of config/limits.yaml') from error
-    if not isinstance(content, dict):
-        raise UsageError(f'{path}: holds no names with values; wanted {", ".join(NEEDED)} '
-                         'and others, as in config/limits.yaml')
-    unknown = [name for name in content if name not in LIMITS]
-    if unknown:
-        raise UsageError(f'{path}: {reprlib.repr(unknown[0])} is no limit; '
-                         f'wanted some of {", ".join(LIMITS)}')
-    missing = [name for name in NEEDED if name not in content]
+    try:
+        given = checked('the file', content, dict.fromkeys(LIMITS, _limit))
+    except WrongValue as error:
+        raise UsageError(f'{path}: {error}; config/limits.yaml is an example') from None
+    missing = [name for name in NEEDED if name not in given]
     if missing:
         raise UsageError(f'{path}: {missing[0]} is missing; add what the robot can do')
-    ability = Ability(**dict(_limit(path, name, value) for name, value in content.items()))
+    ability = Ability(**{LIMITS[name][0]: value * LIMITS[name][1]
+                         for name, value in given.items()})
     if ability.slowest > ability.rate:
         raise UsageError(f'{path}: minimum_rate_dps is above maximum_rate_dps; mend one of them')
     return ability
 
 
-def _limit(path: str, name: str, value: Any) -> tuple[str, float]:
-    attribute, unit, low, high = LIMITS[name]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise UsageError(f'{path}: {name} is {reprlib.repr(value)}; '
-                         f'wanted a number from {low:g} to {high:g}')
-    return attribute, float(value) * unit
+def _limit(place: str, value: Any) -> float:
+    name = place.rpartition('.')[2]
+    return number(name, value, *LIMITS[name][2:])
 
 
 def _noise(given: argparse.Namespace) -> Noise:

@@ -12,14 +12,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import math
 from pathlib import Path
-import reprlib
 from typing import Any
 
 from gyro_calibration.files import InputError, LARGEST, reason, write_atomically
-from gyro_calibration.logs.log import Array, shown
+from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
     CATALOGUE,
     Effect,
@@ -28,12 +27,21 @@ from gyro_calibration.model.effects import (
 )
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term, Tolerance
 from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.settings_file import read_settings, settings_text
+from gyro_calibration.model.settings_file import (
+    checked,
+    number,
+    read_settings,
+    refuse_others,
+    settings_text,
+    text,
+    WrongValue,
+)
 import numpy as np
 
 FORMAT = 'gyro_calibration/model'
 VERSION = 1
 POLYNOMIAL = 'rate_temperature_polynomial'
+_NOISES = tuple(Noise.__dataclass_fields__)
 #: Highest order of a polynomial.
 _HIGHEST = 20
 #: Largest standard deviation of a self-calibration, rad/s and 1; beyond it double precision does
@@ -69,147 +77,102 @@ def read_model(path: str | Path) -> GyroModel:
                          'restore the file or calibrate again') from error
     try:
         return _from_content(content)
-    except _PlaceError as error:
-        raise ModelError(f'{path}: {error}') from None
-
-
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel = 3
-
-
-class _PlaceError(ValueError):
-
-    def __init__(self, place: str, given: Any, wanted: str):
-        super().__init__(f'{shown(place)} is {_SHORT.repr(given)}; wanted {wanted}')
+    except WrongValue as error:
+        raise ModelError(f'{path}: {error} (see docs/explanation/error_model.md)') from None
 
 
 def _from_content(content: Any) -> GyroModel:
-    top = _mapping('the file', content)
+    top = checked('the file', content, None)
     if top.get('format', FORMAT) != FORMAT:
-        raise _PlaceError('format', top['format'], f'{FORMAT}: this is not a model file')
+        raise WrongValue('format', top['format'], f'{FORMAT}: this is not a model file')
     version = top.get('version', VERSION)
     if not isinstance(version, int) or version > VERSION:
-        raise _PlaceError('version', version,
-                          f'at most {VERSION}: install a newer gyro_calibration')
+        raise WrongValue('version', version,
+                         f'at most {VERSION}: install a newer gyro_calibration')
     if 'effects' not in top:
-        raise _PlaceError('effects', None,
-                          'the effects with their values, such as {bias: {bias: 0.01}}')
+        raise WrongValue('effects', None,
+                         'the effects with their values, such as {bias: {bias: 0.01}}')
     terms = tuple(_term(name, values)
-                  for name, values in _mapping('effects', top['effects'] or {}).items())
-    valid = _mapping('valid', top.get('valid', {}))
+                  for name, values in checked('effects', top['effects'] or {}, None).items())
+    size = sum(len(term.fitted) for term in terms)
+    valid = checked('valid', top.get('valid', {}), None)
     temperature_range = _range('valid.temperature', valid.get('temperature'))
     middle = sum(temperature_range) / 2.0 if all(map(math.isfinite, temperature_range)) else 25.0
-    noise = {name: _noise(f'noise.{name}', value)
-             for name, value in _mapping('noise', top.get('noise', {})).items()}
-    _only('noise', noise, Noise.__dataclass_fields__)
+
+    def part(name: str, schema: Any) -> Any:
+        return checked(name, top.get(name, {}), schema)
+    gyro = part('gyro', None)
     return GyroModel(
-        terms, _covariance(top.get('covariance'), sum(len(term.fitted) for term in terms)),
+        terms,
+        None if top.get('covariance') is None else _matrix('covariance', top['covariance'], size),
         _range('valid.rate', valid.get('rate')), temperature_range,
-        _number('reference_temperature', top.get('reference_temperature', middle)), Noise(**noise),
-        {key: _text(f'gyro.{key}', value)
-         for key, value in _mapping('gyro', top.get('gyro', {})).items()},
-        _mapping('origin', top.get('origin', {})), _self_calibration(top.get('self_calibration')),
-        _tolerance(top.get('tolerance', {})), _noise_bounds(top.get('noise_bounds', {})))
+        number('reference_temperature', top.get('reference_temperature', middle)),
+        Noise(**part('noise', dict.fromkeys(_NOISES, _noise))),
+        {name: text(f'gyro.{name}', value) for name, value in gyro.items()},
+        part('origin', None), _self_calibration(top.get('self_calibration')),
+        Tolerance(**part('tolerance', dict.fromkeys(Tolerance.__dataclass_fields__, _size))),
+        part('noise_bounds', dict.fromkeys(_NOISES, _range)))
 
 
-def _noise_bounds(value: Any) -> dict[str, tuple[float, float]]:
-    given = _mapping('noise_bounds', value)
-    _only('noise_bounds', given, Noise.__dataclass_fields__)
-    return {name: _range(f'noise_bounds.{name}', ends) for name, ends in given.items()}
-
-
-def _tolerance(value: Any) -> Tolerance:
-    given = _mapping('tolerance', value)
-    _only('tolerance', given, Tolerance.__dataclass_fields__)
-    return Tolerance(**{name: _number(f'tolerance.{name}', each, low=0.0)
-                        for name, each in given.items()})
-
-
-def _mapping(place: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise _PlaceError(place, value,
-                          'names with values (see docs/explanation/error_model.md), '
-                          'or calibrate again')
-    return value
-
-
-def _text(place: str, value: Any) -> str:
-    if isinstance(value, (list, dict)):
-        raise _PlaceError(place, value, 'a text')
-    return str(value)
-
-
-def _number(place: str, value: Any, low: float = -math.inf) -> float:
-    if (isinstance(value, bool) or not isinstance(value, (int, float))
-            or not abs(value) <= LARGEST or value < low):
-        least = f' of at least {low:g}' if low > -math.inf else ''
-        raise _PlaceError(place, value, f'a finite number{least}; mend it or calibrate again')
-    return float(value)
+def _size(place: str, value: Any) -> float:
+    return number(place, value, low=0.0)
 
 
 def _noise(place: str, value: Any) -> float:
     """Read a figure whose square can be divided by: 0, or none that vanishes."""
-    number = _number(place, value, low=0.0)
-    if 0.0 < number < 1.0 / LARGEST:
-        raise _PlaceError(place, value, f'0 where it is not known, or at least {1.0 / LARGEST}')
-    return number
-
-
-def _only(place: str, given: Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]) -> None:
-    for name in given:
-        if name not in known:
-            raise _PlaceError(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
+    if 0.0 < (size := _size(place, value)) < 1.0 / LARGEST:
+        raise WrongValue(place, value, f'0 where it is not known, or at least {1.0 / LARGEST}')
+    return size
 
 
 def _range(place: str, value: Any) -> tuple[float, float]:
     if value is None:
         return (-math.inf, math.inf)
     if not isinstance(value, list) or len(value) != 2:
-        raise _PlaceError(place, value, '[lowest, highest]')
-    low, high = (_number(f'{place}[{index}]', item) for index, item in enumerate(value))
+        raise WrongValue(place, value, '[lowest, highest]')
+    low, high = (number(f'{place}[{index}]', item) for index, item in enumerate(value))
     if low > high:
-        raise _PlaceError(place, value, '[lowest, highest] in this order')
+        raise WrongValue(place, value, '[lowest, highest] in this order')
     return low, high
 
 
-def _matrix(place: str, value: Any, size: int) -> Array:
+def _rows(place: str, value: Any) -> list[list[float]]:
+    return [[number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)]
+            for i, row in enumerate(value)]
+
+
+def _matrix(place: str, value: Any, size: int = 2) -> Array:
     if not isinstance(value, list) or [len(row) if isinstance(row, list) else -1
                                        for row in value] != [size] * size:
-        raise _PlaceError(place, value, f'{size} rows of {size} numbers, one a fitted value')
-    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)]
-               for i, row in enumerate(value)]
-    matrix = np.array(numbers).reshape(size, size)
+        raise WrongValue(place, value, f'{size} rows of {size} numbers, one a fitted value')
+    matrix = np.array(_rows(place, value)).reshape(size, size)
     rounding = 1e-9 * np.abs(matrix).max(initial=0.0)
     smallest = min([*matrix.diagonal(), *(np.linalg.eigvalsh(matrix) + rounding)], default=0.0)
     if not np.allclose(matrix, matrix.T, atol=rounding) or smallest < 0.0:
-        raise _PlaceError(place, value, 'a covariance: symmetric, with no negative variance')
+        raise WrongValue(place, value, 'a covariance: symmetric, with no negative variance')
     return matrix
-
-
-def _covariance(value: Any, size: int) -> Array | None:
-    return None if value is None else _matrix('covariance', value, size)
 
 
 def _term(name: str, values: Any) -> Term:
     place = f'effects.{name}'
-    given = _mapping(place, values)
+    given = checked(place, values, None)
     if name == POLYNOMIAL:
         return _polynomial(place, given)
     if name not in CATALOGUE:
-        raise _PlaceError(place, given, 'an effect that this version knows: '
-                          f'{", ".join([*CATALOGUE, POLYNOMIAL])}')
+        raise WrongValue(place, given, 'an effect that this version knows: '
+                         f'{", ".join([*CATALOGUE, POLYNOMIAL])}')
     return Term(CATALOGUE[name], _values(place, CATALOGUE[name], given))
 
 
 def _values(place: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float, ...]:
-    _only(place, given, [parameter.name for parameter in effect.parameters])
+    refuse_others(place, given, [parameter.name for parameter in effect.parameters])
     values = []
     for parameter in effect.parameters:
-        value = _number(f'{place}.{parameter.name}', given.get(parameter.name, parameter.default))
+        value = number(f'{place}.{parameter.name}', given.get(parameter.name, parameter.default))
         low, high = parameter.bounds
         if not low <= value <= high:
-            raise _PlaceError(f'{place}.{parameter.name}', value,
-                              f'{low:g} to {high:g} {parameter.unit}')
+            raise WrongValue(f'{place}.{parameter.name}', value,
+                             f'{low:g} to {high:g} {parameter.unit}')
         values.append(value)
     return tuple(values)
 
@@ -217,66 +180,58 @@ def _values(place: str, effect: Effect, given: Mapping[str, Any]) -> tuple[float
 def _polynomial(place: str, given: Mapping[str, Any]) -> Term:
     """Read a polynomial: the paper's matrix, or orders [rate, temperature] with named values."""
     if 'matrix_dps' in given:
-        _only(place, given, ['matrix_dps'])
-        return _polynomial_from_matrix(f'{place}.matrix_dps', given['matrix_dps'])
+        return Term(*checked(place, given, {'matrix_dps': _effect_of_matrix})['matrix_dps'])
     orders = given.get('orders')
     if not isinstance(orders, list) or len(orders) != 2 or not all(
             type(order) is int and 0 <= order <= _HIGHEST for order in orders):
-        raise _PlaceError(f'{place}.orders', orders,
-                          'the orders in rate and temperature, such as [3, 2], or matrix_dps')
+        raise WrongValue(f'{place}.orders', orders,
+                         'the orders in rate and temperature, such as [3, 2], or matrix_dps')
     effect = rate_temperature_polynomial(*orders)
     return Term(effect, _values(
         place, effect, {name: value for name, value in given.items() if name != 'orders'}))
 
 
-def _polynomial_from_matrix(place: str, rows: Any) -> Term:
+def _effect_of_matrix(place: str, rows: Any) -> tuple[Effect, tuple[float, ...]]:
     if (not isinstance(rows, list) or not all(isinstance(row, list) for row in rows)
             or max(map(len, [rows, *rows])) > _HIGHEST + 1):
-        raise _PlaceError(place, rows, f'rows of finite numbers, up to order {_HIGHEST}')
-    numbers = [[_number(f'{place}[{i}][{j}]', item) for j, item in enumerate(row)]
-               for i, row in enumerate(rows)]
+        raise WrongValue(place, rows, f'rows of finite numbers, up to order {_HIGHEST}')
     try:
-        return Term(*polynomial_from_matrix(numbers))
+        return polynomial_from_matrix(_rows(place, rows))
+    except WrongValue:
+        raise
     except ValueError as error:
-        raise _PlaceError(place, rows, str(error)) from None
+        raise WrongValue(place, rows, str(error)) from None
+
+
+def _scale_factor_error(place: str, value: Any) -> float:
+    return number(place, value, low=-0.9)
+
+
+def _temperature(place: str, value: Any) -> float | None:
+    return None if value is None else number(place, value)
+
+
+_OF_A_RUN = {'scale_factor_error': _scale_factor_error, 'bias': number, 'covariance': _matrix,
+             'standard_deviations': {'scale_factor_error': _size, 'bias': _size}, 'time': text,
+             'temperature': _temperature, 'method': text}
 
 
 def _self_calibration(value: Any) -> SelfCalibration | None:
+    """Read a self-calibration; its covariance may be given by standard deviations alone."""
     if value is None:
         return None
-    place, given = 'self_calibration', _mapping('self_calibration', value)
-    _only(place, given, [*SelfCalibration.__dataclass_fields__, 'standard_deviations'])
-    temperature = given.get('temperature')
-    return SelfCalibration(
-        _number(f'{place}.scale_factor_error', given.get('scale_factor_error'), low=-0.9),
-        _number(f'{place}.bias', given.get('bias')),
-        _calibration_covariance(place, given),
-        _text(f'{place}.time', given.get('time', '')),
-        None if temperature is None else _number(f'{place}.temperature', temperature),
-        _text(f'{place}.method', given.get('method', '')))
-
-
-def _calibration_covariance(place: str, given: Mapping[str, Any]
-                            ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Read the covariance of (s, b), or else their standard deviations; None without both."""
-    covariance = _read_covariance(place, given)
-    if covariance and max(covariance[0][0], covariance[1][1]) > _LEAST_KNOWN ** 2:
-        raise _PlaceError(place, given, f'standard deviations of at most {_LEAST_KNOWN:g}')
-    return covariance
-
-
-def _read_covariance(place: str, given: Mapping[str, Any]
-                     ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    if 'covariance' in given:
-        (a, b), (_, c) = _matrix(f'{place}.covariance', given['covariance'], 2).tolist()
-        return (a, b), (b, c)
-    if 'standard_deviations' not in given:
-        return None
-    place, names = f'{place}.standard_deviations', ('scale_factor_error', 'bias')
-    named = _mapping(place, given['standard_deviations'])
-    _only(place, named, names)
-    s, b = (_number(f'{place}.{name}', named.get(name), low=0.0) for name in names)
-    return (s * s, 0.0), (0.0, b * b)
+    place, needed = 'self_calibration', {'scale_factor_error': None, 'bias': None}
+    run = checked(place, {**needed, **value} if isinstance(value, dict) else value, _OF_A_RUN)
+    deviations, matrix = run.pop('standard_deviations', None), run.pop('covariance', None)
+    if matrix is None and deviations is not None:
+        place = f'{place}.standard_deviations'
+        matrix = np.diag([_size(f'{place}.{name}', deviations.get(name)) ** 2 for name in needed])
+    if matrix is None:
+        return SelfCalibration(**run)
+    (a, b), (_, c) = matrix.tolist()
+    if max(a, c) > _LEAST_KNOWN ** 2:
+        raise WrongValue(place, value, f'standard deviations of at most {_LEAST_KNOWN:g}')
+    return SelfCalibration(**run, covariance=((a, b), (b, c)))
 
 
 def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:

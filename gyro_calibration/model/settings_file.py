@@ -11,24 +11,30 @@
 """
 Files of settings: models, bias tables, limits.
 
-They are YAML as people write it, and data alone: nothing in them is run or names a file.
+They are YAML as people write it, and data alone: nothing in them is run or names a file. A schema
+says what each name may hold.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 import re
+import reprlib
 from typing import Any
 
-from gyro_calibration.files import read_bytes
+from gyro_calibration.files import LARGEST, plain, read_bytes
 import yaml
 
 #: Bytes of such a file: a model with the covariance of 150 values has half of it.
 BYTES = 1_000_000
 #: How deep lists and names may be nested, and how many there may be; YAML takes 30 us for each.
 _DEEPEST, _MOST = 10, 50_000
+#: Shows what was given, and not all of a large value.
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 3
 
 
 def read_settings(path: str | Path, most: int = BYTES) -> Any:
@@ -56,6 +62,72 @@ def read_settings(path: str | Path, most: int = BYTES) -> Any:
     if isinstance(content, dict) and 'format' in content and not text.endswith(('\n', '\r')):
         raise ValueError('its last line has no end, as that of a file which was cut off')
     return content
+
+
+class WrongValue(ValueError):
+    """A value is not what its schema wants; the message is a part of a sentence."""
+
+    def __init__(self, place: str, given: Any, wanted: str):
+        super().__init__(f'{plain(place[:100])} is {_SHORT.repr(given)}; wanted {wanted}')
+
+
+def checked(place: str, value: Any, schema: Any) -> Any:
+    """
+    Return a value as its schema reads it.
+
+    Parameters
+    ----------
+    place : of the value in the file, such as `noise.angle_random_walk`
+    value : what the file holds there
+    schema : a function of place and value; or a mapping of names to schemas, of which the file may
+        leave some out; or None, for a mapping of any names
+
+    Raises
+    ------
+    WrongValue : it is something else
+
+    """
+    if callable(schema):
+        return schema(place, value)
+    if not isinstance(value, dict):
+        raise WrongValue(place, value, 'names with values')
+    if schema is None:
+        return value
+    refuse_others(place, value, schema)
+    return {name: checked(f'{place}.{name}', each, schema[name]) for name, each in value.items()}
+
+
+def refuse_others(place: str, given: Mapping[str, Any],
+                  known: Sequence[str] | Mapping[str, Any]) -> None:
+    """
+    Refuse names that are not known.
+
+    Raises
+    ------
+    WrongValue : there is one
+
+    """
+    for name in given:
+        if name not in known:
+            raise WrongValue(f'{place}.{name}', given[name], f'one of {", ".join(known)}')
+
+
+def number(place: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> float:
+    """Return a number that a gyro may have."""
+    if (isinstance(value, bool) or not isinstance(value, (int, float))
+            or not low <= value <= high):
+        least = '' if low == -LARGEST else f' of at least {low:g}'
+        wanted = (f'a finite number{least}; mend it or calibrate again' if high == LARGEST
+                  else f'a number from {low:g} to {high:g}')
+        raise WrongValue(place, value, wanted)
+    return float(value)
+
+
+def text(place: str, value: Any) -> str:
+    """Return a text, also of what YAML takes for a number."""
+    if isinstance(value, (list, dict)):
+        raise WrongValue(place, value, 'a text')
+    return str(value)
 
 
 def _line(text: object) -> str:
