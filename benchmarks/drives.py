@@ -18,11 +18,9 @@ from functools import partial
 
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.hong_park import XV3500
+from gyro_calibration.model.presets import GOOD_MEMS, Preset, RD2100, XV3500
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,37 +28,7 @@ from numpy.typing import NDArray
 STEP, GRID = 0.01, 0.1
 
 
-@dataclass(frozen=True)
-class Gyro:
-    """A gyro's true errors and noise, and the interval of its samples, s."""
-
-    name: str
-    model: GyroModel
-    interval: float
-
-    @property
-    def true(self) -> tuple[float, float]:
-        """Return its scale factor error s, and its bias b, rad/s, at the beginning."""
-        (s,), (b,) = (term.values for term in self.model.terms)
-        return s, b
-
-
-def _gyro(name: str, interval: float, scale_factor_error: float, bias: float, walk: float,
-          instability: float) -> Gyro:
-    """Return a gyro from figures in the units of data sheets: deg/s, deg/√h, deg/h."""
-    noise = Noise(walk * DEGREE / 60.0, instability * DEGREE / 3600.0)
-    return Gyro(name, GyroModel((Term(SCALE_FACTOR_ERROR, (scale_factor_error,)),
-                                 Term(BIAS, (bias * DEGREE,))), noise=noise), interval)
-
-
-GYROS = {
-    'XV3500': Gyro('XV3500', XV3500, 0.01),
-    # Ojeda, Chung and Borenstein, Table I and 10 Hz of section 5: 5 (deg/h)/√Hz, 0.002 deg/s at
-    # constant temperature; half of 2 % and 0.2 deg/s, both over the range of temperatures
-    'RD2100': _gyro('RD2100', 0.1, 0.01, 0.1, 5.0 / 60.0, 7.2),
-    # round figures of the better ones that are sold, such as the ADIS16488
-    'good MEMS': _gyro('good MEMS', 0.01, 0.01, 0.2, 0.3, 6.0),
-}
+GYROS = {each.name: each for each in (XV3500, RD2100, GOOD_MEMS)}
 
 
 @dataclass(frozen=True)
@@ -88,7 +56,7 @@ class Drive:
 
     """
 
-    gyro: Gyro
+    gyro: Preset
     time: Array
     output: Array
     rate: Array
@@ -213,7 +181,7 @@ COURSES = {
 }
 
 
-def simulate(gyro: Gyro, course: Course, generator: np.random.Generator) -> Drive:
+def simulate(gyro: Preset, course: Course, generator: np.random.Generator) -> Drive:
     """Return what a gyro says of a calibration and of a course after it."""
     way = begun_any_time(course.path(generator), generator)
     every, before = round(gyro.interval / STEP), round(course.warm / gyro.interval)

@@ -34,7 +34,7 @@ import os
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from drives import begun_any_time, Gyro, GYROS, of_motion, random_path, STEP
+from drives import begun_any_time, GYROS, of_motion, random_path, STEP
 from gyro_calibration.calibration.self_calibration import record, self_calibrate
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.timestamps import SampleClock
@@ -45,6 +45,7 @@ from gyro_calibration.model.compensation import covariance, rate_sensitivity
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import CALIBRATION
 from gyro_calibration.model.noise import simulate_noise
+from gyro_calibration.model.presets import Preset
 import numpy as np
 
 BURST = 0.016  # s; what an FTDI adapter collects by default
@@ -84,7 +85,7 @@ class Drive:
     interval: float
 
 
-def simulate(gyro: Gyro, interval: float, duration: float,
+def simulate(gyro: Preset, interval: float, duration: float,
              generator: np.random.Generator) -> Drive:
     """Return a drive with the calibration before it; one that is refused is run again."""
     begin, way = of_motion(CALIBRATION), begun_any_time(random_path(duration, generator),

@@ -34,7 +34,7 @@ from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, turns
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.hong_park import XV3500
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 from scipy.signal import lfilter
 

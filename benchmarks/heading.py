@@ -43,7 +43,7 @@ from multiprocessing import get_context
 import re
 
 import bounds
-from drives import Course, COURSES, Drive, Gyro, GYROS, simulate, slow_path
+from drives import Course, COURSES, Drive, GYROS, simulate, slow_path
 from gyro_calibration.calibration.self_calibration import fit_heading, record, self_calibrate
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.heading.tracker import HeadingTracker, in_hindsight, Settings
@@ -52,6 +52,7 @@ from gyro_calibration.model.compensation import covariance, rate_sensitivity
 from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration
 from gyro_calibration.model.motion import CALIBRATION
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import Preset
 import numpy as np
 from peers import PEERS, tuned
 
@@ -82,7 +83,7 @@ class Estimate:
     variance: Array | None = None
 
 
-def known(gyro: Gyro, course: Course, generator: np.random.Generator) -> Known:
+def known(gyro: Preset, course: Course, generator: np.random.Generator) -> Known:
     """Simulate a drive and calibrate; a calibration that is refused is run again."""
     while True:
         drive = simulate(gyro, course, generator)

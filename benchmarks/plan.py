@@ -39,7 +39,7 @@ from gyro_calibration.calibration.motion_design import Ability, best, Forecast, 
 from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.motion import CALIBRATION, Motion, ROBOT, turns
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.hong_park import XV3500
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 
 RATE, DRIVE = 100, 160.0

@@ -40,14 +40,13 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.model.compensation import quadratic_form
 from gyro_calibration.model.motion import from_headings
-from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import MPU6050
 import numpy as np
 
 FOLLOWED = 300.0
 #: The gyro is mounted upside down against the encoder in two of them.
 RECORDINGS = {'yaw_slow': -1.0, 'pitch_slow': 1.0, 'yaw_fast': -1.0}
-#: Angle random walk of an MPU-6050 at rest: 0.64 deg/sqrt(h).
-NOISE = Noise(0.64 * DEGREE / 60.0)
+NOISE = MPU6050.noise
 METHODS = ('none', 'eq. 7', 'blocks', 'slow', 'now')
 
 

@@ -38,7 +38,7 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
 from gyro_calibration.model.motion import CALIBRATION, from_headings, from_rates, turns
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.hong_park import XV3500
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 

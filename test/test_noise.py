@@ -11,8 +11,11 @@
 """Simulated noise has the Allan deviation of IEEE Std 952: N/sqrt(tau), 0.664 B, K sqrt(tau/3)."""
 
 import math
+from pathlib import Path
 
+from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.noise import ALLAN_FLOOR, CALIBRATED, Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 
@@ -90,12 +93,16 @@ def test_the_three_add_up_and_none_is_silence():
 
 def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_so():
     """2.5 deg/sqrt(h) and 18 deg/h give up to 11 deg in 30 min, as their introduction states."""
-    degree = math.pi / 180.0
-    assert (math.sqrt(Noise(2.5 * degree / 60).heading_variance(3600.0)) / degree
+    assert (math.degrees(math.sqrt(Noise(XV3500.noise.angle_random_walk).heading_variance(3600.0)))
             == pytest.approx(2.5))
-    both = (math.sqrt(Noise(2.5 * degree / 60, 18 * degree / 3600).heading_variance(1800.0))
-            / degree)
-    assert both == pytest.approx(11.0, abs=1.0)
+    assert (math.degrees(math.sqrt(XV3500.noise.heading_variance(1800.0)))
+            == pytest.approx(11.0, abs=1.0))
+
+
+def test_the_configuration_of_the_xv3500_holds_its_figures():
+    model = read_model(Path(__file__).parents[1] / 'config/xv3500.yaml')
+    assert vars(model.noise) == pytest.approx(vars(XV3500.noise), rel=1e-4)
+    assert model.output(0.5, 25.0) == pytest.approx(XV3500.model.output(0.5, 25.0), rel=1e-6)
 
 
 @pytest.mark.parametrize('noise', [

@@ -103,7 +103,7 @@ def test_yaml_is_read_as_plain_data_at_one_place():
 def test_only_the_demonstration_starts_processes():
     assert {path.name for path in FILES for name in set.union(*names(path))
             if belongs(name, {'subprocess', 'pty.spawn'})
-            or name.startswith(('os.exec', 'os.spawn'))} == {'demo.py'}
+            or name.startswith(('os.exec', 'os.spawn'))} == {'demo_run.py'}
 
 
 # The policy of a secured graph
@@ -270,7 +270,7 @@ def test_who_calibrates_cannot_allow_the_robot_to_be_driven():
 def test_only_the_calibration_and_the_demonstration_can_command_a_robot():
     makers = {path.name for path in FILES for line in path.read_text().splitlines()
               if 'create_publisher' in line and 'cmd_vel' in line}
-    assert makers == {'compensation_node.py', 'demo.py'}
+    assert makers == {'compensation_node.py', 'demo_run.py'}
 
 
 def test_only_a_session_that_may_drive_sends_commands(tmp_path):

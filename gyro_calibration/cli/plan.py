@@ -31,8 +31,8 @@ from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.motion import CALIBRATION, Motion, NAMED, read_motion
 from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration.model.settings_file import checked, number, read_settings, WrongValue
-from gyro_calibration.reproduction.hong_park import XV3500
 import numpy as np
 
 #: Name of a limit in a file -> its name in `Ability`, its unit, and the range of its numbers.

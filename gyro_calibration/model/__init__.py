@@ -11,7 +11,7 @@
 """
 What a gyro is: effects with values, noise; simulation and compensation with them.
 
-Reading order: `effects`, `channels`, `noise`, `gyro_model`, `settings_file`, `model_file`,
-`motion`, `simulation`, `simulator_export`, `compensation`.
+Reading order: `effects`, `channels`, `noise`, `gyro_model`, `presets`, `settings_file`,
+`model_file`, `motion`, `simulation`, `simulator_export`, `compensation`.
 
 """

@@ -24,10 +24,10 @@ from gyro_calibration.calibration.likelihood import fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_heading, fit_rate, record
 from gyro_calibration.heading.integration import filter_rates, integrate, Threshold
 from gyro_calibration.logs.log import Array, DEGREE, Progress
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, Term
+from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, ROBOT
 from gyro_calibration.model.noise import Noise, simulate_noise
+from gyro_calibration.model.presets import XV3500
 from gyro_calibration.reproduction.finding import (
     Comparison,
     Contradiction,
@@ -42,17 +42,12 @@ TITLE = ('Hong and Park: Minimal-drift heading measurement using a MEMS gyro for
 S, B = -0.1, 0.1
 #: Sampling rates of reference and gyro in section 4.1, Hz.
 REFERENCE_RATE, GYRO_RATE = 20.0, 100.0
-#: Sections 1, 2.1, 3.2 and 4.2: deg/√h, deg/h, deg/s, 1, deg/s as printed (deg/min is taken, see
-#: `_bias_unit`), s.
-ANGLE_RANDOM_WALK, BIAS_INSTABILITY, THRESHOLD, SCALE_FACTOR, PRINTED_BIAS, DRIVE = (
-    2.5, 18.0, 0.3, 0.0373, 0.75, 160.0)
+#: Sections 3.2 and 4.2: deg/s, deg/s as printed (deg/min is taken, see `_bias_unit`), s.
+THRESHOLD, PRINTED_BIAS, DRIVE = 0.3, 0.75, 160.0
 #: Table 1: mean and standard deviation of the heading error, deg.
 TABLE_1 = {'pure integration': (1.6675, 1.5075), 'self-calibration': (1.1511, 1.1675),
            'threshold filter': (0.7768, 1.2653), 'both': (0.5985, 1.2998)}
 PURE, CALIBRATED, FILTERED, PROPOSED = TABLE_1.values()
-XV3500 = GyroModel(
-    (Term(SCALE_FACTOR_ERROR, (SCALE_FACTOR,)), Term(BIAS, (PRINTED_BIAS * DEGREE / 60.0,))),
-    noise=Noise(ANGLE_RANDOM_WALK * DEGREE / 60.0, BIAS_INSTABILITY * DEGREE / 3600.0))
 ASSUMED = (
     'The motions of figures 6 and 7 are not published; a rest of 2 s and one turn with ramps of '
     '0.25 s is taken, its speed and length being those that give the two errors.',
@@ -197,7 +192,7 @@ def _exchanged_columns() -> Contradiction:
 
 def drift_in_half_an_hour() -> tuple[float, float]:
     """Return the drift in 30 min by bias instability and by angle random walk, deg."""
-    return BIAS_INSTABILITY * 0.5, ANGLE_RANDOM_WALK * math.sqrt(0.5)
+    return XV3500.bias_instability * 0.5, XV3500.angle_random_walk * math.sqrt(0.5)
 
 
 def _own_figures() -> list[Comparison]:
@@ -280,7 +275,7 @@ BOTH = Motion(np.append(CALIBRATION.time, CALIBRATION.duration + ROBOT.time[1:])
 def output_of(motion: Motion, noise: Noise, generator: np.random.Generator) -> tuple[Array, Array]:
     """Return time, s, and output, rad/s, of the gyro of section 4."""
     time = np.arange(round(motion.duration * GYRO_RATE) + 1) / GYRO_RATE
-    return time, XV3500.output(motion.rate_at(time), 25.0) + simulate_noise(
+    return time, XV3500.model.output(motion.rate_at(time), 25.0) + simulate_noise(
         noise, len(time), 1.0 / GYRO_RATE, generator)
 
 
