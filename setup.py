@@ -36,6 +36,8 @@ KILTED = '9.1.2', '5.5.1', '2.3.0'  # for Python 3.10 to 3.14
 ros = wheels(*JAZZY, 'python_version < "3.14"') + wheels(*KILTED, 'python_version >= "3.14"')
 
 plot = ['matplotlib']
+# what a fleet of logs can use: a Dask cluster, and tables in Parquet
+fleet = ['distributed', 'pyarrow']
 # hypothesis makes up inputs and finds the shortest that fails; atheris makes them up guided by
 # coverage, and has wheels for Linux on x86-64 alone
 fuzz = ['hypothesis', 'atheris; sys_platform == "linux" and platform_machine == "x86_64"']
@@ -71,7 +73,7 @@ setup(
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
     ], extras_require={
         'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED),
-        'plot': plot, 'test': test, 'peers': peers
+        'plot': plot, 'fleet': fleet, 'test': test, 'peers': peers
     }, zip_safe=False, entry_points={
         'console_scripts': [
             'gyro_calibration = gyro_calibration.cli.main:main',

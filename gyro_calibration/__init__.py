@@ -20,7 +20,7 @@ Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise p
 Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist
 only in files, wires and the command line, where the name says so: ``gyro_dps``.
 
-Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `reproduction`;
+Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `fleet`, `reproduction`;
 then, with ports, processes and ROS 2, `driver`, `ros`, `cli`. Each folder imports only what
 stands before it, and so does each module of a folder, by the reading order that its docstring
 gives. `files` opens and writes files for all of them.

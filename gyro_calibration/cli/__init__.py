@@ -24,6 +24,7 @@ from gyro_calibration.cli import (
     emulate,
     export,
     fit,
+    fleet,
     plan,
     record,
     reproduce,
@@ -32,5 +33,5 @@ from gyro_calibration.cli import (
     turn,
 )
 
-VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, simulate, export,
+VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, fleet, simulate, export,
          emulate, record, reproduce, demo)

@@ -183,9 +183,9 @@ def say(text: object) -> None:
     print(f'gyro_calibration: {plain(text)}', file=sys.stderr, flush=True)
 
 
-def bar(items: Iterable[Any], what: str) -> Iterable[Any]:
+def bar(items: Iterable[Any], what: str, total: int | None = None) -> Iterable[Any]:
     """Show on a terminal the progress over some items, if it takes longer than two seconds."""
-    return tqdm(items, desc=what, delay=2.0, leave=False, disable=None)
+    return tqdm(items, desc=what, total=total, delay=2.0, leave=False, disable=None)
 
 
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:

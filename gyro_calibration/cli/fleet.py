@@ -1,0 +1,206 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""The verb fleet: many logs of many gyros, calibrated, diagnosed and pooled."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import re
+import textwrap
+from typing import Any
+
+from gyro_calibration.calibration.course_over_ground import PRIORS
+from gyro_calibration.cli.verb import Answer, bar, positive, UsageError, verb, whole
+from gyro_calibration.diagnosis.finding import Estimate
+from gyro_calibration.diagnosis.units import amount, quantity
+from gyro_calibration.files import plain, write_atomically
+from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
+from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
+from gyro_calibration.fleet.summary import (
+    data as type_data,
+)
+from gyro_calibration.fleet.summary import (
+    FALSE_ALARMS,
+    Found,
+    sentences,
+    summarized,
+    TypeFound,
+)
+from gyro_calibration.fleet.table import entries, Entry, pattern
+from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
+from gyro_calibration.logs.log import DataRefused
+import numpy as np
+
+#: Lines for people are not longer.
+_WIDTH = 120
+_SPOKEN = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
+           (DRIVES, 'between drives'))
+#: Bytes of a GB.
+_GIGABYTE = 1e9
+
+
+def add(verbs: Any) -> argparse.ArgumentParser:
+    parser = verb(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many gyros, and '
+                  'say what is of the unit, of the type, and of the reference',
+                  'drives/ --out fleet')
+    parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
+                        'a list (.txt), or a table (.csv) with the columns log and any of unit, '
+                        'type, drive, date, temperature')
+    parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; what '
+                        'was done is not done again')
+    parser.add_argument('--pattern', type=_pattern, metavar='TEXT', help='how the files are '
+                        "named, without their ends, such as 'rc_car_{drive}_unit{unit}'")
+    parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='of all logs whose type '
+                        'is not said')
+    parser.add_argument('--technology', choices=list(PRIORS), default='mems',
+                        help='of the gyros; default: mems')
+    parser.add_argument('--no-diagnosis', action='store_true', help='calibrate alone, which is '
+                        'faster')
+    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='of what a diagnosis '
+                        'draws; default: 0')
+    parser.add_argument('--workers', type=_count, metavar='N', help='processes; default: one a '
+                        'core')
+    parser.add_argument('--memory', type=positive, metavar='GB', help='that a worker may use; '
+                        "default: its share of this machine's")
+    parser.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster that does the '
+                        'work, such as tcp://host:8786; its workers see the same files')
+    return parser
+
+
+def _pattern(text: str) -> re.Pattern[str]:
+    try:
+        return pattern(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'{text} is below 1')
+    return value
+
+
+def _fleet(given: argparse.Namespace) -> Answer:
+    listed = entries(given.logs, without=given.out)
+    folder = os.path.abspath(given.out)
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise UsageError(f'{given.out}: is a file, where a folder is wanted; name another')
+    records = _records(given, [_task(given, entry, folder) for entry in listed])
+    used = [each for each in records if each['status'] == DONE]
+    if not used:
+        first = records[0]
+        raise DataRefused(f'none of {len(records)} logs can be used; '
+                          f'{plain(first["log"])}: {first["reason"]}')
+    left = [each for each in records if each['status'] == NO_EVIDENCE]
+    lines = [f'{len(used)} of {len(records)} logs are calibrated.']
+    lines += [f'{each["log"]}: no evidence, {each["reason"]}.' for each in left]
+    types = summarized(used)
+    for found in types:
+        lines += ['', *(_wrapped(each) for each in _lines(found))]
+    data = {'schema': 'gyro_calibration/fleet/1', 'out': given.out, 'logs': len(records),
+            'false_alarm_rate': FALSE_ALARMS,
+            'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in left],
+            'types': [type_data(found) for found in types]}
+    write_atomically(Path(given.out) / 'fleet.json',
+                     json.dumps(data, indent=1, allow_nan=False).encode())
+    lines += ['', f'Written to {given.out}: fleet.json.']
+    return Answer('\n'.join(lines), data)
+
+
+def _lines(found: TypeFound) -> Iterator[str]:
+    """Say what is known of a type, and of its units."""
+    yield (f'{found.name or "One type"}: {len(found.records)} logs of {len(found.units)} units '
+           f'on {len(found.drives)} drives.')
+    for each in found.values.values():
+        parts = [f'{spoken} {_spread(each, each.components[name])}' for name, spoken in _SPOKEN
+                 if name in each.components]
+        mean = quantity(Estimate(float(each.mean.value[0]), (
+            float(each.mean.low[0]), float(each.mean.high[0])), each.unit), each.name)
+        yield f'  {each.name}: {mean}; {", ".join(parts)}'
+        if not each.slow:
+            yield '    ' + '; '.join(
+                f'unit {plain(name)} {_of_unit(each, place)}' for place, name in enumerate(
+                    found.units) if np.isfinite(each.units.value[place]))
+    yield from (f'  {text}.' for text in sentences(found))
+
+
+def _spread(each: Found, of: Component) -> str:
+    """Say a standard deviation; its upper bound where it may be zero."""
+    if of.low > 0.0:
+        return amount(of.estimate, each.unit, each.name)
+    return f'less than {amount(of.high, each.unit, each.name)}'
+
+
+def _of_unit(each: Found, place: int) -> str:
+    return str(quantity(Estimate(float(each.units.value[place]), (
+        float(each.units.low[place]), float(each.units.high[place])), each.unit), each.name))
+
+
+def _wrapped(line: str) -> str:
+    indent = ' ' * (len(line) - len(line.lstrip()))
+    return textwrap.fill(line, _WIDTH, subsequent_indent=f'{indent}  ')
+
+
+def _task(given: argparse.Namespace, entry: Entry, folder: str) -> Task:
+    drawn = None if given.no_diagnosis else np.random.default_rng(given.seed)
+    return Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '')
+
+
+def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:
+    """Return the record of each log, in the order of the logs, whatever was finished first."""
+    found: dict[str, dict[str, Any]] = {}
+    with _executors(given) as (workers, create):
+        for task, record in bar(finished(done, tasks, workers, create), 'logs', len(tasks)):
+            found[task.entry.log] = (refused(task.entry, str(record))
+                                     if isinstance(record, Lost) else record)
+    return _usable([found[task.entry.log] for task in tasks])
+
+
+@contextmanager
+def _executors(given: argparse.Namespace) -> Iterator[Any]:
+    """Give the number of workers, and what makes executors of them."""
+    workers = given.workers or usual_workers()
+    if given.scheduler is None:
+        machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
+        memory = given.memory * _GIGABYTE if given.memory else 0.8 * machine / workers
+        with processes(workers, memory) as create:
+            yield workers, create
+        return
+    try:
+        with cluster(given.scheduler) as create:
+            yield given.workers or 64, create
+    except ImportError:
+        raise UsageError('--scheduler needs distributed, which is not installed; install '
+                         'gyro_calibration[fleet], or leave --scheduler out') from None
+    except (OSError, ValueError) as error:
+        raise UsageError(f'{given.scheduler}: no Dask scheduler answers there '
+                         f'({type(error).__name__}); give its address, such as '
+                         'tcp://host:8786') from None
+
+
+def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return records in which a double, and a log of nobody, is no evidence."""
+    seen: dict[str, str] = {}
+    found = []
+    for each in records:
+        first = seen.setdefault(each['sha256'], each['log']) if each['sha256'] else each['log']
+        why = ('' if each['status'] != DONE
+               else f'it holds the same as {plain(first)}' if first != each['log']
+               else '' if each['unit']
+               else 'it does not say of which unit it is; give a table, or --pattern')
+        found.append({**each, 'status': NO_EVIDENCE, 'reason': why} if why else each)
+    return found

@@ -1,0 +1,18 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+A fleet: many logs of many gyros, and what is the unit's, the type's and the reference's.
+
+Reading order, each imports only from those before it: `table` (which log is of which unit),
+`slow_effects` (of a log), `work` (on one log), `run` (of many tasks), `pooling` (of one value over
+the logs of a type), `outliers` (among units and drives), `summary` (of a type).
+
+"""

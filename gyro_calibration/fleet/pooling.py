@@ -1,0 +1,532 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Partial pooling: what of a value is the type's, the unit's, the drive's, and of one power-on.
+
+Value ``y`` of the log ``i`` of unit ``u`` on drive ``d`` is taken as::
+
+    y_i = x_i' beta + unit_u + drive_d + power_on_i + error_i
+
+* ``beta``: mean of the type, and its slopes over age and temperature;
+* ``unit``, ``drive`` and ``power_on``: normal, with the standard deviations *between units*,
+  *between drives* and *between power-ons* that are sought;
+* ``error``: what the calibration of the log states, ``sigma_i``. Units that were moved together
+  were compared with one reference, so the share ``1 - lambda`` of the variance of their errors is
+  common to the drive: ``cov(error_i, error_j) = (1 - lambda) sigma_i sigma_j``.
+
+The restricted likelihood (REML) of the variances is integrated, not maximized, so that intervals
+hold with few units and few drives: estimates are averaged over points of a quasi-random sequence,
+weighted by likelihood times a prior. The prior is that of Jeffreys for the variance of groups,
+``sqrt(sum 1 / (tau² + v_g)²)`` with ``v_g`` the variance of the mean of a group; in balanced data
+it is flat in the logarithms of the expected mean squares, and the intervals are those of Student.
+
+The equations are those of mixed models (Henderson 1975): units are eliminated first, as each log
+is of one unit, so that only the columns of drives and ``beta`` are solved for.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+import math
+from typing import Any
+
+from gyro_calibration.logs.log import Array, DataRefused
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.sparse import csr_array
+from scipy.special import ndtr
+from scipy.stats import qmc
+
+Numbers = NDArray[np.intp]
+#: The standard deviations that are sought, and the share of the errors that is a log's own.
+UNITS, DRIVES, POWER_ONS, OWN = 'units', 'drives', 'power_ons', 'own_share'
+#: Points of the sequence over the variances, and of a slice through the likeliest.
+POINTS, _SLICE = 512, 41
+#: Numbers that the equations take at a time.
+_AT_A_TIME = 2_000_000
+#: Largest standard deviation that is possible, in those of the values about their median.
+_LARGEST = 30.0
+#: Twice the gain in log likelihood beyond which a variance of zero is rejected at 2.5 %, one-sided
+#: (Self and Liang 1987: half of the chance is at zero); and where two are zero, at most 2.5 %.
+_REJECTED, _BOTH_REJECTED = 3.841, 7.378
+
+
+@dataclass(frozen=True)
+class Observed:
+    """
+    One value over the logs of a type.
+
+    Attributes
+    ----------
+    value, deviation : in one unit, shape (n,)
+    unit : number of the unit of each log, from 0 on, shape (n,)
+    drive : number of the drive, from 0 on, or -1 where a log stands alone, shape (n,)
+    columns : fixed effects beside the mean, such as age, shape (n, k)
+
+    """
+
+    value: Array
+    deviation: Array
+    unit: Numbers
+    drive: Numbers
+    columns: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @property
+    def fixed(self) -> Array:
+        """Return the columns with that of the mean, shape (n, 1 + k)."""
+        more = self.columns if self.columns.size else np.empty((len(self), 0))
+        return np.column_stack([np.ones(len(self)), more])
+
+    def with_column(self, column: Array) -> Observed:
+        """Return the same with one more fixed effect."""
+        return replace(self, columns=np.column_stack([self.fixed[:, 1:], column]))
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """
+    Linear functions of what is estimated: of fixed effects, one unit and one drive each.
+
+    Attributes
+    ----------
+    fixed : shape (k, 1 + columns)
+    unit, drive : numbers, -1 for none, shape (k,)
+    error : standard deviation by which the common error of the drive counts, shape (k,)
+    more : name of a variance -> how often it is added, for what is not estimated, such as the
+        next power-on
+    measured : whether the log's own error is added too, for what a log will show
+
+    """
+
+    fixed: Array
+    unit: Numbers
+    drive: Numbers
+    error: Array
+    more: Mapping[str, float] = field(default_factory=dict)
+    measured: bool = False
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Estimates with standard deviations and bounds, each of shape (k,), or numbers."""
+
+    value: Array
+    deviation: Array
+    low: Array
+    high: Array
+
+
+class _Equations:
+    """The mixed-model equations, at many points of the variances at a time."""
+
+    def __init__(self, of: Observed, fixed: Array, shared: bool):
+        """Lay out the columns: fixed effects, drives, and the common errors of drives."""
+        self.of, self.fixed = of, fixed
+        self.units = int(of.unit.max()) + 1
+        self.drives = int(of.drive.max()) + 1 if shared else 0
+        self.columns = fixed.shape[1] + 2 * self.drives
+        self.to_unit = _summing(of.unit)
+        if self.drives:
+            on = np.flatnonzero(of.drive >= 0)
+            self._on, self.to_drive = on, _summing(of.drive[on])
+            pairs, place = np.unique(of.unit[on] * self.drives + of.drive[on],
+                                     return_inverse=True)
+            self.to_pair = _summing(place)
+            self.pair_unit, self.pair_drive = np.divmod(pairs, self.drives)
+
+    def chunks(self, points: int) -> list[slice]:
+        """Return parts of the points that are solved for at a time, so that memory is bounded."""
+        size = self.units * self.columns + self.columns ** 2 + len(self.of)
+        step = max(_AT_A_TIME // size, 1)
+        return [slice(begin, begin + step) for begin in range(0, points, step)]
+
+    def solve(self, sizes: Mapping[str, Array]) -> _Solved:
+        """Return the solutions for variances of shape (points,)."""
+        return _Solved(self, sizes)
+
+
+def _summing(group: Numbers) -> Any:
+    """Return the matrix that sums over the members of each group."""
+    return csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
+
+
+class _Solved:
+    """Solutions at many points; the first axis of all arrays is that of the points."""
+
+    def __init__(self, at: _Equations, sizes: Mapping[str, Array]):
+        of, fixed, count = at.of, at.fixed, len(next(iter(sizes.values())))
+        none = np.zeros(count)
+        own = sizes.get(OWN, none + 1.0)
+        self._at, self._tau = at, np.sqrt(sizes.get(UNITS, none))
+        self._scale = np.sqrt(sizes.get(DRIVES, none)), np.sqrt(np.maximum(1.0 - own, 0.0))
+        variance = (sizes.get(POWER_ONS, none)[:, None] + own[:, None] * of.deviation ** 2)
+        weight = 1.0 / variance
+
+        def summed(matrix: Any, values: Array) -> Array:
+            return np.asarray((matrix @ values.T).T)
+
+        kept, total = fixed.shape[1], at.columns
+        normal, right = np.zeros((count, total, total)), np.zeros((count, total))
+        across = np.zeros((count, at.units, total))
+        normal[:, :kept, :kept] = np.einsum('pn,na,nb->pab', weight, fixed, fixed, optimize=True)
+        right[:, :kept] = weight @ (of.value[:, None] * fixed)
+        for place in range(kept):
+            across[:, :, place] = summed(at.to_unit, weight * fixed[:, place])
+        if at.drives:
+            here, error = weight[:, at._on], of.deviation[at._on]
+            first = kept + np.arange(at.drives)
+            parts = [(first + kind * at.drives, scale[:, None], error ** kind)
+                     for kind, scale in enumerate(self._scale)]
+            for index, scale, by in parts:
+                weighted = here * by
+                right[:, index] = scale * summed(at.to_drive, weighted * of.value[at._on])
+                across[:, at.pair_unit, index[at.pair_drive]] = scale * summed(at.to_pair,
+                                                                               weighted)
+                for place in range(kept):
+                    normal[:, place, index] = scale * summed(
+                        at.to_drive, weighted * fixed[at._on, place])
+                    normal[:, index, place] = normal[:, place, index]
+                for other, other_scale, other_by in parts:
+                    normal[:, index, other] = scale * other_scale * summed(
+                        at.to_drive, weighted * other_by)
+            normal[:, range(kept, total), range(kept, total)] += 1.0
+        tau = self._tau[:, None]
+        self._of_unit = 1.0 + tau ** 2 * summed(at.to_unit, weight)
+        self._across = tau[:, :, None] * across
+        self._right = tau * summed(at.to_unit, weight * of.value)
+        lighter = self._across / self._of_unit[:, :, None]
+        triangle = np.linalg.cholesky(normal - np.swapaxes(lighter, 1, 2) @ self._across)
+        self._inverse = np.linalg.inv(triangle)  # of at most some hundred columns
+        reduced = right - np.einsum('puc,pu->pc', lighter, self._right)
+        half = np.einsum('pij,pj->pi', self._inverse, reduced)
+        self._solution = np.einsum('pij,pi->pj', self._inverse, half)
+        squares = (weight @ of.value ** 2 - np.sum(self._right ** 2 / self._of_unit, axis=1)
+                   - np.sum(half ** 2, axis=1))
+        self.log_likelihood = -0.5 * (
+            np.log(variance).sum(axis=1) + np.log(self._of_unit).sum(axis=1) + squares
+            + 2.0 * np.log(np.diagonal(triangle, axis1=1, axis2=2)).sum(axis=1))
+
+    def moments(self, wanted: Wanted) -> tuple[Array, Array]:
+        """Return means and variances of linear functions, shape (points, k)."""
+        at, kept = self._at, self._at.fixed.shape[1]
+        rows = np.zeros((len(self._tau), len(wanted.unit), at.columns))
+        rows[:, :, :kept] = wanted.fixed
+        if at.drives:
+            on = np.flatnonzero(wanted.drive >= 0)
+            rows[:, on, kept + wanted.drive[on]] = self._scale[0][:, None]
+            rows[:, on, kept + at.drives + wanted.drive[on]] = (self._scale[1][:, None]
+                                                                * wanted.error[on])
+        unit = np.maximum(wanted.unit, 0)
+        size = self._tau[:, None] * (wanted.unit >= 0)
+        share = size / self._of_unit[:, unit]
+        rows -= share[:, :, None] * self._across[:, unit]
+        mean = np.einsum('pkc,pc->pk', rows, self._solution) + share * self._right[:, unit]
+        spread = rows @ np.swapaxes(self._inverse, 1, 2)
+        return mean, size * share + np.sum(spread ** 2, axis=2)
+
+
+@dataclass(frozen=True)
+class Component:
+    """A standard deviation: its REML estimate and the bounds that hold it with 95 %."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+class Pooled:
+    """
+    One value, pooled over the logs of a type.
+
+    Attributes
+    ----------
+    observed : the values
+    names : of the variances that the logs can tell apart
+    likeliest : name -> variance (of `OWN`, a share) at the largest restricted likelihood
+
+    """
+
+    def __init__(self, observed: Observed, points: int = POINTS):
+        """Pool; raise `DataRefused` where there is less than two logs more than fixed effects."""
+        fixed = observed.fixed
+        if len(observed) < fixed.shape[1] + 1:
+            raise DataRefused(f'{len(observed)} logs do not show how much a value varies; at '
+                              f'least {fixed.shape[1] + 1} are needed')
+        self.observed = observed
+        self._middle = float(np.median(observed.value))
+        error = float(np.median(observed.deviation))
+        self._size = math.hypot(float(np.std(observed.value)), 1e-3 * error) or 1.0
+        # columns of about one, so that the equations are well conditioned
+        self._scales = np.maximum(np.abs(fixed).max(axis=0), 1e-300)
+        self._fixed = fixed / self._scales
+        # what a file is rounded to is no better than a millionth of what values differ by
+        self._scaled = replace(
+            observed, value=(observed.value - self._middle) / self._size,
+            deviation=np.maximum(observed.deviation / self._size, 1e-6))
+        self.names = _told_apart(observed)
+        self._bounds = _bounds(self._scaled, self.names)
+        self._equations = _Equations(self._scaled, self._fixed, DRIVES in self.names)
+        self._best = self._search()
+        self.likeliest = {name: float(value[0]) * (1.0 if name == OWN else self._size ** 2)
+                          for name, value in self._sizes(self._best[None]).items()
+                          if name in self.names}
+        self._sample, self._weight = self._integrated(points)
+
+    # the variances
+
+    def _sizes(self, points: Array) -> dict[str, Array]:
+        """Return the variances at points: logarithms of variance plus a floor, and the share."""
+        found = {name: column if name == OWN
+                 else np.maximum(np.exp(column) - math.exp(self._bounds[name][0]), 0.0)
+                 for name, column in zip(self.names, points.T)}
+        return found or {POWER_ONS: np.zeros(len(points))}
+
+    def _log_likelihood(self, points: Array, prior: bool = False) -> Array:
+        """Return the restricted likelihoods at points, or their product with the prior."""
+        found = []
+        for part in self._equations.chunks(len(points)):
+            sizes = self._sizes(points[part])
+            found.append(self._equations.solve(sizes).log_likelihood)
+            if prior:
+                found[-1] = found[-1] + _log_prior(self._scaled, sizes) + sum(
+                    column for name, column in zip(self.names, points[part].T) if name != OWN)
+        return np.concatenate(found)
+
+    def _search(self, without: str = '') -> Array:
+        """
+        Return the point of the largest restricted likelihood.
+
+        A variance may be held at zero; with that of drives all errors are then a log's own.
+
+        """
+        if not self.names:
+            return np.empty(0)
+        held = {without: 0, **({OWN: 1} if without == DRIVES else {})}
+        bounds = [(self._bounds[name][held[name]],) * 2 if name in held else self._bounds[name]
+                  for name in self.names]
+        point = np.array([low + 0.3 * (high - low) for low, high in bounds])
+        for place, (low, high) in enumerate(bounds):
+            if high > low:
+                tried = _moved(point, place, np.linspace(low, high, 15))
+                point = tried[np.argmax(self._log_likelihood(tried))]
+        found = minimize(self._downhill, point, method='L-BFGS-B', jac=True, bounds=bounds,
+                         options={'maxiter': 60})
+        # an optimum at the floor is often missed by the slope there
+        ends = [_moved(found.x, place, np.array([low])) for place, (low, _) in enumerate(bounds)]
+        tried = np.vstack([found.x, point, *ends])
+        best: Array = tried[np.argmax(self._log_likelihood(tried))]
+        return best
+
+    def _downhill(self, point: Array) -> tuple[float, Array]:
+        """Return minus the restricted likelihood and its slope."""
+        step = 1e-5
+        found = -self._log_likelihood(np.vstack([point, point + step * np.eye(len(point))]))
+        return float(found[0]), (found[1:] - found[0]) / step
+
+    def _integrated(self, points: int) -> tuple[Array, Array]:
+        """Return points of the variances, shape (points, names), and their weights."""
+        if not self.names:
+            return np.empty((1, 0)), np.ones(1)
+        uniform = qmc.Halton(len(self.names), scramble=False).random(points + 1)[1:]
+        sample, log_density = np.empty_like(uniform), np.zeros(points)
+        for place, name in enumerate(self.names):
+            axis = np.linspace(*self._bounds[name], _SLICE)
+            along = self._log_likelihood(_moved(self._best, place, axis), prior=True)
+            # wider than the slice, for what the other variances leave open
+            density = np.exp(0.6 * (along - along.max()))
+            density = density + 0.1 * density.mean()
+            cells = 0.5 * (density[1:] + density[:-1]) * np.diff(axis)
+            total = np.concatenate([[0.0], np.cumsum(cells)])
+            sample[:, place] = np.interp(uniform[:, place], total / total[-1], axis)
+            cell = np.clip(np.searchsorted(axis, sample[:, place]) - 1, 0, _SLICE - 2)
+            log_density += np.log(cells[cell])  # within a cell the points are uniform
+        log_weight = self._log_likelihood(sample, prior=True) - log_density
+        weight = np.exp(log_weight - log_weight.max())
+        return sample, weight / weight.sum()
+
+    @property
+    def effective_points(self) -> float:
+        """Return how many points count: 1 over the sum of squared weights."""
+        return float(1.0 / np.sum(self._weight ** 2))
+
+    @cached_property
+    def components(self) -> dict[str, Component]:
+        """
+        Return the standard deviations by name, and the share of the errors that is own.
+
+        That of drives is all that the logs of a drive have in common: what differs between
+        drives, and the common part of an error of the usual size.
+
+        """
+        found = {}
+        usual = float(np.median(self._scaled.deviation))
+        for name in self.names:
+            best, sample = (self._deviation(name, points, usual)
+                            for points in (self._best[None], self._sample))
+            order = np.argsort(sample)
+            total = np.cumsum(self._weight[order]) - 0.5 * self._weight[order]
+            low, high = np.interp([0.025, 0.975], total, sample[order]).tolist()
+            if name != OWN:
+                likely, without = self._log_likelihood(
+                    np.vstack([self._best, self._search(name)])).tolist()
+                limit = _BOTH_REJECTED if name == DRIVES else _REJECTED
+                low = low if 2.0 * (likely - without) > limit else 0.0
+            size = 1.0 if name == OWN else self._size
+            found[name] = Component(size * float(best[0]), size * low, size * high)
+        return found
+
+    def _deviation(self, name: str, points: Array, usual: float) -> Array:
+        sizes = self._sizes(points)
+        if name == OWN:
+            return sizes[OWN]
+        common = (1.0 - sizes[OWN]) * usual ** 2 if name == DRIVES else 0.0
+        return np.sqrt(sizes[name] + common)
+
+    # estimates
+
+    def _moments(self, wanted: Wanted) -> tuple[Array, Array]:
+        """Return means and variances at each point, shape (points, k), in units of the values."""
+        scaled = replace(wanted, fixed=wanted.fixed / self._scales,
+                         error=wanted.error / self._size)
+        found = []
+        for part in self._equations.chunks(len(self._sample)):
+            sizes = self._sizes(self._sample[part])
+            mean, variance = self._equations.solve(sizes).moments(scaled)
+            for name, often in wanted.more.items():
+                variance = variance + often * sizes.get(name, np.zeros(1))[:, None]
+            if wanted.measured:
+                own = np.where(wanted.drive >= 0, sizes.get(OWN, np.ones(1))[:, None], 1.0)
+                variance = variance + own * scaled.error ** 2
+            found.append((mean, variance))
+        mean, variance = (np.concatenate(each) for each in zip(*found))
+        constant = self._middle * wanted.fixed[:, 0]
+        return constant + self._size * mean, self._size ** 2 * np.maximum(variance, 1e-30)
+
+    def estimate(self, wanted: Wanted, level: float = 0.95) -> Interval:
+        """Return estimates with intervals that hold with a chance of `level`."""
+        mean, variance = self._moments(wanted)
+        value = self._weight @ mean
+        deviation = np.sqrt(self._weight @ (variance + (mean - value) ** 2))
+        low, high = (_quantile(mean, variance, self._weight, chance)
+                     for chance in (0.5 * (1.0 - level), 0.5 * (1.0 + level)))
+        return Interval(value, deviation, low, high)
+
+    def chance(self, wanted: Wanted) -> Array:
+        """Return the chances, two-sided, that what is wanted is as far from 0, shape (k,)."""
+        mean, variance = self._moments(wanted)
+        below = self._weight @ ndtr(-mean / np.sqrt(variance))
+        return np.minimum(2.0 * np.minimum(below, 1.0 - below), 1.0)
+
+    def wanted(self, unit: Numbers | None = None, drive: Numbers | None = None,
+               fixed: Array | None = None, error: Array | float = 0.0,
+               measured: bool = False, **more: float) -> Wanted:
+        """Return what is wanted; by default the mean of the type, or of units and drives."""
+        count = max(len(each) for each in (unit, drive, fixed, [0]) if each is not None)
+        none = np.full(count, -1)
+        row = np.zeros((count, self._fixed.shape[1]))
+        row[:, 0] = 1.0
+        return Wanted(row if fixed is None else fixed, none if unit is None else unit,
+                      none if drive is None else drive,
+                      np.broadcast_to(np.asarray(error, float), (count,)), more, measured)
+
+    def score(self, column: Array) -> float:
+        """Return how many standard deviations one more fixed effect is from 0, roughly."""
+        fixed = np.column_stack([self._fixed, column])
+        sizes = self._sizes(self._best[None])
+        solved = _Equations(self._scaled, fixed, DRIVES in self.names).solve(sizes)
+        row, none = np.zeros((1, fixed.shape[1])), np.array([-1])
+        row[0, -1] = 1.0
+        mean, variance = solved.moments(Wanted(row, none, none, np.zeros(1)))
+        return float(mean[0, 0] / math.sqrt(variance[0, 0]))
+
+    def standing(self, kind: str) -> Array:
+        """Return how many standard deviations each unit or drive is off the others, roughly."""
+        number = self.observed.unit if kind == UNITS else self.observed.drive
+        sizes = self._sizes(self._best[None])
+        size = np.maximum(sizes.get(kind, np.zeros(1)), 1e-4)
+        groups = np.arange(number.max() + 1)
+        rows = np.zeros((len(groups), self._fixed.shape[1]))
+        wanted = (self.wanted(unit=groups, fixed=rows) if kind == UNITS
+                  else self.wanted(drive=groups, fixed=rows))
+        mean, variance = self._equations.solve({**sizes, kind: size}).moments(wanted)
+        known = np.maximum(size - variance[0], 1e-12 * size)
+        return np.asarray(mean[0] / np.sqrt(known))
+
+
+def _told_apart(of: Observed) -> list[str]:
+    """Return the variances that the logs can tell apart."""
+    logs = np.bincount(of.unit)
+    names = [UNITS] if len(logs) > 1 else []
+    if len(logs) == 1 or logs.max() > 1:
+        names.append(POWER_ONS)
+    on = of.drive[of.drive >= 0]
+    if len(on) and np.bincount(on).max() > 1 and len(np.unique(on)) > 1:
+        names += [DRIVES, OWN]
+    return names
+
+
+def _bounds(of: Observed, names: list[str]) -> dict[str, tuple[float, float]]:
+    """Return the ends of each coordinate: the logarithm of floor, and of floor plus largest."""
+    square = float(np.median(of.deviation ** 2))
+    floors = {UNITS: square * len(np.unique(of.unit)) / len(of),
+              DRIVES: square * len(np.unique(of.drive)) / len(of), POWER_ONS: square}
+    found = {}
+    for name in names:
+        floor = max(floors.get(name, 0.0), 1e-8)
+        found[name] = ((0.02, 1.0) if name == OWN
+                       else (math.log(floor), math.log(floor + _LARGEST ** 2)))
+    return found
+
+
+def _log_prior(of: Observed, sizes: Mapping[str, Array]) -> Array:
+    """Return logarithms of Jeffreys' prior of the variances of groups, shape (points,)."""
+    none = np.zeros((len(next(iter(sizes.values()))), 1))
+    own = none + sizes.get(OWN, np.ones(1))[:, None]
+    variance = none + sizes.get(POWER_ONS, np.zeros(1))[:, None] + own * of.deviation ** 2
+    found = np.zeros(len(none))
+    if POWER_ONS in sizes:
+        found += 0.5 * np.log(np.sum(variance ** -2.0, axis=1))
+    for name, number in ((UNITS, of.unit), (DRIVES, of.drive)):
+        if name in sizes:
+            on = number >= 0
+            known = np.asarray((_summing(number[on]) @ (1.0 / variance[:, on]).T).T)
+            mean = 1.0 / known
+            if name == DRIVES:
+                mean = mean + (1.0 - own) * float(np.mean(of.deviation[on] ** 2))
+            found += 0.5 * np.log(np.sum((sizes[name][:, None] + mean) ** -2.0, axis=1))
+    return found
+
+
+def _moved(point: Array, place: int, values: Array) -> Array:
+    """Return points that differ in one coordinate, shape (values, names)."""
+    found = np.tile(point, (len(values), 1))
+    found[:, place] = values
+    return found
+
+
+def _quantile(mean: Array, variance: Array, weight: Array, chance: float) -> Array:
+    """Return quantiles of mixtures of normal distributions, shape (k,), by bisection."""
+    deviation = np.sqrt(variance)
+    # beyond this a mixture has no more of its weight than the chance
+    low, high = (mean - 40.0 * deviation).min(axis=0), (mean + 40.0 * deviation).max(axis=0)
+    within: Callable[[Array], Array] = lambda at: weight @ ndtr((at - mean) / deviation)  # noqa: E731,E501
+    for _ in range(70):
+        middle = 0.5 * (low + high)
+        below = within(middle) < chance
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.asarray(0.5 * (low + high))

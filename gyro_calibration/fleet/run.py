@@ -1,0 +1,161 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Many tasks on the processes of this machine, or on another executor of `concurrent.futures`.
+
+Only some tasks are handed out at a time, so that ten thousand take no more memory than ten. A
+worker that is killed takes the others of its pool with it: the tasks that were handed out are then
+done again one by one, the one that kills its worker again is reported, and the rest goes on.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from itertools import islice
+from multiprocessing import get_context
+import os
+import resource
+from typing import Any, TypeVar
+
+Task = TypeVar('Task')
+Found = TypeVar('Found')
+Work = Callable[[Task], Found]
+#: Tasks handed out for each worker.
+_AHEAD = 2
+
+
+class Lost(Exception):
+    """A task that has no result, for its worker was killed; the message says so."""
+
+
+@contextmanager
+def processes(workers: int, memory: float | None = None) -> Iterator[Callable[[int], Executor]]:
+    """
+    Give what makes executors of processes on this machine, and end all of them.
+
+    Parameters
+    ----------
+    workers : of an executor, at most
+    memory : bytes that a worker may allocate; None without a limit
+
+    """
+    made: list[ProcessPoolExecutor] = []
+
+    def create(wanted: int) -> Executor:
+        made.append(ProcessPoolExecutor(min(wanted, workers), get_context('forkserver'),
+                                        _limit, (memory,)))
+        return made[-1]
+    try:
+        yield create
+    finally:
+        for each in made:
+            each.shutdown(wait=True, cancel_futures=True)
+
+
+def _limit(memory: float | None) -> None:
+    """Limit what this process may allocate."""
+    if memory is not None:
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        limit = int(memory) if hard == resource.RLIM_INFINITY else min(int(memory), hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
+    """
+    Give what makes executors of a Dask cluster.
+
+    Raises
+    ------
+    ImportError : `distributed` is not installed
+    OSError : nobody answers there
+
+    """
+    from distributed import Client
+    with Client(address, timeout='10s', set_as_default=False) as client:
+        yield lambda wanted: client.get_executor(pure=False, retries=0)
+
+
+def finished(work: Work[Task, Found], tasks: Iterable[Task], workers: int,
+             create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
+    """
+    Give each task with its result as it is finished, or with `Lost` where its worker was killed.
+
+    Parameters
+    ----------
+    work : a function of a module, which raises nothing
+    tasks : may be endless
+    workers : that work at a time
+    create : makes an executor of so many workers, of `processes` or `cluster`
+
+    """
+    rest = iter(tasks)
+    executor = create(workers)
+    handed: dict[Future[Any], Any] = {}
+    while True:
+        while len(handed) < _AHEAD * workers and (new := list(islice(rest, 1))):
+            try:
+                handed[executor.submit(work, new[0])] = new[0]
+            except BrokenExecutor:
+                executor = create(workers)
+                handed[executor.submit(work, new[0])] = new[0]
+        if not handed:
+            return
+        ready, suspects = wait(handed, return_when=FIRST_COMPLETED)[0], []
+        if any(isinstance(each.exception(), BrokenExecutor) for each in ready):
+            ready = wait(handed)[0]
+        for each in ready:
+            task = handed.pop(each)
+            try:
+                yield task, each.result()
+            except BrokenExecutor:
+                suspects.append(task)
+            except Exception as error:  # of a cluster: it has seen workers die of it
+                yield task, Lost(_killed(error))
+        if suspects:
+            executor.shutdown(wait=True, cancel_futures=True)
+            yield from _one_by_one(work, suspects, create)
+            executor = create(workers)
+
+
+def _one_by_one(work: Work[Task, Found], tasks: Iterable[Task],
+                create: Callable[[int], Executor]) -> Iterator[tuple[Task, Found | Lost]]:
+    executor = create(1)
+    for task in tasks:
+        try:
+            yield task, executor.submit(work, task).result()
+        except BrokenExecutor as error:
+            yield task, Lost(_killed(error))
+            executor.shutdown(wait=True, cancel_futures=True)
+            executor = create(1)
+    executor.shutdown(wait=True)
+
+
+def _killed(error: Exception) -> str:
+    if isinstance(error, BrokenExecutor) or type(error).__name__ == 'KilledWorker':
+        return ('its worker was killed, as where memory runs out; look at the log, '
+                'or give --workers 1')
+    return f'its worker failed ({type(error).__name__}: {str(error)[:200]})'
+
+
+def usual_workers() -> int:
+    """Return how many workers this machine has cores for."""
+    return max(len(os.sched_getaffinity(0)), 1)

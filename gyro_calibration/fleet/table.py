@@ -1,0 +1,315 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Which log is of which unit, type and drive: from a table, notes, metadata or file names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+import csv
+from dataclasses import dataclass, replace
+from datetime import date
+from glob import glob
+import gzip
+import math
+import os
+from pathlib import Path
+import re
+import struct
+from typing import Any, BinaryIO
+
+from gyro_calibration.files import InputError, opened, plain, read_bytes
+from gyro_calibration.model.settings_file import read_settings
+
+#: What is said of a log, beside its path.
+KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
+#: Ends of files that are logs.
+LOGS = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
+#: Bytes of a table, of the notes of a log, and of the metadata of a recording that are read.
+_MOST, _NOTES = 50_000_000, 4096
+#: Notes and names, such as "unit: 7", "Movella DOT unit 1, drive h" and rc_car_h_unit1.csv.gz.
+_KEYED = re.compile(r'\b(unit|type|drive|date|temperature)\s*[:=]\s*([^,;#\s]+)', re.IGNORECASE)
+_SPOKEN = re.compile(r'\b(unit|drive) (\w*\d\w*|[a-z](?=[,;.)]|$))', re.IGNORECASE | re.MULTILINE)
+_NAMED = {'unit': re.compile(r'(?:^|[_.-])(?:unit|sn)[_-]?([A-Za-z0-9]+)', re.IGNORECASE),
+          'date': re.compile(r'(?:^|[_.-])(\d{4}-\d\d-\d\d)'),
+          'drive': re.compile(r'(?:^|[_.-])drive[_-]?([A-Za-z0-9]+)', re.IGNORECASE)}
+_MAGIC, _CHUNK_HEAD, _METADATA = b'\x89MCAP0\r\n', 9, 0x0C
+
+
+@dataclass(frozen=True)
+class Entry:
+    """
+    A log of a fleet.
+
+    Attributes
+    ----------
+    log : its path
+    unit : which gyro; '' where it is not known
+    type : of the gyro; logs of one type are pooled
+    drive : what units that were moved together share, with its reference; '' where the log stands
+        alone
+    date : ISO 8601, or ''
+    temperature : degC; None where it is not known
+
+    """
+
+    log: str
+    unit: str = ''
+    type: str = ''  # noqa: A003
+    drive: str = ''
+    date: str = ''
+    temperature: float | None = None
+
+    def with_missing(self, said: Mapping[str, str]) -> Entry:
+        """Return the entry with what it does not hold yet."""
+        new: dict[str, Any] = {name: text.strip() for name, text in said.items()
+                               if name in KEYS and text.strip()
+                               and getattr(self, name) in ('', None)}
+        if 'temperature' in new:
+            new['temperature'] = _temperature(self.log, new['temperature'])
+        if 'date' in new:
+            new['date'] = _date(self.log, new['date'])
+        return replace(self, **new)
+
+
+def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
+    """
+    Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
+
+    Parameters
+    ----------
+    paths : as a user gives them
+    without : a folder that is not searched, as that of the results
+
+    Raises
+    ------
+    InputError : there is none, or a table is wrong
+    OSError : a table cannot be read
+
+    """
+    found: dict[str, Entry] = {}
+    for path in paths:
+        for entry in _of(path, Path(without).absolute() if without else None):
+            found.setdefault(os.path.abspath(entry.log), entry)
+    if not found:
+        raise InputError(f'{", ".join(map(str, paths))}: holds no log; logs end in '
+                         f'{", ".join(LOGS)}, or are the folder of a ROS 2 recording')
+    return list(found.values())
+
+
+def _of(path: str, without: Path | None) -> Iterator[Entry]:
+    if os.path.isdir(path):
+        yield from map(Entry, _inside(Path(path), without))
+    elif not os.path.exists(path) and glob(path, recursive=True):
+        for each in sorted(glob(path, recursive=True)):
+            yield from _of(each, without)
+    elif path.endswith('.txt'):
+        lines = (line.strip() for line in _text(path).splitlines())
+        yield from (Entry(_beside(path, line)) for line in lines if line and line[0] != '#')
+    elif path.endswith('.csv') and (columns := _header(path)) and 'log' in columns:
+        yield from _rows(path, columns)
+    else:
+        yield Entry(path)
+
+
+def _inside(folder: Path, without: Path | None) -> Iterator[str]:
+    """Give the logs in a folder and in those inside it; one with metadata.yaml is a recording."""
+    if folder.absolute() == without:
+        return
+    if (folder / 'metadata.yaml').is_file():
+        yield str(folder)
+        return
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            yield from _inside(path, without)
+        elif path.name.endswith(LOGS) and not path.name.startswith('.'):
+            yield str(path)
+
+
+def _text(path: str) -> str:
+    try:
+        return read_bytes(path, _MOST).decode('utf-8-sig')
+    except OSError:
+        raise
+    except ValueError as error:
+        raise InputError(f'{path}: {plain(error)}; give a text file in UTF-8') from error
+
+
+def _header(path: str) -> list[str]:
+    with opened(path) as file:
+        line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
+    return [name.strip().lower() for name in line.split(',')]
+
+
+def _beside(path: str, log: str) -> str:
+    """Return the path of a log that a table names: as it is, or seen from the table."""
+    seen = Path(path).parent / log
+    return str(seen) if seen.exists() or not Path(log).exists() else log
+
+
+def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
+    unknown = sorted(set(columns) - {'log', *KEYS})
+    if unknown or len(set(columns)) < len(columns):
+        raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
+                         f'{", ".join(KEYS)}, each once')
+    rows = csv.reader(_text(path).splitlines())
+    next(rows)
+    for number, row in enumerate(rows, 2):
+        if not any(map(str.strip, row)):
+            continue
+        if len(row) != len(columns):
+            raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
+                             f'{len(columns)} as in its first line')
+        said = dict(zip(columns, row))
+        log = said.pop('log').strip()
+        if not log:
+            raise InputError(f'{path}, line {number}: names no log')
+        yield Entry(_beside(path, log)).with_missing(said)
+
+
+def pattern(text: str) -> re.Pattern[str]:
+    """
+    Return what reads a file name such as ``rc_car_{drive}_unit{unit}``.
+
+    Raises
+    ------
+    ValueError : it names nothing, or what a log has not
+
+    """
+    parts = re.split(r'\{(\w*)\}', text)
+    unknown = [name for name in parts[1::2] if name not in KEYS]
+    if unknown or len(parts) < 3 or len(set(parts[1::2])) < len(parts[1::2]):
+        raise ValueError(f'{text}: wanted a file name with {{unit}}, and perhaps '
+                         f'{", ".join(f"{{{name}}}" for name in KEYS[1:])}, each once')
+    return re.compile(''.join(f'(?P<{part}>.+?)' if place % 2 else re.escape(part)
+                              for place, part in enumerate(parts)))
+
+
+def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
+    """
+    Return an entry with what its file name, notes or metadata say beside it.
+
+    What a table says counts first, then a pattern of the user's, then notes and metadata, then
+    names that are usual.
+
+    Parameters
+    ----------
+    entry : with a log that exists
+    named : how a user's files are named, of `pattern`
+
+    """
+    stem = Path(entry.log).name
+    for end in sorted(LOGS, key=len, reverse=True):
+        stem = stem.removesuffix(end)
+    if named is not None and (found := named.fullmatch(stem)):
+        entry = entry.with_missing(found.groupdict())
+    return entry.with_missing(_notes(entry.log)).with_missing(_usual(stem))
+
+
+def _usual(stem: str) -> dict[str, str]:
+    """Return what a file name says; what is left beside unit and date names the drive."""
+    said, rest = {}, stem
+    for name, shape in _NAMED.items():
+        if found := shape.search(rest):
+            said[name] = found[1]
+            rest = rest.replace(found[0], '')
+    if 'unit' in said and rest.strip('_.-'):
+        said.setdefault('drive', rest.strip('_.-'))
+    return said
+
+
+def _notes(path: str) -> dict[str, str]:
+    """Return what notes of a log, or metadata of a recording, say."""
+    if os.path.isdir(path):
+        return {**_custom(Path(path)), **_of_recordings(sorted(Path(path).glob('*.mcap')))}
+    if path.endswith('.mcap'):
+        return _of_recordings([Path(path)])
+    if not path.endswith(('.csv', '.csv.gz')):
+        return {}
+    with opened(path) as file:
+        try:
+            data = (gzip.GzipFile(fileobj=file).read(_NOTES) if path.endswith('.gz')
+                    else file.read(_NOTES))
+        except (OSError, EOFError):  # read again, and told, where the log is read
+            return {}
+    lines = []
+    for line in data.decode(errors='replace').splitlines():
+        if not line.startswith('#'):
+            break
+        lines.append(line)
+    return said_in('\n'.join(lines))
+
+
+def said_in(text: str) -> dict[str, str]:
+    """Return what a text says of a log, such as "unit: 7" or "unit 7, drive h"."""
+    found = {name.lower(): value for name, value in reversed(_SPOKEN.findall(text))}
+    return {**found, **{name.lower(): value for name, value in reversed(_KEYED.findall(text))}}
+
+
+def _custom(folder: Path) -> dict[str, str]:
+    """Return the custom data in metadata.yaml of a rosbag2 folder."""
+    try:
+        content = read_settings(folder / 'metadata.yaml')
+        said = content['rosbag2_bagfile_information']['custom_data'] or {}
+        return {str(name).lower(): str(value) for name, value in said.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _of_recordings(paths: Sequence[Path]) -> dict[str, str]:
+    said: dict[str, str] = {}
+    for path in paths:
+        try:
+            with opened(path) as file:
+                said |= dict(_metadata(file))
+        except (OSError, struct.error):  # told where the log is read
+            continue
+    return said
+
+
+def _metadata(file: BinaryIO) -> Iterator[tuple[str, str]]:
+    """Give names and values of the metadata records of an MCAP file."""
+    if file.read(len(_MAGIC)) != _MAGIC:
+        return
+    while len(head := file.read(_CHUNK_HEAD)) == _CHUNK_HEAD:
+        code, length = struct.unpack('<BQ', head)
+        if code != _METADATA or length > _MOST:
+            file.seek(length, os.SEEK_CUR)
+            continue
+        texts = list(_texts(file.read(length)))
+        yield from ((name.lower(), value) for name, value in zip(texts[1::2], texts[2::2]))
+
+
+def _texts(body: bytes) -> Iterator[str]:
+    """Give the name of a metadata record, then its names and values in turn."""
+    place, first = 0, True
+    while place < len(body):
+        (length,) = struct.unpack_from('<I', body, place)
+        yield body[place + 4:place + 4 + length].decode(errors='replace')
+        place += 4 + length + (4 if first else 0)
+        first = False
+
+
+def _temperature(log: str, text: str) -> float:
+    try:
+        value = float(re.sub(r'\s*(deg)?[°cC]*$', '', text))
+    except ValueError:
+        value = math.nan
+    if not -273.15 <= value <= 1e4:
+        raise InputError(f'{log}: its temperature is said to be {text!r}; wanted degC')
+    return value
+
+
+def _date(log: str, text: str) -> str:
+    try:
+        return date.fromisoformat(text[:10]).isoformat()
+    except ValueError:
+        raise InputError(f'{log}: its date is said to be {text!r}; wanted such as '
+                         '2026-03-01') from None

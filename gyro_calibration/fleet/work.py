@@ -1,0 +1,239 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""What is done with one log of a fleet: calibrated, diagnosed, and kept as data."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from gyro_calibration import __version__
+from gyro_calibration.calibration.dwells import dwells
+from gyro_calibration.calibration.encoder import calibrate_encoder
+from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.diagnosis.door import rests
+from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import diagnose
+from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.files import InputError, opened, plain, reason, write_atomically
+from gyro_calibration.fleet.slow_effects import rest_bias, slow_effects
+from gyro_calibration.fleet.table import described, Entry
+from gyro_calibration.logs.log import DataRefused, Log, read_log
+from gyro_calibration.logs.recording import read_recording
+from gyro_calibration.logs.ros_bag import files_of, is_recording
+from gyro_calibration.model.effects import BIAS
+from gyro_calibration.model.gyro_model import GyroModel, Term
+import numpy as np
+
+#: A log that was calibrated, and one that is no evidence.
+DONE, NO_EVIDENCE = 'done', 'no evidence'
+#: Of the records; another one is not taken for this one.
+SCHEMA = 'gyro_calibration/fleet_log/1'
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    What is to be done with a log.
+
+    Attributes
+    ----------
+    entry : the log
+    folder : of the results
+    technology : of the gyros, one of `course_over_ground.PRIORS`
+    named : how files are named, of `table.pattern`
+    generator : for the diagnosis, the same for each log; None without a diagnosis
+    usual_type : of a log whose type is not said
+
+    """
+
+    entry: Entry
+    folder: str
+    technology: str = 'mems'
+    named: re.Pattern[str] | None = None
+    generator: np.random.Generator | None = None
+    usual_type: str = ''
+
+    @property
+    def name(self) -> str:
+        """Return the name of the log's files among the results, another for each path."""
+        stem = re.sub(r'[^A-Za-z0-9_.-]', '_', Path(self.entry.log).name.partition('.')[0])
+        path = os.path.abspath(self.entry.log).encode(errors='surrogateescape')
+        return f'{stem[:60]}-{hashlib.sha256(path).hexdigest()[:8]}'
+
+    @property
+    def record(self) -> Path:
+        """Return the path of the record that is kept."""
+        return Path(self.folder) / 'logs' / f'{self.name}.json'
+
+
+def done(task: Task) -> dict[str, Any]:
+    """
+    Return the record of a log, and keep it; one that was kept of the same content is taken.
+
+    It is data that JSON can hold, and the same to the bit wherever it is computed.
+
+    Returns
+    -------
+    ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``values`` has name -> value,
+    standard deviation and unit; ``slow`` the same of effects that a single log cannot tell from
+    the wander of the bias, each fitted alone; ``diagnosis`` a summary
+
+    """
+    try:
+        entry = described(task.entry, task.named).with_missing({'type': task.usual_type})
+        content = _digest(task.entry.log)
+        key = _key(task, entry, content)
+        kept = _kept(task.record, key)
+        if kept is not None:
+            return kept
+        found = {'schema': SCHEMA, 'key': key, 'sha256': content, **asdict(entry),
+                 **_calibrated(task, entry)}
+        write_atomically(task.record, json.dumps(found, allow_nan=False).encode())
+        return found
+    except (InputError, ArithmeticError, np.linalg.LinAlgError, OSError, MemoryError) as error:
+        return refused(task.entry, _why(error, task.entry.log))
+
+
+def refused(entry: Entry, why: str) -> dict[str, Any]:
+    """Return the record of a log that is no evidence."""
+    return {'schema': SCHEMA, 'key': '', 'sha256': '', **asdict(entry),
+            'status': NO_EVIDENCE, 'reason': why}
+
+
+def _why(error: Exception, path: str) -> str:
+    if isinstance(error, MemoryError):
+        return 'takes more memory than a worker may use; give --memory more, or a shorter log'
+    if isinstance(error, InputError):
+        return str(error).removeprefix(f'{plain(path)}: ')
+    return reason(error)
+
+
+def _digest(path: str) -> str:
+    found = hashlib.sha256()
+    for each in files_of(path):
+        with opened(each) as file:
+            while piece := file.read(1 << 20):
+                found.update(piece)
+    return found.hexdigest()
+
+
+def _key(task: Task, entry: Entry, content: str) -> str:
+    """Return what is another where another record would be found."""
+    drawn = None if task.generator is None else task.generator.bit_generator.state
+    about = [SCHEMA, __version__, task.technology, asdict(entry), content, drawn]
+    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+
+
+def _kept(path: Path, key: str) -> dict[str, Any] | None:
+    try:
+        kept = json.loads(path.read_bytes())
+        return kept if kept['key'] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _calibrated(task: Task, entry: Entry) -> dict[str, Any]:
+    log = read_recording(entry.log) if is_recording(entry.log) else read_log(entry.log)
+    method, model, more = calibrate(log, task.technology)
+    temperature = None if log.temperature is None else float(np.nanmean(log.temperature))
+    if temperature is not None and not math.isfinite(temperature):
+        temperature = None
+    found: dict[str, Any] = {
+        'status': DONE, 'reason': '', 'method': method, 'samples': len(log),
+        'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
+        'values': {**_values(model), **more},
+        'slow': slow_effects(log, more['time_offset']['value'] if more else 0.0)
+        if log.time is not None else {},
+        'noise': {name: float(value) for name, value in vars(model.noise).items()},
+        'diagnosis': None, 'page': ''}
+    if entry.temperature is None:
+        found['temperature'] = temperature
+    if task.generator is not None:
+        found |= _diagnosed(task, log)
+    return found
+
+
+def calibrate(log: Log, technology: str = 'mems'
+              ) -> tuple[str, GyroModel, dict[str, dict[str, Any]]]:
+    """
+    Return how a log was calibrated, its model, and values that a model does not hold.
+
+    A reference heading over time is taken as `calibrate_encoder` takes it, what rests shows the
+    bias alone, and anything else is taken for dwells.
+
+    Raises
+    ------
+    DataRefused : with the reason and the remedy
+
+    """
+    if log.output is None:
+        raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
+    if log.time is not None and log.reference_rate is None and log.reference_heading is not None:
+        found = calibrate_encoder(log, technology=technology)
+        offset = {} if math.isnan(found.fit.time_offset) else {'time_offset': _value(
+            found.fit.time_offset, found.fit.time_offset_deviation, 's')}
+        return found.method, found.model, offset
+    if log.time is not None and rests(log):
+        return 'rest', _at_rest(log), {}
+    return 'dwells', select_effects(dwells(log), technology).calibration.model, {}
+
+
+def _at_rest(log: Log) -> GyroModel:
+    bias, deviation = rest_bias(log)
+    return GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]))
+
+
+def _values(model: GyroModel) -> dict[str, dict[str, Any]]:
+    """Return the fitted values of a model, by parameter where it is named as its effect."""
+    values: dict[str, dict[str, Any]] = {}
+    variances = iter([math.nan] * 1000 if model.covariance is None
+                     else np.diag(model.covariance).tolist())
+    for term in model.terms:
+        for place in term.fitted:
+            parameter = term.effect.parameters[place]
+            name = (parameter.name if parameter.name == term.effect.name
+                    else f'{term.effect.name}.{parameter.name}')
+            values[name] = _value(term.values[place], math.sqrt(next(variances)), parameter.unit)
+    return values
+
+
+def _value(value: float, deviation: float, unit: str) -> dict[str, Any]:
+    return {'value': float(value), 'deviation': float(deviation), 'unit': unit}
+
+
+def _diagnosed(task: Task, log: Log) -> dict[str, Any]:
+    """Return a summary of the diagnosis, and write its page."""
+    assert task.generator is not None
+    try:
+        found = (diagnose_table(log, None) if log.time is None
+                 else diagnose([log], task.generator, names=[task.entry.log]))
+    except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
+        return {'diagnosis': {'verdict': 'refused', 'reason': _why(error, task.entry.log),
+                              'findings': []}}
+    page = task.record.with_suffix('.html')
+    write_atomically(page, report(found).encode())
+    return {'diagnosis': _summary(found), 'page': f'logs/{page.name}'}
+
+
+def _summary(found: Diagnosis) -> dict[str, Any]:
+    return {'verdict': found.verdict, 'reason': '', 'findings': [
+        {'effect': each.effect, 'status': each.status, 'p_value': each.p_value,
+         'ambiguous_with': list(each.ambiguous_with),
+         'parameters': {name: value.figures() for name, value in each.parameters.items()}}
+        for each in found.findings]}

@@ -1,0 +1,242 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""A fleet: which log is of which unit, workers that die, and the verb on good and bad input."""
+
+import json
+import os
+import struct
+
+from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
+from gyro_calibration.cli.main import main
+from gyro_calibration.files import InputError
+from gyro_calibration.fleet.outliers import changes, outliers
+from gyro_calibration.fleet.pooling import Observed, Pooled
+from gyro_calibration.fleet.run import finished, Lost, processes
+from gyro_calibration.fleet.summary import data, sentences, summarized
+from gyro_calibration.fleet.table import described, entries, Entry, pattern
+from gyro_calibration.fleet.work import done, Task
+from gyro_calibration.logs.log import Log, write_log
+import numpy as np
+import pytest
+from scipy import stats
+
+DEGREE = np.pi / 180.0
+
+
+def drive(bias, seed, seconds=90.0):
+    """Return a log of a gyro of that bias, rad/s, beside an encoder."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 0.05)
+    heading = 2.0 * np.sin(2.0 * np.pi * time / 15.0)
+    output = np.gradient(heading, time) * 1.01 + bias + 2e-3 * generator.standard_normal(len(time))
+    return Log(time=time, output=output, reference_heading=heading)
+
+
+def run(*arguments):
+    """Return the exit code of the program."""
+    return main(['fleet', *map(str, arguments), '--no-diagnosis', '--workers', '1', '--json'])
+
+
+# which log is of which unit
+
+def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
+    (tmp_path / 'fleet.csv').write_text('log,unit,drive,date,temperature\n'
+                                        'a.csv,7,n,2026-03-01,21\nb.csv,8,n,,\n')
+    (tmp_path / 'a.csv').touch()
+    assert entries([str(tmp_path / 'fleet.csv')]) == [
+        Entry(str(tmp_path / 'a.csv'), '7', '', 'n', '2026-03-01', 21.0),
+        Entry(str(tmp_path / 'b.csv'), '8', '', 'n')]
+
+
+@pytest.mark.parametrize(('text', 'wanted'), [
+    ('log,unit,colour\na.csv,1,red\n', 'its columns are log, unit, colour'),
+    ('log,unit\na.csv\n', 'line 2: holds 1 values, wanted 2'),
+    ('log,unit\n,3\n', 'line 2: names no log'),
+    ('log,date\na.csv,March\n', "its date is said to be 'March'"),
+    ('log,temperature\na.csv,hot\n', "its temperature is said to be 'hot'")])
+def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
+    (tmp_path / 'fleet.csv').write_text(text)
+    with pytest.raises(InputError, match=wanted):
+        entries([str(tmp_path / 'fleet.csv')])
+
+
+def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_path):
+    for name in ('x/b.csv', 'x/y/a.mcap', 'x/out/c.csv', 'x/readme.md', 'x/bag/metadata.yaml'):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / 'list.txt').write_text('# two\nx/b.csv\n')
+
+    def found(path):
+        return [os.path.relpath(entry.log, tmp_path)
+                for entry in entries([str(tmp_path / path)], without=tmp_path / 'x/out')]
+    assert found('x') == ['x/b.csv', 'x/bag', 'x/y/a.mcap']
+    assert found('x/*/*.mcap') == ['x/y/a.mcap']
+    assert found('list.txt') == ['x/b.csv']
+    with pytest.raises(InputError, match='holds no log'):
+        found('x/out')
+
+
+def _mcap(said):
+    """Return an MCAP file with a metadata record."""
+    def text(each):
+        return struct.pack('<I', len(each)) + each.encode()
+    pairs = b''.join(text(name) + text(value) for name, value in said.items())
+    body = text('gyro') + struct.pack('<I', len(pairs)) + pairs
+    return (b'\x89MCAP0\r\n' + struct.pack('<BQ', 1, 8) + bytes(8)
+            + struct.pack('<BQ', 0x0C, len(body)) + body)
+
+
+def test_notes_metadata_and_names_say_what_a_table_does_not(tmp_path):
+    written = {
+        'plain.csv': b'# Movella DOT unit 1, RTK course; drive h, 2024\ntime_s,gyro_dps\n',
+        'keyed.csv': b'# unit: SN-12, type: DOT\n# date: 2026-03-01\ntime_s,gyro_dps\n',
+        'bag.mcap': _mcap({'unit': '9', 'Drive': 'm', 'temperature': '21.5 degC'}),
+        'rc_car_h_unit3.csv': b'time_s,gyro_dps\n', 'aimless.csv': b'# a drive in town\nx\n'}
+    for name, content in written.items():
+        (tmp_path / name).write_bytes(content)
+
+    def of(name, named=None):
+        found = described(Entry(str(tmp_path / name)), named)
+        return found.unit, found.type, found.drive, found.date, found.temperature
+    assert of('plain.csv') == ('1', '', 'h', '', None)
+    assert of('keyed.csv') == ('SN-12', 'DOT', '', '2026-03-01', None)
+    assert of('bag.mcap') == ('9', '', 'm', '', 21.5)
+    assert of('rc_car_h_unit3.csv') == ('3', '', 'rc_car_h', '', None)
+    assert of('rc_car_h_unit3.csv', pattern('{type}_{drive}_unit{unit}')) == (
+        '3', 'rc', 'car_h', '', None)
+    assert of('aimless.csv') == ('', '', '', '', None)
+    with pytest.raises(ValueError, match='wanted a file name'):
+        pattern('rc_car')
+
+
+# workers
+
+def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
+    with processes(2, 1e9) as create:
+        found = dict(finished(task, range(10), 2, create))
+    lost = found.pop(KILLS)
+    assert isinstance(lost, Lost) and 'killed' in str(lost)
+    assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
+    assert found == {number: number for number in range(10) if number not in (KILLS, TAKES_ALL_MEMORY)}
+
+
+# the verb
+
+def test_logs_that_are_no_evidence_are_told_and_the_others_done(tmp_path, capsys):
+    logs = tmp_path / 'logs'
+    for unit, seed in ((1, 0), (2, 1)):
+        write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
+    write_log(logs / 'b_unit1.csv', drive(0.01, 0))  # a double
+    (logs / 'c_unit1.csv').write_text('time_s,gyro_dps\n0,x\n1,2\n')
+    write_log(logs / 'nobody.csv', drive(0.01, 3))
+    assert run(logs, '--out', tmp_path / 'out') == 0
+    told = json.loads(capsys.readouterr().out)
+    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
+    assert told['logs'] == 5 and 'holds the same as' in reasons['b_unit1.csv']
+    assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
+    assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv'}
+
+
+def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
+    write_log(tmp_path / 'a_unit1.csv', drive(0.01, 0))
+    one = Task(Entry(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
+    first, stamp, kept = done(one), one.record.stat().st_mtime_ns, one.record.read_bytes()
+    assert first == done(one) and one.record.stat().st_mtime_ns == stamp
+    assert first['unit'] == '1' and first['values']['bias']['value'] == pytest.approx(
+        0.01, abs=4.0 * first['values']['bias']['deviation'])
+    one.record.write_text('{"key": "of another version"}')
+    assert done(one) == first and one.record.read_bytes() == kept
+
+
+@pytest.mark.parametrize(('make', 'code', 'wanted'), [
+    (lambda path: path.mkdir(), 2, 'holds no log'),
+    (lambda path: path.mkdir() or (path / 'a.csv').write_text('?'), 1, 'none of 1 logs')])
+def test_where_nothing_can_be_done_one_sentence_says_why(tmp_path, capsys, make, code, wanted):
+    make(tmp_path / 'logs')
+    assert run(tmp_path / 'logs', '--out', tmp_path / 'out') == code
+    out, error = capsys.readouterr()
+    assert not out and wanted in error and error.count('\n') == 1
+
+
+# pooling
+
+def crossed(values, deviation=1e-6):
+    """Return values of units by drives, each with a small error of its own."""
+    unit, drive = np.indices(values.shape).reshape(2, -1)
+    return Observed(values.ravel(), np.full(values.size, deviation), unit, drive)
+
+
+def test_balanced_data_give_the_variances_of_an_analysis_of_variance():
+    values = np.random.default_rng(5).standard_normal((6, 5))
+    values += 3.0 * np.arange(6)[:, None] + 2.0 * np.arange(5)
+    found = Pooled(crossed(values)).components
+    units, drives = values.mean(axis=1), values.mean(axis=0)
+    rest = np.sum((values - units[:, None] - drives + values.mean()) ** 2) / 20.0
+    for name, wanted in (('units', np.var(units, ddof=1) - rest / 5.0),
+                         ('drives', np.var(drives, ddof=1) - rest / 6.0), ('power_ons', rest)):
+        assert found[name].estimate == pytest.approx(np.sqrt(wanted), rel=2e-3)
+        assert found[name].low < found[name].estimate < found[name].high
+
+
+def test_the_interval_of_one_more_unit_is_that_of_student():
+    values = np.random.default_rng(6).standard_normal(6)
+    pooled = Pooled(Observed(values, np.full(6, 1e-6), np.arange(6), np.full(6, -1)))
+    found = pooled.estimate(pooled.wanted(units=1.0))
+    half = stats.t.ppf(0.975, 5) * np.std(values, ddof=1) * np.sqrt(1.0 + 1.0 / 6.0)
+    assert found.low[0] == pytest.approx(values.mean() - half, abs=0.03 * half)
+    assert found.high[0] == pytest.approx(values.mean() + half, abs=0.03 * half)
+
+
+def test_what_the_units_of_a_drive_share_does_not_move_a_unit():
+    """A reference that is off in one drive by far more than units differ."""
+    values = np.array([[1.0, 1.1, 1.0, 0.9], [2.0, 1.9, 2.0, 2.1], [3.1, 3.0, 3.0, 2.9],
+                       [4.0, 4.0, 4.1, 4.0]]) + np.array([0.0, 0.0, 0.0, 40.0])
+    pooled = Pooled(crossed(values))
+    rows = np.zeros((4, 1))
+    apart = pooled.estimate(pooled.wanted(unit=np.arange(4), fixed=rows)).value
+    assert apart - apart[0] == pytest.approx([0.0, 1.0, 2.0, 3.0], abs=0.1)
+
+
+def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
+    generator = np.random.default_rng(8)
+    values = generator.standard_normal((12, 1)) + 0.2 * generator.standard_normal((12, 6))
+    date = np.tile(np.arange(6), 12)
+    assert outliers(crossed(values), 'units', 0.01) == []
+    assert changes(crossed(values), date, 0.01) == []
+    values[3] += 12.0
+    values[7, 4:] += 3.0
+    assert [each.number for each in outliers(crossed(values), 'units', 0.01)] == [3]
+    (change,) = changes(crossed(values), date, 0.01)
+    assert (change.unit, change.since) == (7, 4) and change.size == pytest.approx(3.0, abs=0.5)
+
+
+def records(ramp=0.0, wander=1.0):
+    """Return records of five units on four drives, in which a ramp repeats or only wanders."""
+    generator = np.random.default_rng(9)
+    off = 0.1 * np.arange(4)
+
+    def of(value, deviation, unit):
+        return {'value': value, 'deviation': deviation, 'unit': unit}
+    return [{'log': f'{drive}{unit}', 'unit': str(unit), 'type': 'DOT', 'drive': 'hijk'[drive],
+             'date': '', 'temperature': None, 'diagnosis': None, 'page': '', 'values': {
+                 'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
+                 'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
+             'slow': {'rate_ramp': of(ramp + wander * generator.standard_normal(), wander,
+                                      'rad/s²')}} for unit in range(5) for drive in range(4)]
+
+
+@pytest.mark.parametrize(('ramp', 'said'), [(0.0, 'none repeats'), (12.0, 'the type lacks it')])
+def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
+    (found,) = summarized(records(ramp))
+    told = '; '.join(sentences(found))
+    assert "bias is the unit's" in told and "time_offset is the reference's" in told
+    assert said in told and 'stands out' not in told
+    json.dumps(data(found), allow_nan=False)
