@@ -68,7 +68,7 @@ setup(
     maintainer=manifest.findtext('maintainer'),
     maintainer_email=manifest.find('maintainer').get('email'),
     packages=find_packages(include=[name, f'{name}.*']), package_data={
-        f'{name}.diagnosis': ['report.html']
+        name: ['py.typed'], f'{name}.diagnosis': ['report.html']
     }, python_requires='>=3.10,<3.15', install_requires=[
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
     ], extras_require={

@@ -20,11 +20,46 @@ Frames. Everything is about one axis, z of the gyro's frame, counter-clockwise p
 Units. SI inside: rad, rad/s, s, K for differences; temperatures are in degC. Other units exist
 only in files, wires and the command line, where the name says so: ``gyro_dps``.
 
-Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `fleet`, `reproduction`;
-then, with ports, processes and ROS 2, `driver`, `ros`, `cli`. Each folder imports only what
-stands before it, and so does each module of a folder, by the reading order that its docstring
-gives. `files` opens and writes files for all of them.
+Interface. The names in `__all__` are public, and imported when they are first used; everything
+else may change. `from gyro_calibration import read_log, fit` needs no ROS 2.
+
+Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `fleet`,
+`reproduction`; then, with ports, processes and ROS 2, `driver`, `ros`, `cli`; then `api`, which
+holds the public names. Each folder imports only what stands before it, and so does each module of
+a folder, by the reading order that its docstring gives. `files` opens and writes files for all.
 
 """
 
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gyro_calibration.api import (
+        allan,
+        compensate,
+        diagnose,
+        fit,
+        GyroModel,
+        Log,
+        read_log,
+        read_model,
+        self_calibrate,
+        simulate,
+        track,
+        write_log,
+        write_model,
+    )
+
 __version__ = '0.2.0'
+__all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_log', 'read_model',
+           'self_calibrate', 'simulate', 'track', 'write_log', 'write_model']
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module('gyro_calibration.api'), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -57,7 +57,7 @@ def stepping(generator, noise, count=6000):
     """Return a log of a gyro that turns at one rate for long, and at another then."""
     rate = np.repeat([0.0, 0.7, 0.0, -0.7, 0.0, 0.3], count // 6)
     output = 1.01 * rate + 2e-3 + simulate_noise(noise, count, INTERVAL, generator)
-    return Log(output, time=np.arange(count) * INTERVAL, reference_rate=rate)
+    return Log(output=output, time=np.arange(count) * INTERVAL, reference_rate=rate)
 
 
 def found(log, model=None):
@@ -272,7 +272,7 @@ def test_a_moving_average_of_coarse_codes_is_not_stuck(generator):
     log = swing(generator)
     mean = np.convolve(coarse(log, 0.2 * SIGMA).output, np.full(7, 1.0 / 7.0),
                        'valid') * (1.0 + 0.02 * np.sin(31.0 * log.time[3:-3]))
-    assert not found(Log(printed(mean, 4), time=log.time[3:-3],
+    assert not found(Log(output=printed(mean, 4), time=log.time[3:-3],
                          reference_rate=log.reference_rate[3:-3]))
 
 
@@ -414,23 +414,25 @@ REFUSED = {
                      'no gyro output in rad/s; with'),
     'no reference': (replace(GOOD, reference_rate=None), None,
                      'no reference, and the gyro is not at rest'),
-    'few': (Log(GOOD.output[:90], time=GOOD.time[:90], reference_rate=GOOD.reference_rate[:90]),
+    'few': (Log(output=GOOD.output[:90], time=GOOD.time[:90],
+                reference_rate=GOOD.reference_rate[:90]),
             None, '90 of 90 samples'),
-    'short': (Log(GOOD.output[:900], time=GOOD.time[:900],
+    'short': (Log(output=GOOD.output[:900], time=GOOD.time[:900],
                   reference_rate=GOOD.reference_rate[:900]), None, 'lasts 9.0 s'),
     'constant': (replace(GOOD, output=0.0 * GOOD.output + 0.1), None,
                  'in 100 % of the samples: it is dead'),
     'same': (replace(GOOD, reference_rate=GOOD.output), None, '1 times the reference plus'),
     'affine': (replace(GOOD, reference_rate=(GOOD.output - 0.1) / 1.3), None,
                '1.3 times the reference plus 5.73 deg/s'),
-    'summed up': (Log(GOOD.output, time=GOOD.time,
+    'summed up': (Log(output=GOOD.output, time=GOOD.time,
                       reference_heading=np.cumsum(GOOD.output) * INTERVAL),
                   None, '1 times the reference'),
     'lost gyro': (replace(GOOD, output=GOOD.output * NAN), None,
                   'the gyro has a value in 50 of 6000'),
     'lost reference': (replace(GOOD, reference_rate=GOOD.reference_rate * NAN), None,
                        'the reference has a value in 50 of 6000'),
-    'few rows': (Log(GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None, '5 rows'),
+    'few rows': (Log(output=GOOD.output[:5], reference_rate=GOOD.reference_rate[:5]), None,
+                 '5 rows'),
     'model in deg/s': (GOOD, OTHER_UNITS, 'of other units'),
     'range in rad/s read as deg/s': (GOOD, GyroModel(rate_range=(-0.01, 0.01)),
                                      'of other units, or of another gyro'),
@@ -456,7 +458,7 @@ def test_what_allows_one_passes_the_door():
     refuse(replace(GOOD, output=GOOD.output * half,
                    reference_rate=GOOD.reference_rate * half[::-1]), own)
     refuse(replace(GOOD, output=GOOD.output / DEGREE), own)
-    refuse(Log(GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
+    refuse(Log(output=GOOD.output[::100], reference_rate=GOOD.reference_rate[::100]), own)
 
 
 def test_a_gyro_at_rest_needs_no_reference():

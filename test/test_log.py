@@ -160,7 +160,7 @@ def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch
 def test_texts_of_a_log_are_read_back_whatever_ends_their_lines(tmp_path):
     path = written(tmp_path, '# a\ngyro_dps,place,"a\rb"\n1,"a\rb",c\n2,"a\r\nb","d"\n')
     log = read_log(path)
-    write_log(path, Log(log.output, notes=('one\rtwo\nthree',), others=log.others))
+    write_log(path, Log(output=log.output, notes=('one\rtwo\nthree',), others=log.others))
     again = read_log(path)
     assert (again.notes == ('one two three',)
             and again.others == {'place': ('a\nb', 'a\nb'), 'a\nb': ('c', 'd')})
@@ -286,8 +286,8 @@ def test_a_log_written_in_blocks_is_the_log_written_at_once(tmp_path, name):
     more = generator.normal(size=9)
     write_log(tmp_path / f'whole_{name}', log, {'rate_rad_s': more})
     pieces = [slice(0, 4), slice(4, 5), slice(5, 9)]
-    write_log_blocks(tmp_path / name, ((Log(log.output[here], time=log.time[here], notes=('a',),
-                                            others={'lap': log.others['lap'][here]}),
+    write_log_blocks(tmp_path / name, ((Log(output=log.output[here], time=log.time[here],
+                                            notes=('a',), others={'lap': log.others['lap'][here]}),
                                         {'rate_rad_s': more[here]}) for here in pieces))
     assert read_log(tmp_path / name).others == read_log(tmp_path / f'whole_{name}').others
     opened = gzip.open if name.endswith('.gz') else open

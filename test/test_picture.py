@@ -19,11 +19,15 @@ from gyro_calibration.calibration.turn_error import predicted_rates, SLOWEST, tu
 from gyro_calibration.cli.plots import (
     draw_error_surface,
     draw_headings,
+    draw_motion,
+    draw_reference,
     draw_residuals,
+    draw_run,
     draw_turn_errors,
 )
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR, SINE_RESPONSE
+from gyro_calibration.model.motion import CALIBRATION
 import numpy as np
 import pytest
 
@@ -55,7 +59,8 @@ def without_temperature():
 
 
 def draw_surface(path, fit, dwells=None):
-    draw_error_surface(path, fit.model, fit.model.rate_range, fit.model.temperature_range, dwells)
+    return draw_error_surface(path, fit.model, fit.model.rate_range, fit.model.temperature_range,
+                              dwells)
 
 
 def fitted(fit):
@@ -64,27 +69,43 @@ def fitted(fit):
 
 def draw_turns(path, fit):
     kept = fit.scatter.kept
-    draw_turn_errors(path,
-                     turn_errors(take(fit.dwells, kept), predicted_rates(fit)[kept]), SLOWEST)
+    return draw_turn_errors(
+        path, turn_errors(take(fit.dwells, kept), predicted_rates(fit)[kept]), SLOWEST)
 
 
 def draw_drive(path):
     time = np.linspace(0.0, 10.0, 50)
-    draw_headings(path, time, np.sin(time), {'pure integration': np.sin(time) + 0.01 * time,
-                                             'compensated': np.sin(time) + 0.001 * time})
+    return draw_headings(path, time, np.sin(time), {
+        'pure integration': np.sin(time) + 0.01 * time,
+        'compensated': np.sin(time) + 0.001 * time})
+
+
+def draw_encoder(path):
+    time = np.linspace(0.0, 10.0, 50)
+    return draw_reference(path, time, 3.0 * np.sin(time), 0.01 * time, 1e-4 * np.sin(5.0 * time))
+
+
+def draw_calibration_run(path):
+    time = np.linspace(0.0, CALIBRATION.duration, 1000)
+    rate = 1.03 * CALIBRATION.rate_at(time) + 0.002
+    return draw_run(path, time, rate, (rate - 0.002) / 1.03, CALIBRATION)
 
 
 IN_GREY = {
+    'turns': lambda path: draw_turns(path, warm()),
+    'turns without temperature': lambda path: draw_turns(path, without_temperature()),
+}
+PICTURES = {
+    **IN_GREY,
     'surface': lambda path: draw_surface(path, warm(), fitted(warm())),
     'surface without dwells': lambda path: draw_surface(path, warm()),
     'surface without temperature': lambda path: draw_surface(
         path, without_temperature(), fitted(without_temperature())),
     'residuals': lambda path: draw_residuals(path, warm()),
     'residuals without temperature': lambda path: draw_residuals(path, without_temperature()),
-    'turns': lambda path: draw_turns(path, warm()),
-    'turns without temperature': lambda path: draw_turns(path, without_temperature()),
+    'headings': draw_drive, 'encoder': draw_encoder, 'run': draw_calibration_run,
+    'motion': lambda path: draw_motion(path, CALIBRATION, 1.0),
 }
-PICTURES = {**IN_GREY, 'headings': draw_drive}
 each_picture = pytest.mark.parametrize('draw', PICTURES.values(), ids=PICTURES)
 
 
@@ -98,20 +119,16 @@ def pyplot():
 @pytest.fixture(scope='module')
 def drawn(pyplot, tmp_path_factory):
     """Return a function from one that draws to the figure, as it is on paper, and the file."""
-    found, folder, close = {}, tmp_path_factory.mktemp('pictures'), pyplot.close
+    found, folder = {}, tmp_path_factory.mktemp('pictures')
 
     def drawn(draw):
         if draw not in found:
-            figures, path = [], folder / f'{len(found)}.png'
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(pyplot, 'close', figures.append)
-                draw(path)
-            figures[-1].canvas.draw()  # the boxes below are in its dots, not in those of the file
-            found[draw] = figures[-1], path
+            path = folder / f'{len(found)}.png'
+            figure = draw(path)
+            figure.draw_without_rendering()  # the boxes below are in its dots, not the file's
+            found[draw] = figure, path
         return found[draw]
-    yield drawn
-    for figure, _ in found.values():
-        close(figure)
+    return drawn
 
 
 @pytest.fixture
@@ -161,10 +178,21 @@ def test_no_text_covers_another_or_leaves_the_paper(figure_of, draw):
 
 
 @pytest.mark.parametrize('draw', IN_GREY.values(), ids=IN_GREY)
-def test_pictures_of_rate_tables_have_no_colours(pyplot, drawn, draw):
+def test_pictures_of_turns_have_no_colours(pyplot, drawn, draw):
     image = pyplot.imread(drawn(draw)[1])[..., :3]
     assert np.ptp(image, axis=2).max() < 0.01
     assert image.min() < 0.1 and len(np.unique(image)) > 10
+
+
+@each_picture
+def test_a_line_below_the_picture_says_what_to_see(figure_of, draw):
+    assert figure_of(draw).get_supxlabel().endswith('.')
+
+
+def test_colours_of_values_with_a_sign_are_symmetric_about_zero(figure_of):
+    by_temperature = figure_of(lambda path: draw_residuals(path, warm())).axes[1].collections[0]
+    low, high = by_temperature.get_clim()
+    assert low == -high and by_temperature.get_cmap().name == 'RdBu_r'
 
 
 @each_picture

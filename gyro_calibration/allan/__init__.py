@@ -24,6 +24,11 @@ parts, fitted), `ranking` (of all combinations), `figures` (of the likeliest).
 
 """
 
+from importlib import import_module
+import sys
+from types import ModuleType
+from typing import Any
+
 from gyro_calibration.allan.chart import allan_deviation, AllanChart, averaging_sizes, Floor
 from gyro_calibration.allan.figures import Figure, fit_noise, NoiseFit
 from gyro_calibration.allan.parts import Part, PARTS
@@ -31,3 +36,19 @@ from gyro_calibration.allan.record import even_record, Record
 
 __all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',
            'allan_deviation', 'averaging_sizes', 'even_record', 'fit_noise']
+
+
+class _Folder(ModuleType):
+    """
+    This folder, which can be called as `gyro_calibration.api.allan`.
+
+    Python binds the name of an imported folder in its package, over the public function of the
+    same name. So both can be called, whichever was imported first.
+
+    """
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return import_module('gyro_calibration.api').allan(*arguments, **named)
+
+
+sys.modules[__name__].__class__ = _Folder

@@ -77,13 +77,16 @@ def _allan(given: argparse.Namespace) -> Answer:
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
     if given.picture:
-        draw_allan(given.picture, chart, fit, {
-            symbol: _named(symbol, figure) for symbol, figure in fit.figures.items()
-            if figure.value})
+        draw_allan(given.picture, chart, fit, names(fit))
     if given.out:
         write_model(given.out, replace(with_origin(given, model), noise=fit.noise,
                                        noise_bounds=fit.noise_bounds))
-    return Answer('\n'.join(_lines(given, record, chart, fit)), _data(given, record, chart, fit))
+    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
+    if given.out:
+        written.insert(0, 'The model gets the flicker as its bias instability, '
+                       'for it adds N and K to it.')
+    return Answer('\n'.join([*lines(record, chart, fit), *written]),
+                  _data(given, record, chart, fit))
 
 
 def _check(given: argparse.Namespace) -> None:
@@ -93,18 +96,14 @@ def _check(given: argparse.Namespace) -> None:
                          'say with --out where to write it')
 
 
-def _lines(given: argparse.Namespace, record: Record, chart: AllanChart,
-           fit: NoiseFit) -> list[str]:
+def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
+    """Return what was found, for people."""
     lost = int(np.isnan(record.rate).sum())
-    lines = [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
-             f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks]
-    lines += [_said_of_floor(chart, fit),
-              *(_line(symbol, figure) for symbol, figure in fit.figures.items()),
-              _said_of_fit(fit)]
-    if given.out:
-        lines.append('The model gets the flicker as its bias instability, '
-                     'for it adds N and K to it.')
-    return lines + [f'Written to {each}.' for each in (given.picture, given.out) if each]
+    return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
+            f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks,
+            _said_of_floor(chart, fit),
+            *(_line(symbol, figure) for symbol, figure in fit.figures.items()),
+            _said_of_fit(fit)]
 
 
 def _line(symbol: str, figure: Figure) -> str:
@@ -117,6 +116,12 @@ def _line(symbol: str, figure: Figure) -> str:
     return (f'{name}: {figure.value * factor:.4g} {unit}, '
             f'95 %: {figure.lower * factor:.4g} to {figure.upper * factor:.4g} '
             f'({figure.value:.4g} {figure.part.unit}, {figure.lower:.4g} to {figure.upper:.4g}).')
+
+
+def names(fit: NoiseFit) -> dict[str, str]:
+    """Return what a chart calls the figures that are seen, by symbol."""
+    return {symbol: _named(symbol, figure) for symbol, figure in fit.figures.items()
+            if figure.value}
 
 
 def _named(symbol: str, figure: Figure) -> str:

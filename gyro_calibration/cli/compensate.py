@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 import math
@@ -102,7 +102,7 @@ class _Found:
     lost_samples: int = 0
     longest_gap_s: float = 0.0
 
-    def add(self, piece: _Piece) -> None:
+    def add(self, piece: Piece) -> None:
         log, columns = piece.log, piece.columns
         self.lost_samples, self.longest_gap_s = piece.intervals.lost, piece.intervals.longest
         self.rows += len(log)
@@ -119,7 +119,7 @@ class _Found:
 
 
 @dataclass(frozen=True)
-class _Piece:
+class Piece:
     """A block of a log, its plausible rows, their new columns, and the intervals so far."""
 
     log: Log
@@ -127,22 +127,34 @@ class _Piece:
     columns: dict[str, Array]
     intervals: Intervals
 
+    def rows(self) -> dict[str, Array]:
+        """Return the new columns of all rows; nan where the row is not plausible."""
+        return {name: _at(self.known, values) for name, values in self.columns.items()}
+
 
 def _compensated(given: argparse.Namespace, model: GyroModel,
                  found: _Found) -> Iterator[tuple[Log, dict[str, Array]]]:
     """Give the log block by block with its new columns, and count what is found in it."""
-    pieces = _followed(given, model) if given.rest or given.hindsight else _pieces(given, model)
-    for piece in _on_stamps(pieces) if model.moves_stamps else pieces:
-        _refuse_infinite(given, piece)
+    for piece in _chosen(given, model):
         found.add(piece)
-        yield piece.log, {name: _at(piece.known, values) for name, values in piece.columns.items()}
+        yield piece.log, piece.rows()
     if found.rows == found.rows_without_output:
         raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
     if found.rows == found.rows_without_output + found.refused_samples:
         raise DataRefused(f'{given.log}: {none_plausible(model)}')
 
 
-def _refuse_infinite(given: argparse.Namespace, piece: _Piece) -> None:
+def _chosen(given: argparse.Namespace, model: GyroModel) -> Iterator[Piece]:
+    if given.rest or given.hindsight:
+        log = read(given)
+        return followed(replace(log, output=output_of(given, log)), model, given.hindsight,
+                        given.log)
+    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
+    return pieces((replace(log, output=output_of(given, log)) for log in read_blocks(given)),
+                  model, threshold, given.log)
+
+
+def _refuse_infinite(file: str, piece: Piece) -> None:
     """Refuse a sample for which the model gives no finite rate or heading."""
     for name, values in piece.columns.items():
         # a standard deviation may be unknown, nan
@@ -152,25 +164,32 @@ def _refuse_infinite(given: argparse.Namespace, piece: _Piece) -> None:
             output = float(np.asarray(piece.log.output)[piece.known][row])
             at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
             raise DataRefused(
-                f'{given.log}: {name} is no finite number from an output of {output:g} rad/s{at} '
+                f'{file}: {name} is no finite number from an output of {output:g} rad/s{at} '
                 'on; remove the sample if no gyro says that, or see whether columns, units and '
                 'the model are right')
 
 
-def _pieces(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
-    threshold = Threshold(given.threshold * DEGREE, given.window, model.noise.angle_random_walk)
+def pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
+           name: str) -> Iterator[Piece]:
+    """Give the blocks of a log, each with its rates and, where it has a time, its heading."""
+    found = _pieces(logs, model, threshold)
+    for piece in _on_stamps(found) if model.moves_stamps else found:
+        _refuse_infinite(name, piece)
+        yield piece
+
+
+def _pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold) -> Iterator[Piece]:
     integrator, compensation = (BlockIntegrator(threshold, model.noise, covariance(model)),
                                 LogCompensation(model))
     variance: float | None = None
-    for log in read_blocks(given):
-        log = replace(log, output=output_of(given, log))
+    for log in logs:
         known = plausible(model, log)
         if variance is None:
             # The noise of a rate depends on the interval between samples. All rates have the
             # interval of the first block, since a lost sample makes no gyro less noisy.
             variance = (0.0 if log.time is None
                         else model.noise.rate_variance(_interval(log.time, known)))
-        yield _Piece(
+        yield Piece(
             log, known, _columns(model, compensation, integrator, variance, rows_of(log, known)),
             integrator.intervals)
 
@@ -180,29 +199,34 @@ def _interval(time: Array, known: Mask) -> float:
     return float(np.median(np.diff(time[known] if known.sum() > 1 else time)))
 
 
-def _followed(given: argparse.Namespace, model: GyroModel) -> Iterator[_Piece]:
+def followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Iterator[Piece]:
     """Give the whole log as one piece, followed as the node follows its samples."""
-    log = read(given)
-    log = replace(log, output=output_of(given, log))
+    piece = _followed(log, model, hindsight, name)
+    for each in _on_stamps(iter([piece])) if model.moves_stamps else [piece]:
+        _refuse_infinite(name, each)
+        yield each
+
+
+def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
     known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
-        raise DataRefused(f'{given.log}: rests show in samples over time; '
+        raise DataRefused(f'{name}: rests show in samples over time; '
                           'give a log with time_s, or say --rate')
     if log.temperature is not None and not plausible(model, log).any():
-        raise DataRefused(f'{given.log}: {none_plausible(model)}')
+        raise DataRefused(f'{name}: {none_plausible(model)}')
     rows = rows_of(log, known)
     time, output = LogCompensation(model).true_time(np.asarray(rows.time)), np.asarray(rows.output)
-    estimator, begun = _begun(model, rows, given.hindsight)
+    estimator, begun = _begun(model, rows, hindsight)
     # the state of the wheels
     moving = None if rows.moving is None else [bool(each) for each in rows.moving]
     found = estimator.follow(time, output, begun, rows.temperature, moving, rows.specific_force,
                              rows.supply)
     heading, variance, rate, rate_variance, resting, corrected, clipped, beyond = found.T
-    if given.hindsight:
+    if hindsight:
         if not np.isfinite(found).all():
-            raise DataRefused(f'{given.log}: the variance of the heading is beyond all numbers')
+            raise DataRefused(f'{name}: the variance of the heading is beyond all numbers')
         heading, variance, resting = in_hindsight(estimator.tracker, time, corrected)
-    yield _Piece(log, known, {
+    return Piece(log, known, {
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
         'rate_std_rad_s': np.sqrt(rate_variance), 'resting': resting.astype(float),
         'temperature_clipped': clipped, 'beyond_range': beyond}, estimator.tracker.intervals)
@@ -260,9 +284,9 @@ _TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad
                                    'rate_std_rad_s')
 
 
-def _on_stamps(pieces: Iterator[_Piece]) -> Iterator[_Piece]:
+def _on_stamps(pieces: Iterator[Piece]) -> Iterator[Piece]:
     """Bring columns of moved stamps back to the stamps of the rows; the blocks beside help."""
-    before: _Piece | None = None
+    before: Piece | None = None
     here = next(pieces, None)
     while here is not None:
         after = next(pieces, None)
@@ -272,7 +296,7 @@ def _on_stamps(pieces: Iterator[_Piece]) -> Iterator[_Piece]:
         before, here = here, after
 
 
-def _brought(piece: _Piece, around: list[dict[str, Array]]) -> _Piece:
+def _brought(piece: Piece, around: list[dict[str, Array]]) -> Piece:
     assert piece.log.time is not None
     true = np.concatenate([columns[_TRUE_TIME] for columns in around])
     stamps, columns = piece.log.time[piece.known], {

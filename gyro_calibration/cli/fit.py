@@ -191,7 +191,7 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)
     if given.picture:
-        plots.draw_headings(given.picture, *_headings(log, found))
+        plots.draw_reference(given.picture, *headings(log, found))
     data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
             **model_data(model), **heading_data(found), 'remarks': list(found.remarks)}
     lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',
@@ -203,10 +203,9 @@ def _names(effects: Sequence[Effect] | None) -> set[str]:
     return {effect.name for effect in effects or ()}
 
 
-def _headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, dict[str, Any]]:
-    """Return time, true heading, and the heading before and after, for a picture."""
+def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, str]:
+    """Return what `plots.draw_reference` takes."""
     assert log.reference_heading is not None
     true = log.reference_heading[np.isfinite(log.reference_heading)]
-    true = true - true[0]
-    return found.time, true, {'without calibration': true + found.before.heading,
-                              'calibrated': true + found.after.heading}
+    name = 'course over ground' if found.method == 'course' else 'encoder'
+    return found.time, true - true[0], found.before.heading, found.after.heading, name

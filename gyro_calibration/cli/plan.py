@@ -25,7 +25,8 @@ from gyro_calibration.calibration.motion_design import (
     Plan,
     Prediction,
 )
-from gyro_calibration.cli.verb import Answer, bar, positive, UsageError, verb, whole
+from gyro_calibration.cli.plots import draw_motion
+from gyro_calibration.cli.verb import Answer, bar, picture_file, positive, UsageError, verb, whole
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -60,6 +61,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE',
+                        help='draw the motion, .png or .svg')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='its noise figures; default: those of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
@@ -92,6 +95,8 @@ def _plan(given: argparse.Namespace) -> Answer:
         [each for each in LENGTHS if each > given.seconds], 'more seconds')}
     if given.out:
         write_motion(given.out, plan.motion)
+    if given.picture:
+        draw_motion(given.picture, plan.motion, ability.rate)
     fits = able(ability, CALIBRATION)
     return Answer(_text(given, plan, rows, more, fits), _data(given, plan, rows, more, fits))
 
@@ -172,7 +177,8 @@ def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
         'whatever the calibration.',
         'The bias is known as well as the time allows, whatever the motion: '
         'only more seconds help.']
-    return '\n'.join(lines + ([f'Written to {given.out}.'] if given.out else []))
+    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
+    return '\n'.join(lines + written)
 
 
 def _row(name: str, row: Prediction) -> str:

@@ -8,12 +8,19 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Pictures for people: PNG or SVG, units on the axes, readable in black and white."""
+"""
+Pictures for people: PNG or SVG, units on the axes, readable in black and white.
+
+Each function returns its figure, and writes it where a path is given; the ending of the path,
+.png or .svg, says in which format. The line below a picture says what to see in it.
+
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from gyro_calibration.allan import AllanChart, NoiseFit
@@ -21,29 +28,31 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration
 from gyro_calibration.calibration.turn_error import TurnErrors
 from gyro_calibration.files import replacing
+from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Mask
 from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration.model.motion import Motion
 import numpy as np
 
 _STYLES = ('-', '--', '-.', ':', (0, (5, 1, 1, 1, 1, 1)))
-#: Grey shades from light to dark; neither end vanishes on paper or in ink.
-_GREYS = ('0.78', '0.0')
+#: Of values with a sign, symmetric about zero, and of others; both are read by the colour-blind.
+_DIVERGING, _SEQUENTIAL = 'RdBu_r', 'cividis'
 
 
-def draw_headings(path: str | Path, time: Array, true: Array,
-                  headings: Mapping[str, Array]) -> None:
+def draw_headings(path: str | Path | None, time: Array, true: Array,
+                  headings: Mapping[str, Array]) -> Any:
     """
     Draw headings against the truth, and their errors below (as figure 10 of Hong and Park).
 
     Parameters
     ----------
-    path : the ending says which format, .png or .svg
+    path : of the file; None writes none
     time : s, shape (n,)
     true : rad, shape (n,)
     headings : by name, rad, shape (n,) each
 
     """
-    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), sharex=True, height_ratios=(1, 1.3))
+    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1.3))
     above.plot(time, true / DEGREE, color='black', linewidth=3, alpha=0.3, label='truth')
     for (name, heading), style in zip(headings.items(), _STYLES * len(headings)):
         above.plot(time, heading / DEGREE, linestyle=style, linewidth=1)
@@ -55,11 +64,102 @@ def draw_headings(path: str | Path, time: Array, true: Array,
     below.legend(loc='best')
     for axes in (above, below):
         axes.grid(alpha=0.3)
-    _save(figure, path)
+    return _save(figure, path, 'Below: the flatter a line and the nearer to zero, the better.')
 
 
-def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit,
-               names: Mapping[str, str]) -> None:
+def draw_reference(path: str | Path | None, time: Array, reference: Array, before: Array,
+                   after: Array, name: str = 'encoder') -> Any:
+    """
+    Draw the heading of a reference and that of a gyro, and what lies between them.
+
+    Parameters
+    ----------
+    path : of the file; None writes none
+    time : s, shape (n,)
+    reference : rad, shape (n,)
+    before, after : heading of the gyro less the reference, without calibration and with it, rad,
+        shape (n,)
+    name : of the reference
+
+    """
+    figure, ((above,), (middle,), (below,)) = _panels(3, 1, (9, 9), (1.3, 1, 1))
+    above.plot(time, reference / DEGREE, color='tab:blue', linewidth=3, alpha=0.5, label=name)
+    above.plot(time, (reference + before) / DEGREE, color='black', linewidth=1, linestyle='--',
+               label='gyro, not calibrated')
+    above.set(ylabel='heading [deg]', title=f'Heading by {name} and gyro')
+    above.legend(loc='best')
+    for axes, error, when in ((middle, before, 'not calibrated'), (below, after, 'calibrated')):
+        axes.plot(time, error / DEGREE, color='black', linewidth=1)
+        axes.axhline(0.0, color='black', linewidth=0.5)
+        axes.set(ylabel=f'gyro less {name} [deg]', title=f'Gyro {when}: rms {_rms(error):.3g} deg')
+    below.set_xlabel('time [s]')
+    for axes in (above, middle, below):
+        axes.grid(alpha=0.3)
+    return _save(figure, path, 'Each of the lower panels has its own scale. A slope that is left '
+                 'is bias; a step with each turn is scale factor error.')
+
+
+def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
+             motion: Motion) -> Any:
+    """
+    Draw a run of self-calibration: its motion, and the error of the heading before and after.
+
+    Parameters
+    ----------
+    path : of the file; None writes none
+    time : of the samples, on the clock of the motion, s, shape (n,)
+    rate, corrected : of the gyro before and after the self-calibration, rad/s, shape (n,)
+    motion : that was driven
+
+    """
+    figure, ((above,), (below,)) = _panels(2, 1, (9, 7), (1, 1))
+    above.plot(time, rate / DEGREE, color='0.6', linewidth=0.8, label='gyro')
+    above.plot(time, motion.rate_at(time) / DEGREE, color='black', linewidth=1.5,
+               linestyle='--', label='motion that was to be driven')
+    above.set(ylabel='rate [deg/s]', title='Run of self-calibration')
+    above.legend(loc='best')
+    true = motion.heading_at(time) - motion.heading_at(time[:1])
+    for values, style, name in ((rate, '--', 'before'), (corrected, '-', 'after')):
+        below.plot(time, (integrate(time, values) - true) / DEGREE, color='black',
+                   linestyle=style, label=f'{name} self-calibration')
+    below.axhline(0.0, color='black', linewidth=0.5)
+    below.set(xlabel='time [s]', ylabel='heading error [deg]')
+    below.legend(loc='best')
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+    return _save(figure, path, 'Above: the two must lie on each other in time. Below: after it, '
+                 'what is left is noise, and drawn out it ends near zero.')
+
+
+def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
+    """
+    Draw a motion profile with the rate limit of the robot.
+
+    Parameters
+    ----------
+    path : of the file; None writes none
+    motion : the profile
+    limit : largest rate of the robot, rad/s
+
+    """
+    figure, ((above,), (below,)) = _panels(2, 1, (9, 6.5), (1, 1))
+    time = np.union1d(np.linspace(0.0, motion.duration, 1000), motion.time)
+    above.plot(time, motion.rate_at(time) / DEGREE, color='black')
+    for sign in (-1.0, 1.0):
+        above.axhline(sign * limit / DEGREE, color='black', linestyle=':', linewidth=1,
+                      label='limit of the robot' if sign > 0 else None)
+    above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
+    above.legend(loc='best')
+    below.plot(time, motion.heading_at(time) / DEGREE, color='black')
+    below.set(xlabel='time [s]', ylabel='heading [deg]')
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+    return _save(figure, path, 'Turns both ways part the scale factor error from the bias; rests '
+                 'show the bias alone.')
+
+
+def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
+               names: Mapping[str, str]) -> Any:
     """
     Draw an Allan chart: deviation with confidence, parts of the noise and their sum.
 
@@ -67,7 +167,7 @@ def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit,
 
     Parameters
     ----------
-    path : the ending says which format, .png or .svg
+    path : of the file; None writes none
     chart : Allan deviations
     fit : the noise figures in them
     names : of the parts that are seen, by symbol, such as 'angle random walk N = 2.3 deg/√h'
@@ -93,7 +193,8 @@ def draw_allan(path: str | Path, chart: AllanChart, fit: NoiseFit,
              ylim=(lowest * hour, highest * hour), title='Allan deviation of the gyro at rest')
     axes.grid(which='both', alpha=0.2)
     axes.legend(loc='best')
-    _save(figure, path)
+    return _save(figure, path, 'Slope -1/2: white noise, N at 1 s. Lowest part: bias instability. '
+                 'Slope +1/2: the bias walks.')
 
 
 #: Of the parts of the noise; a dot and dashes of other lengths tell them apart without colour.
@@ -115,15 +216,15 @@ def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
 
 # rate tables
 
-def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[float, float],
+def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tuple[float, float],
                        temperature_range: tuple[float, float],
-                       dwells: Dwells | None = None) -> None:
+                       dwells: Dwells | None = None) -> Any:
     """
     Draw the error that a model removes, over output and temperature (figure 6 of Ojeda et al.).
 
     Parameters
     ----------
-    path : the ending says which format, .png or .svg
+    path : of the file; None writes none
     model : of the gyro
     rate_range : of the output, rad/s
     temperature_range : degC; where it is not finite, a single curve is drawn at the model's
@@ -151,7 +252,8 @@ def draw_error_surface(path: str | Path, model: GyroModel, rate_range: tuple[flo
              title='Error over the output')
     axes.legend(loc='best')
     axes.grid(alpha=0.3)
-    _save(figure, path)
+    return _save(figure, path, 'The error that the model removes; red: the gyro reports too much, '
+                 'blue: too little.' if thermal else 'The error that the model removes.')
 
 
 def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
@@ -159,8 +261,9 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     across, up = np.meshgrid(output, temperature)
     error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
     levels = _levels(error)
-    axes.contourf(across / DEGREE, up, error, levels=levels, cmap='Greys', alpha=0.45,
-                  extend='both')
+    largest = float(np.abs(levels).max())
+    axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING, alpha=0.8,
+                  vmin=-largest, vmax=largest, extend='both')
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
     if dwells is not None and dwells.temperature is not None:
         axes.plot(dwells.output / DEGREE, dwells.temperature, '.', color='0.35', markersize=2)
@@ -189,7 +292,7 @@ def _label_places(levels: Sequence[Sequence[Array]]) -> list[tuple[float, float]
     return places
 
 
-def draw_residuals(path: str | Path, calibration: Calibration) -> None:
+def draw_residuals(path: str | Path | None, calibration: Calibration) -> Any:
     """
     Draw the errors of dwells before and after a model, by rate and by temperature.
 
@@ -197,7 +300,7 @@ def draw_residuals(path: str | Path, calibration: Calibration) -> None:
 
     Parameters
     ----------
-    path : the ending says which format, .png or .svg
+    path : of the file; None writes none
     calibration : with the dwells, what the model leaves of their errors, and which are outlying
 
     """
@@ -213,22 +316,26 @@ def draw_residuals(path: str | Path, calibration: Calibration) -> None:
     for column, (across, label, shade, shade_label) in enumerate(columns):
         for row, (error, name, when, more) in enumerate(rows):
             axes = panels[row, column]
-            dots = _draw_errors(axes, across, error / DEGREE, kept, shade)
+            dots = _draw_errors(axes, across, error / DEGREE, kept, shade,
+                                _DIVERGING if shade is rate else _SEQUENTIAL)
             axes.set(xlabel=label, ylabel=name,
                      title=f'{when}: rms {_rms(error[kept]):.3g} deg/s' + more)
         if shade is not None:
             figure.colorbar(dots, ax=panels[:, column], label=shade_label, location='bottom',
                             aspect=40, shrink=0.9)
-    _save(figure, path)
+    return _save(figure, path, 'Below: dots without a shape and without bands of one colour are '
+                 'noise; a curve or a band is an effect that the model lacks.')
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values ** 2))) / DEGREE
 
 
-def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None) -> Any:
-    """Draw errors as shaded dots, on the scale of those kept; others beyond it at the edge."""
-    dots = _draw_dots(axes, across[kept], error[kept], None if shade is None else shade[kept])
+def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Array | None,
+                 colours: str) -> Any:
+    """Draw errors as coloured dots, on the scale of those kept; others beyond it at the edge."""
+    dots = _draw_dots(axes, across[kept], error[kept], None if shade is None else shade[kept],
+                      colours)
     low, high = float(error[kept].min()), float(error[kept].max())
     margin = 0.12 * (high - low) or 1e-3
     axes.set_ylim(low - margin, high + margin)
@@ -243,7 +350,7 @@ def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Arra
     return dots
 
 
-def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> None:
+def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float) -> Any:
     """
     Draw the errors of full turns with a static bias only and with the model.
 
@@ -251,7 +358,7 @@ def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> No
 
     Parameters
     ----------
-    path : the ending says which format, .png or .svg
+    path : of the file; None writes none
     errors : of turns
     slowest : of the turns, rad/s
 
@@ -272,31 +379,37 @@ def draw_turn_errors(path: str | Path, errors: TurnErrors, slowest: float) -> No
                                                            lambda percents: percents * 3.6))
         percent.set_ylabel('error [% of a turn]')
         axes.grid(alpha=0.3)
-    figure.supxlabel(f'hatched: slower than {slowest / DEGREE:g} deg/s, left out', fontsize=9)
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
-    _save(figure, path)
+    return _save(figure, path, f'Hatched: slower than {slowest / DEGREE:g} deg/s, left out. The '
+                 'two panels have their own scales.')
 
 
-def _panels(rows: int, columns: int, inches: tuple[float, float], **how: Any) -> tuple[Any, Any]:
-    """Return a figure and its panels, shape (rows, columns)."""
-    import matplotlib  # not needed on a robot, and slow to load
-    matplotlib.use('Agg')
-    from matplotlib import pyplot
-    return pyplot.subplots(rows, columns, figsize=inches, layout='constrained', squeeze=False,
-                           **how)
+def _panels(rows: int, columns: int, inches: tuple[float, float],
+            heights: Sequence[float] | None = None) -> tuple[Any, Any]:
+    """Return a figure and its panels, shape (rows, columns); with heights they share the time."""
+    from matplotlib.figure import Figure  # not needed on a robot, and slow to load
+    figure = Figure(figsize=inches, layout='constrained')
+    return figure, figure.subplots(rows, columns, squeeze=False, sharex=heights is not None,
+                                   gridspec_kw={'height_ratios': heights} if heights else None)
 
 
-def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None) -> Any:
-    """Draw dots, each in the shade of grey that a quantity gives it."""
-    from matplotlib.colors import LinearSegmentedColormap
-    shades = {'color': 'black'} if shade is None else {
-        'c': shade, 'cmap': LinearSegmentedColormap.from_list('greys', _GREYS)}
-    return axes.scatter(across, up, s=9, linewidths=0, **shades)
+def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None,
+               colours: str = 'Greys') -> Any:
+    """Draw dots, each in the colour that a quantity gives it; no dot is white."""
+    if shade is None:
+        return axes.scatter(across, up, s=9, linewidths=0, color='black')
+    largest, span = float(np.abs(shade).max()), float(np.ptp(shade))
+    low, high = ((-largest, largest) if colours == _DIVERGING
+                 else (float(shade.min()) - 0.35 * span, float(shade.max())))
+    return axes.scatter(across, up, s=14, linewidths=0.3, edgecolors='0.3', c=shade, cmap=colours,
+                        vmin=low, vmax=high)
 
 
-def _save(figure: Any, path: str | Path) -> None:
-    from matplotlib import pyplot
-    with replacing(path) as file:
-        figure.savefig(file, dpi=110, format=Path(path).suffix[1:])
-    pyplot.close(figure)
+def _save(figure: Any, path: str | Path | None, caption: str) -> Any:
+    # 13 letters of this size go into an inch
+    figure.supxlabel(fill(caption, int(13 * figure.get_figwidth())), fontsize=9)
+    if path is not None:
+        with replacing(path) as file:
+            figure.savefig(file, dpi=110, format=Path(path).suffix[1:])
+    return figure

@@ -30,11 +30,13 @@ from gyro_calibration.calibration.self_calibration import (
     usual_reference,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING, Turns
+from gyro_calibration.cli.plots import draw_run
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
     not_negative,
     output_of,
+    picture_file,
     read,
     time_of,
     UsageError,
@@ -75,6 +77,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
         parser.add_argument(f'--reference-{name}', type=not_negative, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of who drives the profile, {unit}{default}')
+    parser.add_argument('--picture', type=picture_file, metavar='FILE',
+                        help='draw the run, and its heading error before and after, .png or .svg')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
     return parser
@@ -97,6 +101,9 @@ def _self_calibrate(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
         raise UsageError('--turns and --profile were both given; '
                          'the mark or the profile is the reference, not both')
+    if given.turns is not None and given.picture:
+        raise UsageError('--picture draws a run against a profile, which --turns has not; '
+                         'leave one of the two out')
     if given.turns is None and given.marking is not None:
         raise UsageError('--marking is the error of a mark, which only --turns has; '
                          'leave it out, or say how many turns')
@@ -115,11 +122,19 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     rates = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
                          reference=_goodness(given, motion), output=output[run])
+    if given.picture:
+        draw_run(given.picture, time[run] - _late(fit), rates[run],
+                 (rates[run] - fit.bias) / (1.0 + fit.scale_factor_error), motion)
     rest = rest_after(time[known], rates[known], fit, motion)
     check = (None if rest is None
              else check_rest(time[known][rest], rates[known][rest], fit, model.noise))
     return _answer(given, model, log, fit, run, given.method, _figures(fit, check),
                    list(_sentences(fit, check, given.method)))
+
+
+def _late(fit: Fit) -> float:
+    """Return by how much the gyro lags the motion, s; 0 for a method that does not find it."""
+    return 0.0 if math.isnan(fit.time_offset) else fit.time_offset
 
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
@@ -167,7 +182,7 @@ def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, use
                          temperature)
     if given.out:
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
-    written = [f'Written to {given.out}.'] if given.out else []
+    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
     said = ([f'{refused} rows are not used: no such gyro reports that rate or temperature.']
             if refused else [])

@@ -101,9 +101,9 @@ class Log:
 
     Attributes
     ----------
+    time : s, increasing; without it the rows are dwells of a rate table
     output : what the gyro reported, rad/s, counter-clockwise positive
     counts : the same before any scaling, 1
-    time : s, increasing; without it the rows are dwells of a rate table
     temperature : the gyro's own sensor, degC
     reference_rate, reference_heading : rad/s and rad; nan where the reference was lost; the
         heading is continuous
@@ -116,9 +116,9 @@ class Log:
 
     """
 
+    time: Array | None = None
     output: Array | None = None
     counts: Array | None = None
-    time: Array | None = None
     temperature: Array | None = None
     reference_rate: Array | None = None
     reference_heading: Array | None = None
@@ -127,6 +127,13 @@ class Log:
     moving: Array | None = None
     notes: tuple[str, ...] = ()
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Take lists and columns of a DataFrame as well."""
+        for quantity in QUANTITIES:
+            values = getattr(self, quantity)
+            if values is not None:
+                object.__setattr__(self, quantity, np.asarray(values, float))
 
     def __len__(self) -> int:
         first = self.output if self.output is not None else self.counts

@@ -75,10 +75,15 @@ def read_model(path: str | Path) -> GyroModel:
     except (OSError, ValueError) as error:
         raise ModelError(f'{path}: cannot be read as YAML ({reason(error)}); '
                          'restore the file or calibrate again') from error
+    return model_of(content, str(path))
+
+
+def model_of(content: Any, name: str = 'the model') -> GyroModel:
+    """Return the model that a mapping holds, with the keys of a model file."""
     try:
         return _from_content(content)
     except WrongValue as error:
-        raise ModelError(f'{path}: {error} (see docs/explanation/error_model.md)') from None
+        raise ModelError(f'{name}: {error} (see docs/explanation/error_model.md)') from None
 
 
 def _from_content(content: Any) -> GyroModel:

@@ -1,0 +1,509 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The public interface: what the verbs of the command line do, for a script or a notebook.
+
+All quantities are in SI: s, rad, rad/s; temperatures are in degC. Each function takes a `Log` and
+returns a record that prints its answer, as the verb of the same name does. Data that allow no
+answer raise `DataRefused`, files that cannot be read `LogError` or `ModelError`; all of them are
+a `ValueError` whose text says what to do.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from html import escape
+import json
+from pathlib import Path
+from typing import Any
+
+from gyro_calibration.allan import allan_deviation, AllanChart, even_record, fit_noise, NoiseFit
+from gyro_calibration.calibration.dwells import dwells, join
+from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
+from gyro_calibration.calibration.likelihood import Fit as RunFit
+from gyro_calibration.calibration.rate_table import fit_effects
+from gyro_calibration.calibration.selection import select_effects, Selection
+from gyro_calibration.calibration.self_calibration import (
+    record,
+    Reference,
+    usual_reference,
+)
+from gyro_calibration.calibration.self_calibration import (
+    self_calibrate as calibrate_run,
+)
+from gyro_calibration.cli import allan as allan_answer
+from gyro_calibration.cli import fit_answer, plots
+from gyro_calibration.cli.compensate import followed, Piece, pieces
+from gyro_calibration.cli.fit import headings
+from gyro_calibration.diagnosis.extension import calibrated
+from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.report import report
+from gyro_calibration.diagnosis.steps import diagnose as diagnose_logs
+from gyro_calibration.diagnosis.table import diagnose_table
+from gyro_calibration.diagnosis.words import lines, offered
+from gyro_calibration.files import InputError, write_atomically
+from gyro_calibration.heading.integration import integrate, Threshold
+from gyro_calibration.heading.log_compensation import compensate_log, plausible
+from gyro_calibration.logs import log as logs
+from gyro_calibration.logs.log import Array, DEGREE, Log, log_from_table, unwrapped, write_log
+from gyro_calibration.logs.recording import read_recording, Topics
+from gyro_calibration.logs.ros_bag import is_recording
+from gyro_calibration.model import model_file
+from gyro_calibration.model.effects import STEADY
+from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
+from gyro_calibration.model.model_file import model_of, model_text, write_model
+from gyro_calibration.model.motion import (
+    from_headings,
+    from_rates,
+    Motion,
+    NAMED,
+    read_motion,
+)
+from gyro_calibration.model.simulation import simulate as simulate_motion
+import numpy as np
+
+__all__ = ['GyroModel', 'Log', 'allan', 'compensate', 'diagnose', 'fit', 'read_log', 'read_model',
+           'self_calibrate', 'simulate', 'track', 'write_log', 'write_model']
+
+#: A motion by its name or file, as (time, rate) in s and rad/s, or as the reference of a log.
+MotionLike = str | Path | tuple[Any, Any] | Log | Motion
+
+
+class _Answer:
+    """A record that prints itself in words, also in a notebook."""
+
+    def __str__(self) -> str:
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return f'<pre>{escape(str(self))}</pre>'
+
+
+def read_log(source: Any, columns: Mapping[str, str] = {}, *, axis: str = 'z',
+             rate: float | None = None, sensitivity: float | None = None, unwrap: bool = False,
+             topic: str | None = None, reference_topic: str | None = None,
+             temperature_topic: str | None = None) -> Log:
+    """
+    Read a log.
+
+    Parameters
+    ----------
+    source : a file in the log format (.csv, .csv.gz), a ROS 2 recording (folder, .mcap, .db3), or
+        a table: a pandas DataFrame, or a mapping of names to arrays
+    columns : quantity -> name, or name:unit, where columns have names of other programs, such as
+        ``{'time': 't:ms', 'gyro': 'wz:deg/s', 'heading': 'yaw:deg'}``; without a unit SI
+    axis : x, y or z of a gyro with three
+    rate : Hz; the samples of a file came at this rate, whatever it says of time
+    sensitivity : rad/s a count, for files with raw counts
+    unwrap : the reference heading jumps by whole turns; make it continuous
+    topic, reference_topic, temperature_topic : of a recording
+
+    Raises
+    ------
+    ValueError : the source is no log; the text says where and what to do
+
+    """
+    if not isinstance(source, (str, Path)):
+        log = log_from_table(source, columns, axis)
+    elif is_recording(source):
+        log = read_recording(source, Topics(topic, reference_topic, temperature_topic, axis), rate)
+    else:
+        log = logs.read_log(source, sensitivity, rate, columns, axis)
+    if not unwrap or log.reference_heading is None:
+        return log
+    time, output = _in_time(log)
+    return replace(log, reference_heading=unwrapped(time, log.reference_heading, time, output)[0])
+
+
+def read_model(source: str | Path | Mapping[str, Any]) -> GyroModel:
+    """
+    Return the model of a file, or of a mapping with the keys of a model file.
+
+    ``read_model({'effects': {'bias': {'bias': 0.002}}, 'noise': {'angle_random_walk': 7e-4}})``
+    is a gyro with a bias and white noise.
+
+    Raises
+    ------
+    ValueError : missing, damaged, or no model; the text says where
+
+    """
+    return (model_of(dict(source)) if isinstance(source, Mapping)
+            else model_file.read_model(source))
+
+
+def simulate(model: GyroModel, motion: MotionLike = 'robot', *, sample_rate: float = 100.0,
+             seed: int | None = None, temperature: Any = None) -> Log:
+    """
+    Return the log of a simulated gyro, with the true rate and heading as reference.
+
+    Parameters
+    ----------
+    model : effects and noise of the gyro
+    motion : ``calibration`` (20 s), ``robot`` (160 s), ``rest`` (60 s), a profile file, (time,
+        rate) in s and rad/s, or a log whose reference is the motion
+    sample_rate : Hz
+    seed : of the noise; None simulates none
+    temperature : degC, of all samples or of each, shape (n,)
+
+    """
+    generator = None if seed is None else np.random.default_rng(seed)
+    return simulate_motion(model, _motion(motion)[0], sample_rate, generator, temperature)
+
+
+@dataclass(frozen=True)
+class Headings(_Answer):
+    """
+    Rates and heading of a log, corrected by a model; nan where the output was not plausible.
+
+    Attributes
+    ----------
+    log : that was corrected
+    rate, rate_std : rad/s, shape (n,)
+    heading, heading_std : from 0 on, rad, shape (n,); None for a log without time
+    columns : all columns that `gyro_calibration compensate` adds, by name
+
+    """
+
+    log: Log
+    rate: Array
+    rate_std: Array
+    heading: Array | None
+    heading_std: Array | None
+    columns: Mapping[str, Array] = field(repr=False)
+
+    def __str__(self) -> str:
+        if self.heading is None or self.heading_std is None:
+            return f'{len(self.log)} rows corrected.'
+        return (f'{len(self.log)} rows corrected. Heading at the end: '
+                f'{self.heading[-1] / DEGREE:.2f} +- {self.heading_std[-1] / DEGREE:.2f} deg.')
+
+    def write(self, path: str | Path) -> None:
+        """Write the log with the new columns, .csv or .csv.gz."""
+        write_log(path, self.log, self.columns)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the heading, beside the reference where the log has one."""
+        time, output = _in_time(self.log)
+        assert self.heading is not None
+        known = np.isfinite(output) & np.isfinite(self.heading)
+        raw = integrate(time[known], output[known])
+        reference = self.log.reference_heading
+        true = (self.heading[known] if reference is None
+                else reference[known] - reference[np.isfinite(reference)][0])
+        return plots.draw_headings(path, time[known], true, {
+            'as reported': raw, 'corrected': self.heading[known]})
+
+
+def compensate(log: Log, model: GyroModel) -> Headings:
+    """
+    Correct the rates of a log by a model, and integrate them to a heading.
+
+    Raises
+    ------
+    ValueError : no row of the log is plausible
+
+    """
+    return _headings(log, list(pieces([log], model, Threshold(0.0), 'the log')))
+
+
+def track(log: Log, model: GyroModel, *, hindsight: bool = False) -> Headings:
+    """
+    Follow the heading of a log as the node does: at rest it stands, and the bias is estimated.
+
+    Parameters
+    ----------
+    log : with time
+    model : with an angle random walk in its noise, which `allan` finds
+    hindsight : let all that came later count too
+
+    Raises
+    ------
+    ValueError : the log has no time, or no row of it is plausible
+
+    """
+    if not model.noise.angle_random_walk:
+        raise InputError('the model has no angle random walk, by which rests are found; '
+                         'allan finds it in a log at rest')
+    return _headings(log, list(followed(log, model, hindsight, 'the log')))
+
+
+def _headings(log: Log, found: list[Piece]) -> Headings:
+    parts = [piece.rows() for piece in found]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Headings(log, columns['rate_rad_s'], columns['rate_std_rad_s'],
+                    columns.get('heading_rad'), columns.get('heading_std_rad'), columns)
+
+
+@dataclass(frozen=True)
+class Run(_Answer):
+    """
+    A self-calibration.
+
+    Attributes
+    ----------
+    model : the given model with the new self-calibration
+    scale_factor_error, bias : 1 and rad/s
+    scale_factor_error_std, bias_std : 1 and rad/s
+    fit : all that was fitted, with the lag of the gyro and the goodness of the fit
+
+    """
+
+    model: GyroModel
+    scale_factor_error: float
+    bias: float
+    scale_factor_error_std: float
+    bias_std: float
+    fit: RunFit = field(repr=False)
+    _shown: tuple[Array, Array, Motion] = field(repr=False)
+
+    def __str__(self) -> str:
+        text = str(self.model.self_calibration)
+        return f'{text[0].upper()}{text[1:]}.'
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the run and of its heading error before and after."""
+        time, rate, motion = self._shown
+        return plots.draw_run(path, time, rate, (rate - self.bias)
+                              / (1.0 + self.scale_factor_error), motion)
+
+
+def self_calibrate(log: Log, motion: MotionLike | None = None, model: GyroModel | None = None, *,
+                   method: str = 'likelihood') -> Run:
+    """
+    Find scale factor error and bias in about 20 s of known motion.
+
+    Parameters
+    ----------
+    log : of the run, beginning within 1 s of the motion
+    motion : that was driven; None takes the reference of the log
+    model : that corrects first, and whose noise counts
+    method : likelihood, heading or rate
+
+    Raises
+    ------
+    ValueError : the run is refused, with the reason and the remedy
+
+    """
+    model = model or GyroModel()
+    time, _ = _in_time(log)
+    driven, begin = _motion(log if motion is None else motion)
+    time = time - (begin if motion is None else time[0])
+    run = plausible(model, log) & (time >= -1.0) & (time <= driven.duration + 1.0)
+    rate = compensate_log(with_self_calibration(model, None), log)[run]
+    reference = Reference() if motion is None else usual_reference(driven)
+    found = calibrate_run(time[run], rate, driven, method, noise=model.noise, reference=reference,
+                          output=np.asarray(log.output)[run])
+    temperature = None if log.temperature is None else float(log.temperature[run].mean())
+    now = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    calibration = record(found, method, now, temperature)
+    late = found.time_offset if np.isfinite(found.time_offset) else 0.0
+    return Run(with_self_calibration(model, calibration), found.scale_factor_error, found.bias,
+               *calibration.standard_deviations, found, (time[run] - late, rate, driven))
+
+
+@dataclass(frozen=True)
+class Fitted(_Answer):
+    """
+    A calibration by a rate table, a turntable or a reference heading.
+
+    Attributes
+    ----------
+    model : with the fitted effects and their covariance
+    selection : effects, dwells and residuals; None where a reference heading was fitted
+    encoder : the fit of a reference heading; None where dwells were fitted
+
+    """
+
+    model: GyroModel
+    selection: Selection | None = field(default=None, repr=False)
+    encoder: EncoderCalibration | None = field(default=None, repr=False)
+    _log: Log | None = field(default=None, repr=False)
+
+    def __str__(self) -> str:
+        said = list(fit_answer.value_lines(self.model))
+        if self.selection is not None:
+            found = self.selection.calibration
+            said = [*fit_answer.dwell_lines(found), '', *said, '',
+                    *fit_answer.quality_lines(found), *fit_answer.choice_lines(self.selection)]
+        if self.encoder is not None:
+            said += ['', *fit_answer.heading_lines(self.encoder)]
+        return '\n'.join(said)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return a figure of the errors before and after the fit."""
+        if self.selection is not None:
+            return plots.draw_residuals(path, self.selection.calibration)
+        assert self._log is not None and self.encoder is not None
+        return plots.draw_reference(path, *headings(self._log, self.encoder))
+
+
+def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None = None,
+        method: str | None = None) -> Fitted:
+    """
+    Calibrate a gyro by a rate table, a turntable, or any log with a reference.
+
+    Parameters
+    ----------
+    logs : of one gyro
+    effects : names of those to fit; None takes those that the data support
+    technology : open_loop_fog, closed_loop_fog or mems; decides where effects look alike
+    method : dwells, likelihood, course or rate; None takes what the logs hold
+
+    Raises
+    ------
+    ValueError : the logs do not determine the effects, or a name is wrong
+
+    """
+    if unknown := [name for name in effects or () if name not in STEADY]:
+        raise InputError(f'{unknown[0]} is no effect that fit knows; wanted of '
+                         f'{", ".join(STEADY)}')
+    alone = len(logs) == 1 and logs[0].time is not None and logs[0].reference_rate is None
+    if method in (None, 'likelihood', 'course', 'rate') and (
+            method or alone and not set(effects or ()) - {'bias', 'scale_factor_error'}):
+        if len(logs) != 1:
+            raise InputError('a reference heading is fitted in one log; give them one by one')
+        found = calibrate_encoder(logs[0], method, technology=technology or 'mems')
+        return Fitted(_of(found.model, technology), encoder=found, _log=logs[0])
+    table = join([dwells(log, name=str(number) if len(logs) > 1 else '')
+                  for number, log in enumerate(logs)])
+    selection = (Selection(fit_effects(table, [STEADY[name] for name in effects]), (), ())
+                 if effects else select_effects(table, technology))
+    return Fitted(_of(selection.calibration.model, technology), selection)
+
+
+def _of(model: GyroModel, technology: str | None) -> GyroModel:
+    return replace(model, gyro={'technology': technology}) if technology else model
+
+
+@dataclass(frozen=True)
+class NoiseFigures(_Answer):
+    """
+    The noise of a gyro at rest.
+
+    Attributes
+    ----------
+    chart : Allan deviations with their bounds
+    fit : the figures: angle random walk, bias instability, rate random walk, quantization, ramp
+
+    """
+
+    chart: AllanChart
+    fit: NoiseFit
+    _lines: tuple[str, ...] = field(repr=False)
+
+    def __str__(self) -> str:
+        return '\n'.join(self._lines)
+
+    def put_into(self, model: GyroModel) -> GyroModel:
+        """Return a model with these figures as its noise."""
+        return replace(model, noise=self.fit.noise, noise_bounds=self.fit.noise_bounds)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Return the Allan chart."""
+        return plots.draw_allan(path, self.chart, self.fit, allan_answer.names(self.fit))
+
+
+def allan(log: Log) -> NoiseFigures:
+    """
+    Find the noise figures of a gyro in a log at rest, by its Allan deviation.
+
+    Raises
+    ------
+    ValueError : the gyro moved, is dead, or its stamps are uneven
+
+    """
+    time, output = _in_time(log)
+    even = even_record(time, output, log.moving)
+    chart, found = allan_deviation(even.rate, even.interval), fit_noise(even.rate, even.interval)
+    return NoiseFigures(chart, found, tuple(allan_answer.lines(even, chart, found)))
+
+
+@dataclass(frozen=True)
+class Diagnosed(_Answer):
+    """
+    What a simulation with a model gets wrong of a log.
+
+    Attributes
+    ----------
+    model : the extended model; the given one where nothing is offered
+    found : findings, gates, gain and all else, as in diagnosis.json
+
+    """
+
+    model: GyroModel
+    found: Diagnosis = field(repr=False)
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Return the names of the causes, the strongest first."""
+        return tuple(finding.effect for finding in self.found.findings)
+
+    def __str__(self) -> str:
+        return '\n'.join(lines(self.found))
+
+    def write(self, folder: str | Path) -> None:
+        """Write diagnosis.json, report.html and model.yaml into a folder."""
+        answer = json.dumps(self.found.figures(), indent=2, allow_nan=False) + '\n'
+        for name, text in (('diagnosis.json', answer), ('report.html', report(self.found)),
+                           ('model.yaml', model_text(self.model))):
+            write_atomically(Path(folder) / name, text.encode())
+
+
+def diagnose(*logs: Log, model: GyroModel | None = None, seed: int = 0,
+             kind: str | None = None) -> Diagnosed:
+    """
+    Say what a simulation with a model gets wrong of logs, name the causes, extend the model.
+
+    Parameters
+    ----------
+    logs : of one gyro, each with a reference, or at rest; or a single rate table
+    model : of the simulation; None is an ideal gyro with the bias and scale factor error that fit
+    seed : of what is drawn to learn what chance shows
+    kind : of the reference: rate_command, encoder, motion_capture, course, odometry, gyro or rest;
+        None takes what the log shows
+
+    Raises
+    ------
+    ValueError : the logs allow no diagnosis
+
+    """
+    if len(logs) == 1 and logs[0].time is None:
+        found = diagnose_table(logs[0], None if model is None else calibrated(model))
+    else:
+        found = diagnose_logs(logs, np.random.default_rng(seed), model, kind=kind)
+    return Diagnosed(model if model is not None and not offered(found) else found.model, found)
+
+
+def _in_time(log: Log) -> tuple[Array, Array]:
+    if log.time is None or log.output is None:
+        raise InputError('the log has no time or no output, which this needs; '
+                         'Log(time, output) has both')
+    return log.time, log.output
+
+
+def _motion(motion: MotionLike) -> tuple[Motion, float]:
+    """Return a motion, and the time of its beginning in a log, s."""
+    if isinstance(motion, Motion):
+        return motion, 0.0
+    if isinstance(motion, tuple):
+        time, rate = (np.asarray(values, float) for values in motion)
+        return from_rates(time, rate), 0.0
+    if not isinstance(motion, Log):
+        return NAMED.get(str(motion)) or read_motion(motion), 0.0
+    for values, made in ((motion.reference_heading, from_headings),
+                         (motion.reference_rate, from_rates)):
+        if values is not None and motion.time is not None:
+            known = np.isfinite(values)
+            return made(motion.time[known], values[known]), float(motion.time[known][0])
+    raise InputError('the log has no reference over time; give the motion')

@@ -1,0 +1,138 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""The public names: what they give is what the command line gives, and importing them is cheap."""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import gyro_calibration
+from gyro_calibration import (
+    allan,
+    compensate,
+    diagnose,
+    fit,
+    GyroModel,
+    Log,
+    read_log,
+    read_model,
+    self_calibrate,
+    simulate,
+    track,
+    write_log,
+    write_model,
+)
+import numpy as np
+import pytest
+
+ROOT = Path(gyro_calibration.__file__).parents[1]
+GYRO = read_model({'effects': {'bias': {'bias': 0.002}, 'scale_factor_error':
+                               {'scale_factor_error': 0.03}},
+                   'noise': {'angle_random_walk': 3e-4}})
+NOISE = read_model({'effects': {}, 'noise': {'angle_random_walk': 3e-4}})
+
+
+@pytest.fixture(scope='module')
+def run_model():
+    """Return the model of a self-calibration by the built-in motion."""
+    return self_calibrate(simulate(GYRO, 'calibration', seed=1), 'calibration', NOISE)
+
+
+@pytest.mark.parametrize('order', ['import gyro_calibration.allan.chart; {}',
+                                   '{}; import gyro_calibration.allan.chart'])
+def test_allan_is_a_function_and_a_folder_whichever_comes_first(order):
+    program = order.format('from gyro_calibration import allan') + """
+import gyro_calibration, gyro_calibration.allan.chart as chart, numpy
+from gyro_calibration.allan import allan_deviation
+log = gyro_calibration.simulate(gyro_calibration.read_model(
+    {'effects': {}, 'noise': {'angle_random_walk': 1e-3}}), 'rest', seed=1)
+assert str(allan(log)) == str(gyro_calibration.allan(log)) and chart.allan_deviation
+"""
+    subprocess.run([sys.executable, '-c', program], check=True, timeout=120)
+
+
+def test_importing_the_package_imports_neither_numpy_nor_scipy():
+    program = 'import sys, gyro_calibration; assert not {"numpy", "scipy"} & set(sys.modules)'
+    subprocess.run([sys.executable, '-c', program], check=True, timeout=60)
+
+
+def test_no_other_name_is_public():
+    assert gyro_calibration.__all__ == sys.modules['gyro_calibration.api'].__all__
+    with pytest.raises(AttributeError, match='no_such_name'):
+        _ = gyro_calibration.no_such_name
+    assert (Path(gyro_calibration.__file__).parent / 'py.typed').exists()
+
+
+def test_lists_make_a_log_and_files_keep_it(tmp_path):
+    log = Log([0.0, 0.5, 1.0], [0.0, 0.1, 0.2], reference_heading=[0.0, 0.05, 0.1])
+    write_log(tmp_path / 'log.csv', log)
+    again = read_log(tmp_path / 'log.csv')
+    assert again.output.tolist() == [0.0, 0.1, 0.2] and again.reference_heading[-1] == 0.1
+    assert read_log({'t': [0.0, 500.0], 'wz': [0, 180]},
+                    {'time': 't:ms', 'gyro': 'wz:deg/s'}).output[1] == pytest.approx(np.pi)
+
+
+def test_a_model_of_a_mapping_is_that_of_its_file(tmp_path):
+    write_model(tmp_path / 'model.yaml', GYRO)
+    assert read_model(tmp_path / 'model.yaml').terms == GYRO.terms
+    with pytest.raises(ValueError, match='effects'):
+        read_model({'noise': {}})
+
+
+def test_a_run_gives_what_the_command_line_gives(run_model, run, tmp_path):
+    write_log(tmp_path / 'run.csv', simulate(GYRO, 'calibration', seed=1))
+    write_model(tmp_path / 'noise.yaml', NOISE)
+    _, text, _ = run('self-calibrate', tmp_path / 'run.csv', '--model', tmp_path / 'noise.yaml',
+                     '--profile', ROOT / 'config/motion_profile.csv', '--json')
+    said = json.loads(text)
+    assert run_model.scale_factor_error == pytest.approx(said['scale_factor_error'])
+    assert run_model.bias == pytest.approx(said['bias'])
+    assert abs(run_model.scale_factor_error - 0.03) < 4.0 * run_model.scale_factor_error_std
+    assert 'Scale factor error' in run_model._repr_html_()
+
+
+def test_headings_are_those_of_the_command_line(run_model, run, tmp_path):
+    drive = simulate(GYRO, 'robot', sample_rate=20.0, seed=2)
+    write_log(tmp_path / 'drive.csv', drive)
+    write_model(tmp_path / 'model.yaml', run_model.model)
+    for found, words in ((compensate(drive, run_model.model), ()),
+                         (track(drive, run_model.model, hindsight=True), ('--hindsight',))):
+        run('compensate', tmp_path / 'drive.csv', '--model', tmp_path / 'model.yaml',
+            '--out', tmp_path / 'out.csv', *words)
+        wanted = np.array(read_log(tmp_path / 'out.csv').others['heading_rad'], float)
+        assert np.allclose(found.heading, wanted, atol=1e-9)
+        found.write(tmp_path / 'api.csv')
+        assert (tmp_path / 'api.csv').read_text() == (tmp_path / 'out.csv').read_text()
+    with pytest.raises(ValueError, match='angle random walk'):
+        track(drive, GyroModel())
+
+
+def test_every_answer_has_a_picture(run_model, tmp_path):
+    pytest.importorskip('matplotlib', reason='matplotlib is not installed')
+    log = simulate(GYRO, 'robot', sample_rate=20.0, seed=2)
+    table = Log(output=np.linspace(-1.0, 1.02, 41), reference_rate=np.linspace(-1.0, 1.0, 41))
+    for answer in (run_model, compensate(log, run_model.model),
+                   fit(table, effects=['bias', 'scale_factor_error']),
+                   fit(Log(log.time, log.output, reference_heading=log.reference_heading)),
+                   allan(simulate(NOISE, 'rest', seed=1))):
+        figure = answer.plot(tmp_path / 'picture.png')
+        assert figure.get_supxlabel() and (tmp_path / 'picture.png').stat().st_size > 10_000
+        (tmp_path / 'picture.png').unlink()
+
+
+def test_a_diagnosis_names_its_causes_and_writes_its_files(tmp_path):
+    rate = np.tile(np.linspace(-1.0, 1.0, 21), 6)
+    output = rate + 0.02 * rate ** 3 + 1e-4 * np.random.default_rng(1).standard_normal(len(rate))
+    found = diagnose(Log(output=output, reference_rate=rate))
+    assert 'cubic_nonlinearity' in found.causes or found.causes
+    found.write(tmp_path)
+    assert read_model(tmp_path / 'model.yaml').terms == found.model.terms
