@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.likelihood import Fit
+from gyro_calibration.calibration.likelihood import ASYMMETRY, Fit
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
@@ -36,9 +36,6 @@ _CHANCE = 1e-3
 #: Ratios of the variance of errors of window means to what noise of the rate adds from window to
 #: window that are tried.
 _RATIOS = np.geomspace(1e-3, 1e4, 29)
-
-#: Standard deviation of the scale factor error by which the two senses of turning may differ.
-ASYMMETRY = 1e-4
 
 #: A calibration is for a drive of this length, s, that ends so far from where it began, rad.
 DRIVE, TURN = 300.0, 2.0 * math.pi
@@ -168,7 +165,7 @@ def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
     """
     Return the fit with a small difference between both senses of turning in its covariance.
 
-    Such an error grows with the size of the rate. The run takes the part of it that looks like a
+    For measured headings; against a profile the fit holds it. Such an error grows with the size of the rate. The run takes the part of it that looks like a
     rate and a bias for them. In a swing without rests, the mean size of the rate in each sense
     looks like a bias.
 

@@ -23,7 +23,7 @@ would lose it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 
 from gyro_calibration.heading.integration import integrate
@@ -31,7 +31,7 @@ from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded
+from scipy.linalg import cho_solve_banded, cholesky_banded, helmert, solve_banded
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Goodness:
     """
 
     chi_square: float
-    freedom: int
+    freedom: float
     probability: float
     noise_ratio: float
 
@@ -59,7 +59,7 @@ class Goodness:
         told = ('what the noise explains' if self.probability > UNLIKELY else
                 'more than the noise explains: the robot follows the profile less well than the '
                 'gyro measures, or shakes')
-        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with {self.freedom} '
+        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with {self.freedom:.0f} '
                 f'degrees of freedom, probability {self.probability:.2g}; '
                 f'noise {self.noise_ratio:.2f} times what is known)')
 
@@ -109,7 +109,7 @@ class Fit:
     start_heading: float = math.nan
     start_heading_deviation: float = math.nan
     squares: float = math.nan
-    freedom: int = 0
+    freedom: float = 0.0
     goodness: Goodness | None = None
     repeating: float = 0.0
 
@@ -124,8 +124,9 @@ class _Points:
     """
     Where the reference is known: times, s, headings, rad, and variances, shape (n,) each.
 
-    The variances are known up to one factor. An error that several points share has a column of
-    ones and zeros, shape (n, k), and a standard deviation, rad.
+    The variances are known up to one factor. Errors that several points share have columns, shape
+    (n, k), and prior standard deviations, shape (k,), of which parts may hold: `parts`, shape
+    (m, k).
 
     """
 
@@ -133,7 +134,8 @@ class _Points:
     heading: Array
     variance: Array
     shared: Array
-    shared_deviation: float = 0.0
+    shared_deviation: Array = field(default_factory=lambda: np.empty(0))
+    parts: Array = field(default_factory=lambda: np.ones((1, 0)))
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,7 @@ class _Increments:
     columns : reference increments, rad; intervals, s; the change by a time offset, rad/s; by a
         lag, rad/s²; by errors that several points share, rad; shape (n, 4 + k)
     prior, expected : prior standard deviations and means of the values, shape (4 + k,)
+    parts : of the prior standard deviations that may hold, shape (m, 4 + k)
     turned : increments of the gyro's integral, rad, shape (n,)
     walk, neighbours : variance of the increments of a random walk, and covariance of each with the
         one before, s, shape (n,)
@@ -158,6 +161,7 @@ class _Increments:
 
     columns: Array
     prior: Array
+    parts: Array
     expected: Array
     turned: Array
     walk: Array
@@ -186,14 +190,14 @@ _SMOOTH = 0.01
 class _Pairing:
     """A run and a motion, aligned at any time offset and lag."""
 
-    def __init__(self, time: Array, rate: Array, motion: Motion, lag: float):
+    def __init__(self, time: Array, rate: Array, motion: Motion, lag: float, slip: float):
         self._time, self._rate = time, rate
         self._prior = np.array([math.inf, math.inf, DELAY_DEVIATION, lag])
         self._integral = integrate(time, rate)
         self._base = max(float(np.median(np.diff(time))), _SMOOTH)
         self.sampled = motion.rate is None
         self._block = block_length(motion)
-        self._points = _points(motion, self._block)
+        self._points = _points(motion, self._block, slip)
 
     def increments(self, offset: float, lag: float = 0.0) -> _Increments:
         """
@@ -208,7 +212,7 @@ class _Pairing:
         kept = (at >= self._time[0]) & (at <= self._time[-1])
         time, weight = points.time[kept], 1.0 / points.variance[kept]
         if len(time) < 2:
-            return _Increments(np.empty((0, 4)), *np.empty((8, 0)))
+            return _Increments(np.empty((0, 4)), *np.empty((9, 0)))
         begins = np.flatnonzero(np.diff(np.floor((time - time[0]) / self._block + 1e-6),
                                         prepend=-1.0))
         precision = np.add.reduceat(weight, begins)
@@ -217,14 +221,23 @@ class _Pairing:
                                  points.shared[kept]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
-        prior = np.append(self._prior, np.full(points.shared.shape[1], points.shared_deviation))
+        prior = np.append(self._prior, points.shared_deviation)
+        parts = np.insert(points.parts, [0] * 4, 1.0, axis=1)
         expected = np.zeros(len(prior))
         expected[3] = -lag
         walk = _random_walk(time, weight, begins)
         since = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                 [means[0, 4] - known[0, 4]]])
-        return _Increments(columns, prior, expected, np.diff(means[:, 4]), *walk, 1.0 / precision,
+        return _Increments(columns, prior, parts, expected, np.diff(means[:, 4]), *walk, 1.0 / precision,
                            means[:, 1], since)
+
+    def aligned(self, offset: float, lag: float) -> _Increments:
+        """Return the increments, or refuse a run with hardly any."""
+        data = self.increments(offset, lag)
+        if len(data.turned) < 10:
+            raise DataRefused('the samples cover less than ten blocks of the profile: '
+                              'record the whole motion')
+        return data
 
     def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """
@@ -288,11 +301,12 @@ def block_length(motion: Motion) -> float:
     return block / 2.0 ** halvings
 
 
-def _points(motion: Motion, block: float) -> _Points:
+def _points(motion: Motion, block: float, slip: float) -> _Points:
     """Return where a motion is known: at its samples, or for an encoder where it steps."""
     if motion.rate is not None:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
-        return _Points(time, motion.heading_at(time), np.ones(len(time)), np.empty((len(time), 0)))
+        return _Points(time, motion.heading_at(time), np.ones(len(time)),
+                       *following(motion, time, slip))
     step = encoder_step(motion.heading)
     if not step:
         return _Points(motion.time, motion.heading, np.ones(len(motion.time)),
@@ -302,7 +316,66 @@ def _points(motion: Motion, block: float) -> _Points:
     time, heading, variance, shared = (
         np.concatenate([getattr(points, name) for points in (crossings, stands)])[order]
         for name in ('time', 'heading', 'variance', 'shared'))
-    return _Points(time, heading, variance, shared, step / math.sqrt(12.0))
+    return _Points(time, heading, variance, shared, np.full(2, step / math.sqrt(12.0)),
+                   np.ones((1, 2)))
+
+
+#: Standard deviation of the scale factor error by which the two senses of turning may differ.
+ASYMMETRY = 1e-4
+#: Prior standard deviations of what a robot follows one turn differently by than the others:
+#: delay, s, and lag, s².
+TURN_DELAY, TURN_LAG = 0.1, 0.02
+#: Of a longer motion, neighbouring turns are taken together, so that they are at most so many.
+_MOST_TURNS = 12
+#: Parts of the prior standard deviations of delays and lags by turn, and of slips, that may hold.
+_LATE, _SLIPS = np.array([0.001, 0.1, 1.0]), np.array([0.001, 0.03, 0.1, 0.3, 1.0])
+
+
+def following(motion: Motion, time: Array, slip: float) -> tuple[Array, Array, Array]:
+    """
+    Return what gyro and robot may make of a profile otherwise than scale, bias, delay and lag.
+
+    The gyro's scale may differ between the two senses of turning. The robot may follow each turn
+    with its own delay and lag, as one whose acceleration is limited does, and slip in each, and in
+    each end of one.
+
+    Parameters
+    ----------
+    time : s, shape (n,)
+    slip : largest standard deviation of the slip of a turn, as a part of it
+
+    Returns
+    -------
+    columns of headings, rad, shape (n, k), their prior standard deviations, shape (k,), and the
+    parts of these that may hold, shape (m, k)
+
+    """
+    rate, heading = motion.rate_at(time), motion.heading_at(time)
+    sense, acceleration = np.sign(rate), np.gradient(rate, time)
+    turned = np.diff(heading, prepend=heading[:1])[:, None]
+    turn = np.where(sense, np.cumsum((sense != 0.0) & (np.diff(sense, prepend=0.0) != 0.0)), 0)
+    count = min(int(turn.max()), _MOST_TURNS)
+    if count < 2:
+        return np.empty((len(time), 0)), np.empty(0), np.ones((1, 0))
+    inside = (-(-turn * count // turn.max()))[:, None] == np.arange(1, count + 1)
+    # what all turns share is delay, lag and scale
+    apart = helmert(count).T
+    columns = [rate[:, None] * (inside @ apart), acceleration[:, None] * (inside @ apart)]
+    deviations = [np.full(count - 1, TURN_DELAY), np.full(count - 1, TURN_LAG)]
+    late, slips = _LATE, np.ones(1)
+    if slip:
+        ending = inside & (rate * acceleration < 0.0)[:, None]
+        columns += [np.cumsum(turned * part, axis=0) for part in (inside @ apart, ending)]
+        deviations.append(np.full(2 * count - 1, slip))
+        slips = _SLIPS
+    parts = np.hstack([np.repeat(np.tile(late, len(slips))[:, None], 2 * (count - 1), axis=1),
+                       np.repeat(np.repeat(slips, len(late))[:, None],
+                                 (2 * count - 1) * bool(slip), axis=1)])
+    if sense.min() < 0.0 < sense.max():
+        columns.append(np.cumsum(np.abs(turned), axis=0))
+        deviations.append(np.array([ASYMMETRY]))
+        parts = np.append(parts, np.ones((len(parts), 1)), axis=1)
+    return np.hstack(columns), np.concatenate(deviations), parts
 
 
 def _crossings(motion: Motion, step: float) -> _Points:
@@ -429,13 +502,14 @@ class _Covariance:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Values of (1 + s, b, error of the time offset, lag, ...), with covariance and likelihood."""
+    """Values of (1 + s, b, error of the time offset, lag, ...), with their covariance."""
 
+    prior: Array
     values: Array
     covariance: Array
     residual: Array
+    freedom: float
     rate_variance: float
-    log_likelihood: float
     noise: _Covariance
     influence: Array
 
@@ -444,35 +518,92 @@ class _Estimate:
 _RATIOS = np.geomspace(1e-3, 1e5, 25)
 
 
-def _estimate(data: _Increments, noise: _Covariance, instrument: Array) -> _Estimate:
-    """Solve the weighted normal equations, with the restricted likelihood of the noise."""
-    freedom = len(data.turned) - len(data.prior) - 1  # the values, and the ratio of the noises
+def _estimate(data: _Increments, noise: _Covariance, instrument: Array,
+              prior: Array) -> _Estimate:
+    """Solve the weighted normal equations."""
     weighted = noise.solve(instrument)
     matrix, vector = weighted.T @ data.columns, weighted.T @ data.turned
     rate_variance = 0.0
     for _ in range(3):
-        regular = matrix + np.diag(rate_variance / data.prior ** 2)
-        values = np.linalg.lstsq(
-            regular, vector + rate_variance * data.expected / data.prior ** 2, rcond=1e-14)[0]
+        precision = rate_variance / prior ** 2
+        regular = matrix + np.diag(precision)
+        values = np.linalg.lstsq(regular, vector + precision * data.expected, rcond=1e-14)[0]
+        inverse = np.linalg.pinv(regular, rcond=1e-14)
+        # the values that the priors leave open, and the ratio of the noises
+        freedom = len(data.turned) - 1.0 - float(np.trace(inverse @ matrix))
         residual = data.turned - data.columns @ values
-        rate_variance = max(float(residual @ noise.solve(residual)) / freedom, 1e-30)
-    inverse = np.linalg.pinv(regular, rcond=1e-14)
+        rate_variance = max(float(residual @ noise.solve(residual)) / freedom, _least(data))
+    return _Estimate(prior, values, freedom / (freedom - 2.0) * rate_variance * inverse, residual,
+                     freedom, rate_variance, noise, residual[:, None] * (weighted @ inverse[:2].T))
+
+
+@dataclass(frozen=True)
+class _Mixture:
+    """
+    All sizes of the two noises and of the priors, by their likelihood.
+
+    Attributes
+    ----------
+    values, covariance : means of the values, shape (k,), and their covariance, shape (k, k)
+    ratio, prior : of the noises, and prior standard deviations, shape (k,), that are likeliest
+
+    """
+
+    values: Array
+    covariance: Array
+    ratio: float
+    prior: Array
+
+
+def _mixture(data: _Increments, parts: Array) -> _Mixture:
+    """Return the mixture over all ratios of the noises and these parts of the priors, (m, k)."""
+    ratios = _RATIOS * float(np.median(data.walk) / np.median(data.reference))
+    priors, count, known = data.prior * parts, len(data.turned), np.isfinite(data.prior)
+    given = []
+    for ratio in ratios:
+        noise = _Covariance(data, ratio)
+        weighted = noise.solve(data.columns)
+        matrix = weighted.T @ data.columns
+        plain = np.linalg.lstsq(matrix, weighted.T @ data.turned, rcond=1e-14)[0]
+        left = data.turned - data.columns @ plain
+        given.append((matrix, plain, weighted.T @ left, left @ noise.solve(left),
+                      noise.log_determinant))
+    matrix, plain, gradient, squares, determinant = (
+        np.array(each)[:, None] for each in zip(*given))
+    least, freedom = _least(data), count - len(data.prior) - 1.0
+    variance = np.maximum(np.repeat(squares, len(parts), axis=1) / freedom, least)
+    for _ in range(3):
+        precision = variance[..., None] / priors ** 2
+        regular = matrix + precision[..., None] * np.eye(len(data.prior))
+        size = np.sqrt(np.einsum('...ii->...i', regular))
+        scaled = regular / size[..., None] / size[..., None, :] + 1e-14 * np.eye(len(data.prior))
+        inverse = np.linalg.inv(scaled) / size[..., None] / size[..., None, :]
+        change = np.einsum('...ij,...j->...i', inverse,
+                           gradient - precision * (plain - data.expected))
+        freedom = count - 1.0 - np.einsum('...ij,...ji->...', inverse, matrix)
+        left = squares + np.einsum('...i,...i->...', change, np.einsum(
+            '...ij,...j->...i', matrix, change) - 2.0 * gradient)
+        variance = np.maximum(left / freedom, least)
+    values = plain + change
+    logarithms = -0.5 * (
+        (count - len(data.prior) - 1.0) * np.log(variance) + freedom + determinant
+        + (((values - data.expected) / priors)[..., known] ** 2
+           + 2.0 * np.log(priors[:, known])).sum(axis=-1)
+        + np.linalg.slogdet(scaled)[1] + 2.0 * np.log(size).sum(axis=-1)).ravel()
+    weights = np.exp(logarithms - logarithms.max())
+    weights /= weights.sum()
     # the variance is estimated too, so the values have Student's distribution, which is wider
-    covariance = freedom / (freedom - 2) * rate_variance * inverse
-    log_determinants = noise.log_determinant + np.linalg.slogdet(regular)[1]
-    return _Estimate(values, covariance, residual, rate_variance,
-                     -0.5 * (freedom * math.log(rate_variance) + log_determinants), noise,
-                     residual[:, None] * (weighted @ inverse[:2].T))
+    within = np.einsum('g,gij->ij', weights * (variance * freedom / (freedom - 2.0)).ravel(),
+                       inverse.reshape(-1, *inverse.shape[2:]))
+    values = values.reshape(len(weights), -1)
+    ratio, part = divmod(int(weights.argmax()), len(parts))
+    return _Mixture(weights @ values, within + np.cov(values.T, aweights=weights, ddof=0),
+                    float(ratios[ratio]), priors[part])
 
 
-def _estimates(data: _Increments) -> tuple[list[_Estimate], Array]:
-    """Return the estimates for every ratio of the two noises, and weights with the sum 1."""
-    unit = float(np.median(data.walk) / np.median(data.reference))
-    estimates = [_estimate(data, _Covariance(data, unit * ratio), data.columns)
-                 for ratio in _RATIOS]
-    log_likelihoods = np.array([estimate.log_likelihood for estimate in estimates])
-    weights = np.exp(log_likelihoods - log_likelihoods.max())
-    return estimates, weights / weights.sum()
+def _least(data: _Increments) -> float:
+    """Return the least variance of the noise that rounding lets be seen."""
+    return 1e-18 * float(np.mean(data.turned ** 2 / data.walk))
 
 
 def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
@@ -481,7 +612,7 @@ def _errors_in_variables(data: _Increments, estimate: _Estimate) -> _Estimate:
         instrument = data.columns.copy()
         instrument[:, 0] += (estimate.noise.reference_error(estimate.residual)
                              / _away_from_zero(estimate.values[0]))
-        estimate = _estimate(data, estimate.noise, instrument)
+        estimate = _estimate(data, estimate.noise, instrument, estimate.prior)
     return estimate
 
 
@@ -491,7 +622,7 @@ def _away_from_zero(scale: float) -> float:
 
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
-                   lag: float = LAG_DEVIATION) -> Fit:
+                   lag: float = LAG_DEVIATION, slip: float = 0.0) -> Fit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -504,7 +635,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     A robot follows its profile late and smoothly, so delay and lag are fitted too: without them, a
     first-order lag of 0.2 s causes 0.9 % of scale factor error. The lag is of first order against
     a profile of rates, which a robot only follows; against headings, which were measured on the
-    robot itself, it is small and taken to second order.
+    robot itself, it is small and taken to second order. What else a profile leaves open
+    (`following`) is fitted within its priors, and so is a stretch with a turn of its own, as far
+    as it is probable.
 
     Parameters
     ----------
@@ -513,53 +646,71 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     motion : what the gyro was put through
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
     lag : prior standard deviation of the lag, s²; a sine does not separate it from the scale
+    slip : largest standard deviation of the slip of each turn of a profile, as a part of it
 
     Raises
     ------
     DataRefused : gyro and motion hardly overlap
 
     """
-    pairing = _Pairing(time, rate, motion, lag)
+    pairing = _Pairing(time, rate, motion, lag, slip)
     offset, found_lag = pairing.coarse_offset(
         largest_time_offset + (0.0 if pairing.sampled else FOLLOWING)), 0.0
-    for _ in range(8):
-        data = pairing.increments(offset, found_lag)
-        if len(data.turned) < 10:
-            raise DataRefused('the samples cover less than ten blocks of the profile: '
-                              'record the whole motion')
-        estimates, weights = _estimates(data)
-        estimate = estimates[weights.argmax()]
-        if pairing.sampled:
-            estimate = _errors_in_variables(data, estimate)
-        late = float(np.clip(estimate.values[2], -0.02, 0.02))
-        lagging = 0.0 if pairing.sampled else max(float(estimate.values[3]), -found_lag)
-        if abs(late) < 1e-9 and abs(lagging) < 1e-9:
+    data = pairing.aligned(offset, found_lag)
+    for parts in (data.parts[:1], data.parts, data.parts):
+        before = offset
+        mixture = _mixture(data, parts)
+        estimate = _estimate(data, _Covariance(data, mixture.ratio), data.columns, mixture.prior)
+        for _ in range(8):
+            if pairing.sampled:
+                estimate = _errors_in_variables(data, estimate)
+            late = float(np.clip(estimate.values[2], -0.02, 0.02))
+            lagging = 0.0 if pairing.sampled else max(float(estimate.values[3]), -found_lag)
+            if abs(late) < 1e-9 and abs(lagging) < 1e-9:
+                break
+            offset, found_lag = offset - late, found_lag + lagging
+            data = pairing.aligned(offset, found_lag)
+            estimate = _estimate(data, _Covariance(data, estimate.noise.ratio), data.columns,
+                                 estimate.prior)
+        if len(parts) == len(data.parts) and abs(offset - before) < _ALIGNED:
             break
-        offset, found_lag = offset - late, found_lag + lagging
-    covariance = np.tensordot(weights, [each.covariance for each in estimates], 1) + np.cov(
-        np.array([each.values for each in estimates]).T, aweights=weights, ddof=0)
-    scale, bias = estimate.values[:2]
-    residual, stretch = _worst_stretch(estimate.noise, data, pairing.sampled)
-    return Fit(float(scale) - 1.0, float(bias), covariance[:2, :2], offset,
-               math.sqrt(estimate.rate_variance),
+    values, late = estimate.values[:2], math.sqrt(mixture.covariance[2, 2])
+    covariance = mixture.covariance[:2, :2]
+    found, edges, inside, chance = _unlikeliest(estimate, data)
+    if pairing.sampled:
+        # noise that comes with turning alone, such as slip of wheels, exceeds its robust size
+        chance = max(chance, math.sqrt(max(found.left, 0.0) / (len(inside) - 4.0)))
+    else:
+        values = mixture.values[:2]
+        part, others, covered = _of_stretch(estimate, data, found, inside, chance)
+        apart = others - values
+        covariance = ((1.0 - part) * covariance + part * covered
+                      + part * (1.0 - part) * np.outer(apart, apart))
+        values = values + part * apart
+    scale, bias = values.tolist()
+    begin, end = data.time[edges[[found.first, found.last]]].tolist()
+    return Fit(scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance),
                math.sqrt(estimate.rate_variance * estimate.noise.ratio)
-               / abs(_away_from_zero(scale)), residual, math.sqrt(covariance[2, 2]),
-               np.column_stack([estimate.influence, data.time[1:]]), stretch,
+               / abs(_away_from_zero(estimate.values[0])),
+               (abs(found.rate) * float(inside.sum()), math.sqrt(found.gain) / chance), late,
+               np.column_stack([estimate.influence, data.time[1:]]),
+               (begin, end),
                *(_start_heading(data, estimate) if pairing.sampled else (math.nan, math.nan)),
                *_squares(data, estimate, pairing.sampled))
 
 
+#: The noise is found again where the offset moved by more than this, s.
+_ALIGNED = 1e-3
 #: A robot that follows its profile with a lag is later than at its start by up to this, s.
 FOLLOWING = 0.25
 
 
-def _squares(data: _Increments, estimate: _Estimate, sampled: bool) -> tuple[float, int]:
+def _squares(data: _Increments, estimate: _Estimate, sampled: bool) -> tuple[float, float]:
     """Return weighted sum of squares and degrees of freedom; a profile itself has no noise."""
     if not sampled:
-        estimate = _estimate(data, _Covariance(data, 0.0), data.columns)
-    used = len(data.prior) + sampled  # the ratio of the noises is found too
+        estimate = _estimate(data, _Covariance(data, 0.0), data.columns, estimate.prior)
     return (float(estimate.residual @ estimate.noise.solve(estimate.residual)),
-            len(data.turned) - used)
+            estimate.freedom + (not sampled))  # the ratio of the noises is not found
 
 
 def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float]:
@@ -585,39 +736,90 @@ def _start_heading(data: _Increments, estimate: _Estimate) -> tuple[float, float
     return float(start), math.sqrt(variance) / abs(scale)
 
 
-def _worst_stretch(noise: _Covariance, data: _Increments,
-                   sampled: bool) -> tuple[tuple[float, float], tuple[float, float]]:
+@dataclass(frozen=True)
+class Stretch:
     """
-    Return excess turn of the unlikeliest stretch, rad, its standard deviations, and its times, s.
+    The stretch of a run that improves a fit most by a turn of its own.
+
+    Attributes
+    ----------
+    first, last : edges that it begins and ends at
+    rate : its excess rate, rad/s
+    gain, left : squares that it takes away, and that it leaves
+    gains, squares : squares that each stretch takes away, and of its column without the part that
+        the fit explains, for all stretches that the fit leaves open, shape (m,)
+
+    """
+
+    first: int
+    last: int
+    rate: float
+    gain: float
+    left: float
+    gains: Array
+    squares: Array
+
+    def odds(self, freedom: float, rate: float, chance: float) -> float:
+        """
+        Return the mean odds of all stretches, each against none.
+
+        Parameters
+        ----------
+        freedom : degrees of freedom that a stretch leaves
+        rate : standard deviation of the excess rates that are expected, rad/s
+        chance : of the white noise
+
+        """
+        none = max(self.left + self.gain, 1e-300)
+        odds = -0.5 * (freedom * np.log1p(-np.minimum(self.gains / none, 1.0 - 1e-15))
+                       + np.log1p(self.squares * (rate / chance) ** 2))
+        return float(np.exp(np.minimum(odds, 100.0)).sum()) / max(len(odds), 1)
+
+
+#: A turn that the profile does not have, by hand or by a slip at one place: standard deviation of
+#: its rate, rad/s, and its odds before the run is seen.
+_TURNED, _ODDS = 0.0175, 0.1
+#: Largest number of places of a run at which a stretch begins or ends.
+_EDGES = 150
+
+
+def _unlikeliest(estimate: _Estimate, data: _Increments) -> tuple[
+        Stretch, NDArray[np.intp], Array, float]:
+    """
+    Return the unlikeliest stretch, the edges, its increments at 1 rad/s, s, and what is chance.
 
     The values are fitted together with the excess turn of each stretch, so that a slip does not
     hide itself, and the size of chance is taken from a robust fit.
 
     """
-    robust = noise.whiten(robust_residual(data.columns[:, :4], data.turned, 20))
+    noise, interval = estimate.noise, data.columns[:, 1]
+    shared = data.columns[:, 4:] @ estimate.values[4:]
+    robust = noise.whiten(robust_residual(data.columns[:, :4], data.turned - shared, 20))
     chance = max(float(np.median(np.abs(robust))) / 0.6745
                  * math.sqrt(len(robust) / (len(robust) - 4.0)), 1e-15)
-    edges = np.unique(np.linspace(0, len(robust), min(len(robust), _EDGES) + 1).astype(int))
-    interval = data.columns[:, 1]
+    edges = np.unique(np.linspace(0, len(robust), min(len(robust), _EDGES) + 1).astype(np.intp))
     steps = np.where(np.arange(len(robust))[:, None] >= edges, interval[:, None], 0.0)
-    first, last, rate, squares, left = unlikeliest(
-        noise.whiten(data.columns), noise.whiten(steps), noise.whiten(data.turned))
-    if sampled:
-        # noise that comes with turning alone, such as slip of wheels, exceeds its robust size
-        chance = max(chance, math.sqrt(max(left, 0.0) / (len(robust) - 4.0)))
-    begin, end = edges[first], edges[last]
-    turned = abs(rate) * float(interval[begin:end].sum())
-    return (turned, math.sqrt(squares) / chance), (float(data.time[begin]), float(data.time[end]))
+    prior = chance / estimate.prior
+    found = unlikeliest(np.vstack([noise.whiten(data.columns), np.diag(prior)]),
+                        np.vstack([noise.whiten(steps), np.zeros((len(prior), len(edges)))]),
+                        np.append(noise.whiten(data.turned), prior * data.expected))
+    return found, edges, steps[:, found.first] - steps[:, found.last], chance
 
 
-#: Largest number of places of a run at which a stretch begins or ends.
-_EDGES = 150
+def _of_stretch(estimate: _Estimate, data: _Increments, found: Stretch,
+                inside: Array, chance: float) -> tuple[float, Array, Array]:
+    """Return the probability of a stretch with a turn of its own, and (1 + s, b) with it."""
+    odds = _ODDS * found.odds(estimate.freedom - 1.0, _TURNED, chance)
+    widened = replace(data, columns=np.insert(data.columns, 4, inside, axis=1),
+                      expected=np.insert(data.expected, 4, 0.0))
+    other = _estimate(widened, estimate.noise, widened.columns,
+                      np.insert(estimate.prior, 4, _TURNED))
+    return odds / (1.0 + odds), other.values[:2], other.covariance[:2, :2]
 
 
-def unlikeliest(columns: Array, steps: Array,
-                turned: Array) -> tuple[int, int, float, float, float]:
+def unlikeliest(columns: Array, steps: Array, turned: Array) -> Stretch:
     """
-    Return the stretch that improves a fit most, its excess rate, rad/s, and the gain in squares.
+    Return the stretch that improves a fit most.
 
     Parameters
     ----------
@@ -625,10 +827,6 @@ def unlikeliest(columns: Array, steps: Array,
     steps : the addition of a turn of 1 rad/s from each edge on, white, shape (n, m); the last edge
         is the end
     turned : what is fitted, white, shape (n,)
-
-    Returns
-    -------
-    from which edge, to which edge, rate, squares, and the squares that are left then
 
     """
     left, singular, _ = np.linalg.svd(
@@ -643,10 +841,11 @@ def unlikeliest(columns: Array, steps: Array,
     told = np.triu(norms > _APART * wholes, 1)
     gains = np.where(told, differences ** 2 / np.where(told, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
-    rate, gain = (float(differences[first, last] / max(norms[first, last], 1e-300)),
-                  float(gains[first, last]))
-    return (int(first), int(last), rate, gain,
-            float(turned @ turned - np.sum((left.T @ turned) ** 2)) - gain)
+    gain = float(gains[first, last])
+    return Stretch(int(first), int(last),
+                   float(differences[first, last] / max(norms[first, last], 1e-300)), gain,
+                   float(turned @ turned - np.sum((left.T @ turned) ** 2)) - gain,
+                   gains[told], norms[told])
 
 
 #: Part of a stretch that the columns of a fit must leave, so that the two are distinguishable;

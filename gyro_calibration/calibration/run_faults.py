@@ -275,11 +275,11 @@ def _slip(run: Pieces, motion: Motion, largest: float) -> Tried:
     whole = np.sum((run.turned - run.turned.mean()) ** 2)
     for offset in _offsets(largest):
         reference = run.headings(motion, offset)
-        first, last, rate, squares, _ = unlikeliest(
+        found = unlikeliest(
             np.column_stack([reference, np.full(len(reference), interval)]), steps, run.turned)
-        left = run.left(reference)[0] - squares / max(float(whole), 1e-300)
-        yield left, (rate * float(edges[last] - edges[first]) * interval,
-                     float(run.edges[edges[first]]))
+        left = run.left(reference)[0] - found.gain / max(float(whole), 1e-300)
+        yield left, (found.rate * float(edges[found.last] - edges[found.first]) * interval,
+                     float(run.edges[edges[found.first]]))
 
 
 _WAYS: dict[str, Callable[[Pieces, Motion, float], Tried]] = {

@@ -215,7 +215,7 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     run = pieces(time, rate)
     _refuse_run(run, motion, limits)
     if method == 'likelihood':
-        fit = _fit_likelihood(time, rate, motion, limits.time_offset)
+        fit = _fit_likelihood(time, rate, motion, limits.time_offset, reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
     fit = replace(fit, covariance=fit.covariance + _shared(fit, reference, noise),
@@ -224,14 +224,16 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     return fit
 
 
-def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float) -> Fit:
+def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
+                    slip: float) -> Fit:
     """Fit on the stamps, or on an even grid if that leaves less, and check for slow errors."""
     even = even_times(time)
     jitters = float(np.abs(even - time).max()) > 1e-3 * float(np.median(np.diff(time)))
-    fits = [(fit_likelihood(stamps, rate, motion, largest_time_offset), stamps)
+    fits = [(fit_likelihood(stamps, rate, motion, largest_time_offset, slip=slip), stamps)
             for stamps in ([time, even] if jitters else [time])]
     fit, stamps = min(fits, key=lambda found: np.linalg.det(found[0].covariance))
-    return allow_asymmetry(look_slower(fit, stamps, rate, motion), rate)
+    return fit if motion.rate is not None else allow_asymmetry(
+        look_slower(fit, stamps, rate, motion), rate)
 
 
 def _shared(fit: Fit, reference: Reference, noise: Noise | None) -> Array:
