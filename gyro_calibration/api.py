@@ -46,11 +46,11 @@ from gyro_calibration.cli import allan as allan_answer
 from gyro_calibration.cli import fit_answer, plots
 from gyro_calibration.cli.compensate import followed, Piece, pieces
 from gyro_calibration.cli.fit import headings
-from gyro_calibration.diagnosis.extension import calibrated
-from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.extended_model import calibrated
+from gyro_calibration.diagnosis.findings import Diagnosis
+from gyro_calibration.diagnosis.pipeline import diagnose as diagnose_logs
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose as diagnose_logs
-from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import InputError, write_atomically
 from gyro_calibration.heading.integration import integrate, Threshold

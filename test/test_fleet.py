@@ -125,7 +125,8 @@ def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
     lost = found.pop(KILLS)
     assert isinstance(lost, Lost) and 'killed' in str(lost)
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
-    assert found == {number: number for number in range(10) if number not in (KILLS, TAKES_ALL_MEMORY)}
+    assert found == {number: number for number in range(10)
+                     if number not in (KILLS, TAKES_ALL_MEMORY)}
 
 
 # the verb

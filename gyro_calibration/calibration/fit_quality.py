@@ -165,9 +165,9 @@ def allow_asymmetry(fit: Fit, rate: Array) -> Fit:
     """
     Return the fit with a small difference between both senses of turning in its covariance.
 
-    For measured headings; against a profile the fit holds it. Such an error grows with the size of the rate. The run takes the part of it that looks like a
-    rate and a bias for them. In a swing without rests, the mean size of the rate in each sense
-    looks like a bias.
+    For measured headings; against a profile the fit holds it. Such an error grows with the size of
+    the rate. The run takes the part of it that looks like a rate and a bias for them. In a swing
+    without rests, the mean size of the rate in each sense looks like a bias.
 
     """
     columns = np.column_stack([rate, np.ones(len(rate))])

@@ -59,8 +59,8 @@ class Goodness:
         told = ('what the noise explains' if self.probability > UNLIKELY else
                 'more than the noise explains: the robot follows the profile less well than the '
                 'gyro measures, or shakes')
-        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with {self.freedom:.0f} '
-                f'degrees of freedom, probability {self.probability:.2g}; '
+        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with '
+                f'{self.freedom:.0f} degrees of freedom, probability {self.probability:.2g}; '
                 f'noise {self.noise_ratio:.2f} times what is known)')
 
 
@@ -228,8 +228,8 @@ class _Pairing:
         walk = _random_walk(time, weight, begins)
         since = np.concatenate([[means[0, 0], means[0, 1] - time[0]], means[0, 5:],
                                 [means[0, 4] - known[0, 4]]])
-        return _Increments(columns, prior, parts, expected, np.diff(means[:, 4]), *walk, 1.0 / precision,
-                           means[:, 1], since)
+        return _Increments(columns, prior, parts, expected, np.diff(means[:, 4]), *walk,
+                           1.0 / precision, means[:, 1], since)
 
     def aligned(self, offset: float, lag: float) -> _Increments:
         """Return the increments, or refuse a run with hardly any."""

@@ -23,7 +23,7 @@ import math
 from typing import Any
 
 from gyro_calibration.calibration.noise_grid import BandedNoise, heading_noise, noise_grid, wander
-from gyro_calibration.diagnosis.compared import bridged
+from gyro_calibration.diagnosis.expected_output import bridged
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, Log
 import numpy as np

@@ -25,11 +25,11 @@ from gyro_calibration import __version__
 from gyro_calibration.calibration.dwells import dwells
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.selection import select_effects
-from gyro_calibration.diagnosis.door import rests
-from gyro_calibration.diagnosis.finding import Diagnosis
+from gyro_calibration.diagnosis.findings import Diagnosis
+from gyro_calibration.diagnosis.input_validation import rests
+from gyro_calibration.diagnosis.pipeline import diagnose
+from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.steps import diagnose
-from gyro_calibration.diagnosis.table import diagnose_table
 from gyro_calibration.files import InputError, opened, plain, reason, write_atomically
 from gyro_calibration.fleet.slow_effects import rest_bias, slow_effects
 from gyro_calibration.fleet.table import described, Entry
