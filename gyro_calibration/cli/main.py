@@ -27,6 +27,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 # ruff: noqa: E402
 from gyro_calibration import __version__
 from gyro_calibration.cli import VERBS
+from gyro_calibration.cli.catalogue import load_effects
 from gyro_calibration.cli.verb import Answer, say, UsageError
 from gyro_calibration.files import explained, InputError, plain, reason
 from gyro_calibration.logs.log import DataRefused
@@ -40,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     try:
         _refuse_empty(given)
+        for path in given.catalogue:
+            load_effects(path)
         answer = given.verb(given)
         text = None if answer is None else _text(answer, given.json)
     except DataRefused as error:
@@ -104,6 +107,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
     for verb in VERBS:
-        verb.add(verbs).add_argument('--json', action='store_true',
-                                     help='print one JSON object and nothing else')
+        of_verb = verb.add(verbs)
+        of_verb.add_argument('--json', action='store_true',
+                             help='print one JSON object and nothing else')
+        of_verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
+                             help='Python file of your own, which is run, with EFFECTS, a list of '
+                             'effects that models and diagnoses then know')
     return parser

@@ -119,7 +119,11 @@ def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
     unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
             else CAUSES[name].units.get(name, '1'))
     parameters = {}
-    if len(coefficients) == 2 and name != 'reference_slip':
+    own = () if effect is None else effect.coefficients
+    if len(own) > 1 and [each.name for each in own] != ['sine', 'cosine']:
+        parameters = {each.name: _estimate(value, each.unit)
+                      for each, value in zip(own, coefficients)}
+    elif len(coefficients) == 2 and name != 'reference_slip':
         parameters = _as_phase(found, place, name, coefficients, unit)
     elif coefficients:
         parameters = {name: _estimate(coefficients[0], unit)}

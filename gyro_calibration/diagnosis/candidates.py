@@ -12,13 +12,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 import math
 
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.logs.log import Array
-from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.effects import ADDED, CATALOGUE
 import numpy as np
 
 #: A dead zone is looked for where an encoder makes so many steps a second or more.
@@ -139,8 +140,18 @@ def candidates(replays: Sequence[Replay]) -> list[Candidate]:
     has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
     found = [*_of_time(replays), *(_of_temperature(replays) if 'temperature' in has else []),
-             *_of_surroundings(has)]
+             *_of_surroundings(has),
+             *(effect(name, *shapes) for name, shapes in added_effects(has, moves))]
     return [*found, *(_of_rate(replays, has) if moves else [])]
+
+
+def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Give the effects of the user's own that logs can show, with the shapes to begin with."""
+    for name, own in ADDED.items():
+        turned = own.looks_at & {'rate', 'output', 'heading'}
+        if own.looks_at & LEAST_CHANGE.keys() <= set(has) and (moves or not turned):
+            yield from ((name, shapes) for shapes in product(*(
+                shape.begin_with or (shape.default or 0.0,) for shape in own.shapes)))
 
 
 def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:

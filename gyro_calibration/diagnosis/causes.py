@@ -18,10 +18,10 @@ what would tell the two apart.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.effects import CATALOGUE, Effect
 
 #: Either of these serves as a reference.
 REFERENCES = ('reference_rate', 'reference_heading')
@@ -174,6 +174,13 @@ _OTHERS = (
            separate_by='record at rest for hours, and again: a walk does not repeat'),
 )
 
-CAUSES: Mapping[str, Cause] = {
+CAUSES: dict[str, Cause] = {
     **{name: _of_an_effect(name, likeness) for name, likeness in _OF_THE_GYRO.items()},
     **{cause.name: cause for cause in _OTHERS}}
+
+
+def add_causes(effects: Iterable[Effect]) -> None:
+    """Add effects of one's own, which are in the catalogue, to what a diagnosis looks for."""
+    for effect in effects:
+        CAUSES[effect.name] = _of_an_effect(
+            effect.name, _Likeness(effect.along, separate_by=effect.shown_by))

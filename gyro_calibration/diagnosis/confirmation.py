@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.diagnosis.build_findings import LEAST_CHANCE
+from gyro_calibration.diagnosis.candidates import added_effects, LEAST_CHANGE
 from gyro_calibration.diagnosis.spans import (
     Column,
     FEWEST_STRETCHES,
@@ -113,6 +114,9 @@ def candidates(done: SpanFit) -> Iterator[Column]:
         yield Column('vibration_rectification', (1.0,))
     if log.supply is not None and np.ptp(log.supply) > 0.0:
         yield Column('supply_sensitivity', (5.0,))
+    has = [name for name in LEAST_CHANGE if getattr(log, name) is not None]
+    for name, shapes in added_effects(has, moves=True):
+        yield Column(name, shapes)
 
 
 def search(done: SpanFit, level: float) -> tuple[SpanFit, list[Confirmed]]:

@@ -164,8 +164,8 @@ def _term(name: str, values: Any) -> Term:
     if name == POLYNOMIAL:
         return _polynomial(place, given)
     if name not in CATALOGUE:
-        raise WrongValue(place, given, 'an effect that this version knows: '
-                         f'{", ".join([*CATALOGUE, POLYNOMIAL])}')
+        raise WrongValue(place, given, 'an effect that this version knows, or one of your own '
+                         f'(--catalogue): {", ".join([*CATALOGUE, POLYNOMIAL])}')
     return Term(CATALOGUE[name], _values(place, CATALOGUE[name], given))
 
 

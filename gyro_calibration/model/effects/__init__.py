@@ -23,6 +23,8 @@ leave), `course` (of the time since power-on), `surroundings` (magnetic, mechani
 
 """
 
+from collections.abc import Iterable
+
 from gyro_calibration.logs.log import Number
 from gyro_calibration.model.effects.course import BIAS_STEP, INTERFERENCE_TONE, RATE_RAMP, WARM_UP
 from gyro_calibration.model.effects.effect import Channels, Effect, Parameter
@@ -61,6 +63,7 @@ from gyro_calibration.model.effects.thermal import (
     THERMAL_HYSTERESIS,
     THERMAL_LAG,
 )
+import numpy as np
 
 #: Those of rate and temperature alone, which dwells of a rate table can show.
 STEADY = {effect.name: effect for effect in (
@@ -72,12 +75,47 @@ CATALOGUE = STEADY | {effect.name: effect for effect in (
     HEADING_SENSITIVITY, ACCELERATION_SENSITIVITY, VIBRATION_RECTIFICATION, SUPPLY_SENSITIVITY,
     INTERFERENCE_TONE, BANDWIDTH, TIME_OFFSET, CLOCK_RATE, DEAD_ZONE, SATURATION, QUANTIZATION)}
 
+#: Effects of the user's own, which `add_effects` put into the catalogue.
+ADDED: dict[str, Effect] = {}
+
+
+def add_effects(effects: Iterable[Effect]) -> None:
+    """
+    Put effects of one's own into the catalogue, for models and for the diagnosis of logs.
+
+    Raises
+    ------
+    ValueError : if one is no `Effect`, has a name that is taken, or a shape to be fitted without
+        values to begin with, or if its columns do not fit to its coefficients
+
+    """
+    rate = np.linspace(-1.0, 1.0, 5)
+    channels = Channels(rate, rate, 25.0 + rate, 1.0 + rate, rate, 5.0 + rate, rate,
+                        lambda channel, seconds: rate, lambda seconds, threshold: rate)
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise ValueError(f'{effect!r} is not an Effect')
+        if effect.name in CATALOGUE and effect.name not in ADDED:
+            raise ValueError(f'the name {effect.name} is taken; give the effect another')
+        if any(shape.default is None and not shape.begin_with for shape in effect.shapes):
+            raise ValueError(f'{effect.name} has a shape without a default and without begin_with')
+        shapes = [shape.default if shape.default is not None else shape.begin_with[0]
+                  for shape in effect.shapes]
+        columns = effect.columns(channels, *shapes)
+        if (len(columns) != len(effect.coefficients)
+                or any(np.shape(column) != rate.shape for column in columns)):
+            raise ValueError(f'{effect.name} has {len(effect.coefficients)} coefficients and '
+                             f'{len(columns)} columns; give an array like channels.rate for each')
+        ADDED[effect.name] = CATALOGUE[effect.name] = effect
+
+
 __all__ = [
-    'ACCELERATION_SENSITIVITY', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE',
+    'ACCELERATION_SENSITIVITY', 'ADDED', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE',
     'BIAS_TEMPERATURE_QUADRATIC', 'BIAS_TEMPERATURE_RATE', 'CATALOGUE', 'CLOCK_RATE',
     'CUBIC_NONLINEARITY', 'DEAD_ZONE', 'HEADING_SENSITIVITY', 'INTERFERENCE_TONE',
     'QUADRATIC_NONLINEARITY', 'QUANTIZATION', 'RATE_RAMP', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY',
     'SCALE_FACTOR_ERROR', 'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STEADY',
     'SUPPLY_SENSITIVITY', 'THERMAL_HYSTERESIS', 'THERMAL_LAG', 'TIME_OFFSET',
     'VIBRATION_RECTIFICATION', 'WARM_UP', 'Channels', 'Effect', 'Number', 'Parameter',
+    'add_effects',
     'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']

@@ -93,7 +93,8 @@ class Parameter:
     A coefficient or a shape: its name, unit, the value taken where none is given, and its bounds.
 
     A shape with a default is a convention, such as a temperature to count from; one without is a
-    property of the gyro, and is fitted.
+    property of the gyro, and is fitted. `begin_with` holds the values of a shape with which the
+    search of a diagnosis begins.
 
     """
 
@@ -101,6 +102,7 @@ class Parameter:
     unit: str
     default: float | None = None
     bounds: tuple[float, float] = (-np.inf, np.inf)
+    begin_with: tuple[float, ...] = ()
 
 
 def nothing_added(_channels: Channels, *_shapes: float) -> Sequence[Number]:
@@ -130,6 +132,7 @@ class Effect:
         noise
     moved : (time, *values) -> time, of an effect that is undone by moving the stamps
     undone : what of the effect compensation cannot undo, as a sentence; '' where it undoes all
+    along : the channel along which a diagnosis draws it
 
     """
 
@@ -145,6 +148,7 @@ class Effect:
     stage: str = ''
     moved: Callable[..., Number] | None = None
     undone: str = ''
+    along: str = 'time'
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
