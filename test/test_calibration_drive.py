@@ -397,6 +397,26 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     assert 0.1 < commands < 0.7 and 0.1 < samples < 0.7
 
 
+def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
+    """By up to 0.2 s, in 0.2 s of each 0.8 s; a drive by the last sample would fall back with it."""
+    rig = rested(tmp_path, calibration_drive=True)
+    while not 0.2 < rig.clock.now % 0.8 < 0.3:
+        rig.step()
+    sample, waiting = rig.sample, []
+
+    def late_sample(*reading):
+        waiting.append(reading)
+        while waiting and rig.clock.now % 0.8 >= 0.2:
+            sample(*waiting.pop(0))
+
+    rig.sample, begin = late_sample, rig.clock.now
+    success, message = rig.calibrate()
+    assert success, message
+    times, rates = np.array(rig.commands[:-1]).T
+    np.testing.assert_allclose(rates, CALIBRATION.rate_at(times - begin - 0.01), atol=0.06)
+    assert rig.session.lateness[1] == pytest.approx(0.2, abs=0.02)
+
+
 def test_a_slip_without_load_is_named_as_one(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     rig.begin()

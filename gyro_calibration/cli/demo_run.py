@@ -19,6 +19,7 @@ compensation drives the calibration, then a drive follows.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, field
@@ -78,32 +79,37 @@ class Robot:
     """
     A robot that turns as commanded, within what its wheels can do, with the gyro of a model.
 
+    Where this process is held up, the samples come late, but the robot has turned meanwhile as it
+    was commanded by then.
+
     Attributes
     ----------
-    command : rad/s
+    commands : those to come into force, with the time when they came, s, and the rate, rad/s
     truth : of each sample the time by the clock of this machine, s, and the true heading, rad
 
     """
 
     model: GyroModel
     noise: Array
-    command: float = 0.0
+    commands: deque[tuple[float, float]] = field(default_factory=deque)
     truth: list[tuple[float, float]] = field(default_factory=list)
 
     def obey(self, message: Twist) -> None:
         """Turn from now on as commanded."""
-        self.command = message.angular.z
+        self.commands.append((time.monotonic(), message.angular.z))
 
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
-        rate, heading, begin = 0.0, 0.0, time.monotonic()
+        command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
         for number, noise in enumerate(self.noise):
-            time.sleep(max(0.0, begin + number * INTERVAL - time.monotonic()))
-            change = np.clip(self.command - rate, -ACCELERATION * INTERVAL,
-                             ACCELERATION * INTERVAL)
+            due = begin + number * INTERVAL
+            time.sleep(max(0.0, due - time.monotonic()))
+            while self.commands and self.commands[0][0] <= due:
+                command = self.commands.popleft()[1]
+            change = np.clip(command - rate, -ACCELERATION * INTERVAL, ACCELERATION * INTERVAL)
             heading += INTERVAL * (rate + 0.5 * change)
             rate += change
-            self.truth.append((time.time(), heading))
+            self.truth.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
                          time=number * INTERVAL)
 
