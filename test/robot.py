@@ -156,15 +156,16 @@ class RosRobot:
         True heading, rad, by the stamp of the sample, ns.
     moments : list of Moment
         The truth at each step.
-    clock_stands : bool
-        Set by a test: /clock is published no more and stamps stand; the base goes on.
+    clock_absent, clock_stands : bool
+        Set by a test: /clock is not published; or no more, and stamps stand. The base goes on.
     also : callable or None
         Called with each Imu message after it was published: a second driver.
 
     """
 
     def __init__(self, node, robot, *, stamped=False, speed=None):
-        self.robot, self.node, self.clock_stands, self.also = robot, node, False, None
+        self.robot, self.node, self.also = robot, node, None
+        self.clock_absent = self.clock_stands = False
         self.commands, self.headings, self.moments = [], {}, []
         self._stamped, self._speed, self._lock, self._last = stamped, speed, threading.Lock(), None
         quality = QoSProfile(depth=100)
@@ -196,7 +197,7 @@ class RosRobot:
         stamp = self._stamp(reading)
         self.headings[stamp] = reading.heading
         header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
-        if self._clock and not self.clock_stands:
+        if self._clock and not (self.clock_absent or self.clock_stands):
             clock = Clock()
             clock.clock.sec, clock.clock.nanosec = header['sec'], header['nanosec']
             self._clock.publish(clock)
