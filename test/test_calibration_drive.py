@@ -398,7 +398,7 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
 
 
 def test_samples_that_are_held_up_do_not_hold_up_the_motion(tmp_path):
-    """By up to 0.2 s, in 0.2 s of each 0.8 s; a drive by the last sample would fall back with it."""
+    """By up to 0.2 s, in 0.2 s of each 0.8 s; by the last sample it would fall back."""
     rig = rested(tmp_path, calibration_drive=True)
     while not 0.2 < rig.clock.now % 0.8 < 0.3:
         rig.step()
