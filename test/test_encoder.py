@@ -165,8 +165,9 @@ def test_95_percent_intervals_hold_the_truth_though_the_bias_wanders(runs):
         (found[:, 0] ** 2).mean(axis=0))).all(), 'far too wide'
 
 
-@pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])
-@pytest.mark.parametrize('step, noise', [(0.088, 0.02), (5.0, 0.5)])
+@pytest.mark.parametrize('step, noise, runs', [
+    (0.088, 0.02, 15), pytest.param(0.088, 0.02, 40, marks=pytest.mark.evidence),
+    pytest.param(5.0, 0.5, 40, marks=pytest.mark.evidence)])
 def test_the_likelihood_attains_the_bound_where_cumulative_least_squares_does_not(
         step, noise, runs):
     """

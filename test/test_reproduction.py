@@ -31,10 +31,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'gyro_calibration/reproduction').glob('*.py'))
 each_source = pytest.mark.parametrize('source', SOURCES)
+#: One source; the others, which take some seconds, as evidence.
+one_source = pytest.mark.parametrize('source', [
+    pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
+    for source in SOURCES])
 
 
 #: Of the drives; the verb and the documents have 200, which takes half a minute.
-FEW, MANY = 50, 200
+FEW, MANY = 25, 200
 
 
 @cache
@@ -78,7 +82,7 @@ def test_the_uncertainty_of_ours_counts():
     assert not Comparison('', '', 1.9, '< 2', uncertainty=0.2).agrees
 
 
-@each_source
+@one_source
 def test_a_wrong_published_value_does_not_come_out(source):
     wrong = [replace(each, published=f'{3.0 * each.value + 7.0:.3f}')
              for each in reproduced(source, FEW).comparisons
@@ -108,16 +112,14 @@ def test_every_number_of_a_contradiction_is_in_its_sentence(source):
 
 # the verb and its page
 
-@pytest.mark.parametrize('source', [
-    pytest.param(source, marks=[] if source == 'ojeda' else pytest.mark.evidence)
-    for source in SOURCES])
+@one_source
 def test_the_page_holds_what_the_program_prints(source):
     shown = (ROOT / 'docs/explanation/reproduction.md').read_text()
     assert page(reproduced(source, MANY)) in shown, (
         'run gyro_calibration reproduce and put it there')
 
 
-@each_source
+@one_source
 def test_the_same_seed_gives_the_same_numbers_and_another_others(source, capsys, monkeypatch):
     few = {source: lambda generator, progress: SOURCES[source](generator, 2, progress)}
     monkeypatch.setattr('gyro_calibration.cli.reproduce.SOURCES', few)

@@ -55,7 +55,7 @@ def measured(table, terms, seed=1):
     return table.measure(GyroModel(terms), np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize('runs', [5, pytest.param(15, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('runs', [3, pytest.param(15, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize(
     'table', [Table(), WANDERING, Table(sweep_bias=0.05 * DEGREE, sweep_scale=1e-3, one_way=True)])
 def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
@@ -65,7 +65,7 @@ def test_effects_that_are_not_there_are_hardly_ever_taken(table, runs):
     assert wrong <= binom.ppf(1 - RARE, runs, FALSE_ALARM_RATE)
 
 
-@pytest.mark.parametrize('runs', [4, pytest.param(8, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('runs', [2, pytest.param(8, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('terms, technology', [(CUBIC, 'mems'), (SINE, 'open_loop_fog')])
 def test_effects_of_clear_size_are_found(terms, technology, runs):
     thermal = {'bias_temperature': Term(BIAS_TEMPERATURE, (36.0, 1e-4)),
@@ -100,7 +100,7 @@ def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
     assert wide or technology in selection.twins[0].reason
 
 
-@pytest.mark.parametrize('runs', [4, pytest.param(12, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('runs', [2, pytest.param(12, marks=pytest.mark.evidence)])
 def test_the_rate_that_is_said_to_part_look_alikes_parts_them(runs):
     generator, sigmas = np.random.default_rng(4), []
     truth = GyroModel((*LINEAR, TRUTH['sine_response']))
@@ -146,7 +146,7 @@ def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
 
 def test_of_look_alikes_that_fit_alike_the_bounded_one_is_taken_where_nobody_says_what_it_is():
     generator = np.random.default_rng(6)
-    for _ in range(4):
+    for _ in range(2):
         fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
                                                generator))
         pair, = fit.twins
