@@ -20,7 +20,15 @@ import struct
 import sys
 import tracemalloc
 
-from gyro_calibration.logs.cdr import IMU, LAYOUTS, MessageError, parse, serialize, TEMPERATURE
+from gyro_calibration.logs.cdr import (
+    IMU,
+    layout_of,
+    LAYOUTS,
+    MessageError,
+    parse,
+    serialize,
+    TEMPERATURE,
+)
 from gyro_calibration.logs.log import LogError, read_log, write_log
 from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
 from gyro_calibration.logs.ros_bag import is_recording
@@ -108,6 +116,85 @@ def test_rosbags_reads_a_message_that_was_serialized_here(make, frame):
     assert message.linear_acceleration_covariance[8] == 36.0
     assert (parse(serialize(BEGIN, frame, [20.5, 0.0]), LAYOUTS[TEMPERATURE])
             == (BEGIN, (20.5, 0.0)))
+
+
+CUSTOM = """# a gyro of its own maker
+uint8 GOOD=1
+std_msgs/Header header
+bool good
+float32[] history
+string<=20 name
+Part[2] parts
+float64[<=3] more
+geometry_msgs/Vector3 angular_velocity
+int16 temperature
+string[] words
+float64 behind
+================================================================================
+MSG: my_msgs/Part
+int8 first
+uint64 second
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+
+
+@pytest.mark.parametrize('little', [True, False], ids=['little endian', 'big endian'])
+def test_a_message_of_any_kind_is_parsed_by_its_definition(make, little):
+    pytest.importorskip('rosbags')
+    from rosbags.typesys import get_types_from_msg
+    make.store.register({kind: fields for kind, fields in get_types_from_msg(
+        CUSTOM, 'my_msgs/msg/Gyro').items() if kind.startswith('my_msgs')})
+    custom, part = (make.store.types[f'my_msgs/msg/{name}'] for name in ('Gyro', 'Part'))
+    for frame, history in (('', []), ('gyro', [1.0, 2.0, 3.0])):
+        message = custom(make.header(12.5, frame), True, np.array(history, np.float32), 'a name',
+                         [part(1, 2), part(3, 4)], np.array(history), make.vector(0.25), 31,
+                         ['x'], 7.0)
+        layout = layout_of(CUSTOM)
+        stamp, numbers = parse(bytes(make.store.serialize_cdr(
+            message, 'my_msgs/msg/Gyro', little_endian=little)), layout)
+        assert (stamp, {name: numbers[place] for name, place in layout.quantities.items()}) == (
+            BEGIN + 12_500_000_000, {'rate': 0.25, 'temperature': 31})
+
+
+@pytest.mark.parametrize('definition', [
+    '', 'float64 angular_velocity', 'std_msgs/Header header\n', 'x' * 200_000, CUSTOM[:700],
+    'A a\n' + ''.join(f'{80 * "="}\nMSG: p/{name}\n{inner}[999999999] a\n'
+                      for name, inner in ('AB', 'BC', 'CA')),
+    'A a\n' + 80 * '=' + '\nMSG: p/A\nA a\n', 'Header header\nfloat64[999999999] a\n'])
+def test_a_definition_of_nothing_or_without_end_is_refused_at_once(definition):
+    with pytest.raises(MessageError):
+        layout_of(definition)
+
+
+@pytest.mark.parametrize('storage', ['MCAP', 'SQLITE3'])
+def test_other_kinds_serve_where_they_are_named(make, tmp_path, turning, storage):
+    time, rate, heading = turning
+    types = make.store.types
+    topics = {
+        'rate': [(at, types['geometry_msgs/msg/Vector3Stamped'](make.header(at), make.vector(r)))
+                 for at, r in zip(time, rate)],
+        'pose': [(at, types['geometry_msgs/msg/PoseWithCovarianceStamped'](
+            make.header(at), make.odometry(at, h, 0.0).pose)) for at, h in zip(time, heading)]}
+    path = write(tmp_path / 'bag', topics, storage)
+    log = read_recording(path, Topics('rate', 'pose'))
+    np.testing.assert_array_equal(log.output, rate)
+    np.testing.assert_allclose(log.reference_heading, heading, atol=1e-9)
+    with pytest.raises(LogError, match='no message of sensor_msgs/msg/Imu'):
+        read_recording(path)
+    with pytest.raises(LogError, match='--topic wants sensor_msgs/msg/Imu'):
+        read_recording(path, Topics('pose'))
 
 
 def test_bytes_that_are_no_message_are_refused():

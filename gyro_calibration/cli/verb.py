@@ -96,10 +96,11 @@ AS_IT_IS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap':
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topic', metavar='TOPIC', help='of the gyro in a recording, '
-                        'sensor_msgs/Imu; default: the only one')
+                        'sensor_msgs/Imu or another kind with a rate; default: the only Imu')
     parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference in a '
                         'recording, nav_msgs/Odometry, sensor_msgs/Imu, '
-                        'geometry_msgs/PoseStamped or TwistStamped; default: none')
+                        'geometry_msgs/PoseStamped, TwistStamped or another kind with a rate '
+                        'or an orientation; default: none')
     parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; '
                         'default: the one named most like that of the gyro')
 

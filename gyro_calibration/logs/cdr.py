@@ -9,18 +9,20 @@
 # under the License.
 
 """
-The ROS 2 messages that a recording of a gyro is made of, as bytes; no ROS is needed for them.
+ROS 2 messages of gyros, temperatures and references, as bytes; no ROS is needed for them.
 
 A message is in the common data representation (CDR): four bytes give the order of bytes, then come
-the fields, each aligned to its own size. All messages here are a header, perhaps another text, and
-then only numbers of eight bytes.
+the fields, each aligned to its own size. The definition of its kind, which recordings carry, says
+which fields there are. It is parsed here into a table of formats; nothing in it is run.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+import re
 import struct
 
 from gyro_calibration.logs.log import Number
@@ -43,54 +45,176 @@ All zeros would say that the whole covariance is unknown, z included. A standard
 
 """
 
-#: Places of quantities among the numbers of an Imu: the quaternion x, y, z, w first, each quantity
-#: followed by its covariance.
-ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE = 4, 15, 16, 27, 28
+#: Most parts of a message, how deep they may be nested, and characters of a definition.
+_MOST, _DEEPEST, _LONGEST = 5000, 10, 100_000
+_LINE = '=' * 80
+_CODES = {'bool': '?', 'byte': 'B', 'char': 'b', 'int8': 'b', 'uint8': 'B', 'int16': 'h',
+          'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q',
+          'float32': 'f', 'float64': 'd', 'string': 's'}
+_FIELD = re.compile(r'(?P<kind>[\w/]+)(?:<=\d+)?(?:\[(?P<most><=)?(?P<count>\d{0,9})\])?'
+                    r' +(?P<name>\w+) *(?P<constant>=?)')
+
+#: Where messages have a quantity: the first of these fields that there is. `{}` is the axis.
+_QUANTITIES = {
+    **{f'orientation.{each}': tuple(f'{where}{each}' for where in (
+        'orientation.', 'pose.pose.orientation.', 'pose.orientation.', 'transform.rotation.',
+        'quaternion.')) for each in 'xyzw'},
+    'orientation variance': ('orientation_covariance.0',),
+    'rate': ('angular_velocity.{}', 'twist.twist.angular.{}', 'twist.angular.{}', 'vector.{}'),
+    'rate variance': ('angular_velocity_covariance.0',),
+    'force': ('linear_acceleration.{}',),
+    'force variance': ('linear_acceleration_covariance.0',),
+    'temperature': ('temperature',),
+}
+
+_PARTS = {
+    'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec',
+    'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id',
+    **{f'geometry_msgs/{name}': '\n'.join(f'float64 {each}' for each in axes)
+       for name, axes in (('Point', 'xyz'), ('Vector3', 'xyz'), ('Quaternion', 'xyzw'))},
+    'geometry_msgs/Pose': 'geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation',
+    'geometry_msgs/Twist': 'geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular',
+    'geometry_msgs/PoseWithCovariance': 'geometry_msgs/Pose pose\nfloat64[36] covariance',
+    'geometry_msgs/TwistWithCovariance': 'geometry_msgs/Twist twist\nfloat64[36] covariance',
+}
+_FIELDS = {
+    IMU: """geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance""",
+    TEMPERATURE: 'float64 temperature\nfloat64 variance',
+    ODOMETRY: """string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist""",
+    POSE: 'geometry_msgs/Pose pose',
+    TWIST: 'geometry_msgs/Twist twist',
+}
+
+
+def _with_parts(text: str) -> str:
+    for name, part in reversed(_PARTS.items()):
+        if f'{name} ' in text:
+            text += f'{_LINE}\nMSG: {name}\n{part}\n'
+    return text
+
+
+#: Kind -> its fields, as ROS 2 writes them, for recordings without definitions, and for recorders.
+DEFINITIONS: Mapping[str, str] = {kind: _with_parts(f'std_msgs/Header header\n{fields}\n')
+                                  for kind, fields in _FIELDS.items()}
 
 
 class MessageError(ValueError):
-    """Bytes are not a message of the kind that they should be."""
+    """Bytes are not a message of the kind that they should be, or a definition is none."""
 
 
 @dataclass(frozen=True)
 class Layout:
     """
-    How a kind of message lies in bytes, after its header.
+    How a kind of message lies in bytes, as far as it says something of a gyro or a reference.
 
     Attributes
     ----------
-    texts : how many texts stand before the numbers
-    numbers : how many numbers there are
-    kept : which of them say something of a gyro, a temperature or a reference
+    runs : of numbers that follow each other: bytes of an element of the text or sequence before
+        the run, 0 for the first run; and formats of the numbers
+    numbers : how many numbers there are after the stamp
+    quantities : name -> which of the numbers it is
 
     """
 
-    texts: int
+    runs: tuple[tuple[int, str], ...]
     numbers: int
-    kept: tuple[int, ...]
+    quantities: Mapping[str, int]
+
+    @property
+    def kept(self) -> tuple[int, ...]:
+        """Return which numbers are quantities."""
+        return tuple(self.quantities.values())
 
 
-_QUATERNION_OF_POSE = (3, 4, 5, 6)
+@cache
+def layout_of(definition: str, axis: str = 'z') -> Layout:
+    """
+    Return the layout of a kind of message by its definition, of rates about an axis.
 
-#: Kind -> layout, of an Imu for z. A heading comes of four numbers, the quaternion x, y, z, w.
-LAYOUTS: Mapping[str, Layout] = {
-    IMU: Layout(0, 37, (0, 1, 2, 3, ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z,
-                        FORCE_COVARIANCE)),
-    TEMPERATURE: Layout(0, 2, (0,)),
-    ODOMETRY: Layout(1, 85, (*_QUATERNION_OF_POSE, 48)),
-    POSE: Layout(0, 7, _QUATERNION_OF_POSE),
-    TWIST: Layout(0, 6, (5,)),
-}
+    Raises
+    ------
+    MessageError : it cannot be read
+
+    """
+    if len(definition) > _LONGEST:
+        raise MessageError(f'it has more than {_LONGEST} characters')
+    parts: dict[str, list[re.Match[str]]] = {}
+    for part in f'MSG: /\n{definition}'.split(f'{_LINE}\n'):
+        name, _, text = part.partition('\n')
+        fields = [found for line in text.split('\n')
+                  if (found := _FIELD.match(line.partition('#')[0].strip()))]
+        name = name.removeprefix('MSG: ').strip()
+        # In a definition, a message of the same package is named without the package.
+        parts[name] = parts[name.rpartition('/')[2] or name] = [
+            field for field in fields if not field['constant']]
+    names, runs = list[str](), [['', '']]
+    for number, (name, code) in enumerate(_flat(parts, '/', '', 0)):
+        if number > _MOST:
+            raise MessageError(f'it has more than {_MOST} parts')
+        if name and code:
+            names.append(name)
+            runs[-1][1] += code
+        elif code:
+            runs.append([code, ''])
+    if names[:2] != ['header.stamp.sec', 'header.stamp.nanosec']:
+        raise MessageError('it does not begin with a header')
+    quantities = {quantity: names.index(found) - 2 for quantity, fields in _QUANTITIES.items()
+                  for found in [field.format(axis) for field in fields
+                                if field.format(axis) in names][:1]}
+    return Layout(tuple((struct.calcsize(before), codes) for before, codes in runs),
+                  len(names) - 2, quantities)
 
 
-def layout(kind: str, axis: str) -> Layout:
-    """Return the layout of a kind; of an Imu, rate and force about and along an axis are kept."""
-    found = LAYOUTS[kind]
-    if kind != IMU:
-        return found
-    back = 'zyx'.index(axis)
-    kept = tuple(place - back if place in (RATE_Z, FORCE_Z) else place for place in found.kept)
-    return replace(found, kept=kept)
+def _flat(parts: Mapping[str, Sequence[re.Match[str]]], part: str, path: str,
+          depth: int) -> Iterator[tuple[str, str]]:
+    """
+    Give name and format of each number; texts and sequences have no name, messages no format.
+
+    What comes after a sequence of texts or of messages cannot be found, and is left out.
+
+    """
+    for field in parts[part]:
+        kind, count, name = field['kind'], field['count'], f'{path}{field["name"]}'
+        code = _CODES.get(kind, '')
+        if field['most'] or count == '':
+            if code in ('', 's'):
+                return
+            yield '', code
+            continue
+        if not code and (kind not in parts or depth == _DEEPEST):
+            raise MessageError(f'{kind} in it is not defined')
+        for number in range(int(count or 1)):
+            each = name if count is None else f'{name}.{number}'
+            yield '' if code == 's' else each, code
+            if not code:
+                yield from _flat(parts, kind, f'{each}.', depth + 1)
+
+
+#: Kind -> layout, of an Imu about and along z.
+LAYOUTS: Mapping[str, Layout] = {kind: layout_of(text) for kind, text in DEFINITIONS.items()}
+#: Places of quantities among the numbers of an Imu, whose quaternion x, y, z, w comes first.
+ORIENTATION_COVARIANCE, RATE_Z, RATE_COVARIANCE, FORCE_Z, FORCE_COVARIANCE = LAYOUTS[IMU].kept[4:]
+
+
+@cache
+def _struct(order: str, codes: str, place: int) -> struct.Struct:
+    """Return the format of numbers from a place on, counted from a multiple of eight bytes."""
+    text = [order]
+    for code in codes:
+        size = struct.calcsize(code)
+        text.append(f'{-place % size}x{code}')
+        place += -place % size + size
+    return struct.Struct(''.join(text))
+
+
+_LENGTHS = {order: struct.Struct(f'{order}I').unpack_from for order in '<>'}
 
 
 def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
@@ -105,18 +229,22 @@ def parse(data: bytes, layout: Layout) -> tuple[int, tuple[float, ...]]:
     if data[:2] not in (b'\0\0', b'\0\1'):
         raise MessageError(f'a message begins with {data[:4].hex()}, which is not plain CDR')
     order = '<' if data[1] else '>'
+    numbers: tuple[float, ...] = ()
+    place = 4
     try:
-        seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, 4)
-        place = 16 + length
-        for _ in range(layout.texts):
-            place += -place % 4
-            place += 4 + struct.unpack_from(f'{order}I', data, place)[0]
-        # Aligned to eight bytes from the fifth on.
-        return seconds * NSEC_PER_SEC + nanoseconds, struct.unpack_from(
-            f'{order}{layout.numbers}d', data, place + (4 - place) % 8)
-    except struct.error as error:
+        for size, codes in layout.runs:
+            if size:
+                place += -place % 4 + 4
+                length = _LENGTHS[order](data, place - 4)[0]
+                place += (-(place - 4) % size if length else 0) + length * size
+            if codes:
+                run = _struct(order, codes, (place - 4) % 8)
+                numbers += run.unpack_from(data, place)
+                place += run.size
+    except (struct.error, OverflowError) as error:
         raise MessageError(f'a message of {len(data)} bytes is too short for what it should '
                            'hold') from error
+    return int(numbers[0]) * NSEC_PER_SEC + int(numbers[1]), numbers[2:]
 
 
 def serialize(stamp: int, frame: str, numbers: Sequence[float]) -> bytes:
@@ -134,43 +262,3 @@ def heading_of(x: Number, y: Number, z: Number, w: Number) -> Number:
         length = w * w + x * x + y * y + z * z
         heading = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
         return np.where((length > 0.5) & (length < 2.0), heading, np.nan)
-
-
-_LINE = '=' * 80
-_HEADER = f"""{_LINE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_LINE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-
-#: Kind -> its fields, as ROS 2 writes them; a recording carries them for programs that do not know
-#: the kind.
-DEFINITIONS: Mapping[str, str] = {
-    IMU: f"""std_msgs/Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-{_LINE}
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-{_LINE}
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-{_HEADER}""",
-    TEMPERATURE: f"""std_msgs/Header header
-float64 temperature
-float64 variance
-{_HEADER}""",
-}

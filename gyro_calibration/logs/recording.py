@@ -11,6 +11,7 @@
 """
 A ROS 2 recording as a `Log`: Imu is the gyro, Temperature and a reference come onto its stamps.
 
+Other kinds of messages with a rate, an orientation or a temperature serve where they are named.
 Times are the stamps of the headers, at which something was measured. Times of receiving are taken
 only where headers have no stamps, and a note says so. Everything else that was mended is in a note
 as well.
@@ -29,7 +30,7 @@ from typing import Any
 from gyro_calibration.logs.cdr import (
     heading_of,
     IMU,
-    layout,
+    layout_of,
     MessageError,
     NOT_REPORTED,
     NSEC_PER_SEC,
@@ -66,8 +67,9 @@ _MOST_LISTED = 20
 #: s without a temperature, beyond which a note says so; gyros take minutes to warm up.
 _LONG_WITHOUT_TEMPERATURE = 30.0
 
-# Places among the numbers that are kept of an Imu, see `messages.LAYOUTS`.
-_ORIENTATION_VARIANCE, _RATE, _RATE_VARIANCE, _FORCE, _FORCE_VARIANCE = 4, 5, 6, 7, 8
+#: Role -> quantities that a topic must have one of.
+_NEEDED = {'gyro': {'rate'}, 'temperature': {'temperature'},
+           'reference': {'rate', 'orientation.w'}}
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,11 @@ def _same(topic: str, other: str | None) -> bool:
 class _Series:
     """Messages of one topic as they come: stamps and times of receiving, ns, and numbers kept."""
 
-    def __init__(self, topic: str, kind: str, axis: str):
+    def __init__(self, topic: str, kind: str, definition: str, axis: str):
         self.topic, self.kind, self.damaged = topic, kind, 0
-        self._layout = layout(kind, axis)
+        self._layout = layout_of(definition, axis)
+        self.quantities = tuple(self._layout.quantities)
+        self._kept = self._layout.kept
         self._stamps, self._received, self._numbers = array('q'), array('q'), array('d')
 
     def __len__(self) -> int:
@@ -115,14 +119,14 @@ class _Series:
             self.damaged += 1
             return
         self._stamps.append(stamp)
-        self._numbers.extend([numbers[place] for place in self._layout.kept])
+        self._numbers.extend([numbers[place] for place in self._kept])
 
     def by_arrival(self) -> _Course:
         """Return what came, in the order in which it was received."""
         received = np.frombuffer(self._received, np.int64)
         numbers = np.frombuffer(self._numbers).reshape(len(self), -1)
         course = _Course(self.topic, self.kind, np.frombuffer(self._stamps, np.int64), received,
-                         numbers)
+                         numbers, self.quantities)
         # Long recordings are hardly ever out of order, and need no copy then.
         return (course if (received[1:] >= received[:-1]).all()
                 else course.taken(np.argsort(received, kind='stable')))
@@ -130,16 +134,28 @@ class _Series:
 
 @dataclass(frozen=True)
 class _Course:
-    """Stamps and times of receiving of a topic, ns, shape (n,), and numbers, shape (n, kept)."""
+    """Stamps and times of receiving of a topic, ns, shape (n,), and numbers, shape (n, m)."""
 
     topic: str
     kind: str
     stamps: Nanoseconds
     received: Nanoseconds
     numbers: Array
+    quantities: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def values(self, quantity: str) -> Array:
+        """Return the values of a quantity, shape (n,); zeros where there is none."""
+        if quantity not in self.quantities:
+            return np.zeros(len(self))
+        return self.numbers[:, self.quantities.index(quantity)]
+
+    def reports(self, quantity: str) -> bool:
+        """Return whether the messages have a quantity and do not declare it unknown."""
+        return quantity in self.quantities and not (
+            self.values(f'{quantity} variance') == NOT_REPORTED).all()
 
     @property
     def has_stamps(self) -> bool:
@@ -180,7 +196,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     for message in read_messages(path, contents, heard):
         if message.topic not in series:
             axis = 'z' if _same(message.topic, topics.reference) else topics.axis
-            series[message.topic] = _Series(message.topic, message.kind, axis)
+            series[message.topic] = _Series(message.topic, message.kind,
+                                            contents.definitions[message.kind], axis)
         series[message.topic].add(message)
     log = _Reader(path, topics, contents, series).log(rate)
     for note in log.notes:
@@ -232,7 +249,7 @@ class _Reader:
         wanted = self._topics.gyro
         found = self._named(wanted, 'gyro') if wanted else self._only_imu()
         course = self._course(found)
-        if (course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
+        if not course.reports('rate'):
             raise LogError(f'{self._path}: {found} says that it reports no angular velocity; '
                            'name another by --topic')
         return course
@@ -281,7 +298,10 @@ class _Reader:
         if topic is None:
             raise LogError(f'{self._path}: no topic {wanted}{self._what_there_is()}; '
                            f'name one of them by {ROLES[role][0]}')
-        if wrong := wrong_kind(role, topic, self._contents.topics[topic]):
+        kind = self._contents.topics[topic]
+        definition = self._contents.definitions.get(kind)
+        found = layout_of(definition).quantities if definition else {}
+        if not _NEEDED[role] & set(found) and (wrong := wrong_kind(role, topic, kind)):
             raise LogError(f'{self._path}: {wrong}')
         if topic not in self._series or not len(self._series[topic]):
             raise LogError(f'{self._path}: {topic} has no message that can be read; record again')
@@ -333,7 +353,8 @@ class _Reader:
         if not doubled.any():
             return gyro
         same = doubled.copy()
-        same[1:] &= gyro.numbers[1:, _RATE] == gyro.numbers[:-1, _RATE]
+        rate = gyro.values('rate')
+        same[1:] &= rate[1:] == rate[:-1]
         other = int(np.count_nonzero(doubled & ~same))
         if other > 1 + _DOUBLED * len(gyro):
             raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
@@ -344,7 +365,7 @@ class _Reader:
         return gyro.taken(~doubled)
 
     def _output(self, gyro: _Course) -> Array:
-        output = gyro.numbers[:, _RATE].copy()
+        output = gyro.values('rate').copy()
         lost = ~np.isfinite(output)
         if lost.any():
             self._notes.append(f'{np.count_nonzero(lost)} samples are no finite number and count '
@@ -354,8 +375,8 @@ class _Reader:
 
     def _force(self, gyro: _Course) -> Array | None:
         """Return the specific force along z, or None if it is not reported or never filled in."""
-        force = gyro.numbers[:, _FORCE]
-        if (gyro.numbers[:, _FORCE_VARIANCE] == NOT_REPORTED).any() or not force.any():
+        force = gyro.values('force')
+        if (gyro.values('force variance') == NOT_REPORTED).any() or not force.any():
             return None
         if not np.isfinite(force).all():
             self._notes.append('the specific force is not finite everywhere and was left out')
@@ -372,7 +393,7 @@ class _Reader:
         so interpolation is nearer than the last reading, which a robot has to take.
 
         """
-        course = _rising(course.taken(np.isfinite(course.numbers[:, 0])))
+        course = _rising(course.taken(np.isfinite(course.values('temperature'))))
         at = (course.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE
                 or at[-1] < -_LONG_WITHOUT_TEMPERATURE):
@@ -385,7 +406,7 @@ class _Reader:
         if longest > _LONG_WITHOUT_TEMPERATURE:
             self._notes.append(f'no temperature came for up to {longest:.0f} s; '
                                'it was interpolated, or held at the ends')
-        return np.interp(time, at, course.numbers[:, 0])
+        return np.interp(time, at, course.values('temperature'))
 
     def _referred(self, course: _Course, gyro: _Course, time: Array,
                   output: Array | None) -> dict[str, Any]:
@@ -430,30 +451,24 @@ def _rising(course: _Course) -> _Course:
 
 def _headings(course: _Course) -> Array | None:
     """Return the rotation about z, wrapped, nan where there is none; None without any."""
-    if course.kind == TWIST:
+    if not course.reports('orientation.w'):
         return None
-    if course.kind == IMU and not _knows_heading(course):
+    x, y, z, w = (course.values(f'orientation.{each}') for each in 'xyzw')
+    variance = course.values('orientation variance')
+    # declared unknown by an Imu, or left at its default
+    if 'orientation variance' in course.quantities and (
+            (variance == NOT_REPORTED).all()
+            or not (x.any() or y.any() or z.any() or variance.any()) and (w == 1.0).all()):
         return None
-    heading: Array = heading_of(*course.numbers[:, :4].T)
+    heading: Array = heading_of(x, y, z, w)
     return heading
 
 
-def _knows_heading(course: _Course) -> bool:
-    """Return whether an Imu has a heading: neither declared unknown nor left at its default."""
-    variance = course.numbers[:, _ORIENTATION_VARIANCE]
-    untouched = (not (course.numbers[:, :3].any() or variance.any())
-                 and bool((course.numbers[:, 3] == 1.0).all()))
-    return not untouched and not (variance == NOT_REPORTED).all()
-
-
 def _rates(course: _Course) -> Array | None:
-    place: dict[str, Any] = {IMU: _RATE, ODOMETRY: 4, TWIST: 0}
-    if course.kind not in place or course.kind == IMU and (
-            course.numbers[:, _RATE_VARIANCE] == NOT_REPORTED).all():
+    if not course.reports('rate'):
         return None
-    rate = course.numbers[:, place[course.kind]].copy()
-    rate[~np.isfinite(rate)] = np.nan
-    return rate
+    rate = course.values('rate')
+    return np.where(np.isfinite(rate), rate, np.nan)
 
 
 def _at(time: Array, at: Array, values: Array) -> Array:
