@@ -23,10 +23,10 @@ only in files, wires and the command line, where the name says so: ``gyro_dps``.
 Interface. The names in `__all__` are public, and imported when they are first used; everything
 else may change. `from gyro_calibration import read_log, fit` needs no ROS 2.
 
-Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `fleet`,
-`reproduction`; then, with ports, processes and ROS 2, `driver`, `ros`, `cli`; then `api`, which
-holds the public names. Each folder imports only what stands before it, and so does each module of
-a folder, by the reading order that its docstring gives. `files` opens and writes files for all.
+Reading order: `logs`, `model`, `heading`, `calibration`, `allan`, `diagnosis`, `fleet`; then, with
+ports, processes and ROS 2, `driver`, `ros`, `cli`; then `api`, which holds the public names. Each
+folder imports only what stands before it, and so does each module of a folder, by the reading
+order that its docstring gives. `files` opens and writes files for all.
 
 """
 

@@ -26,7 +26,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
-         'gyro_calibration', 'config', 'launch', 'bin', 'lib', 'resource']
+         'gyro_calibration', 'gyro_calibration_reproduction', 'config', 'launch', 'bin', 'lib',
+         'resource']
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
 COLCON = shutil.which('colcon',
                       path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
@@ -80,7 +81,7 @@ def imported():
     names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
     roots = ({name.partition('.')[0] for name in names} - sys.stdlib_module_names
-             - {'gyro_calibration'})
+             - {'gyro_calibration', 'gyro_calibration_reproduction'})
     return {f'python3-{root}' if root in {'numpy', 'scipy', 'serial', 'yaml', 'tqdm', 'matplotlib'}
             else root for root in roots}
 

@@ -22,14 +22,14 @@ from gyro_calibration.cli.reproduce import page
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import CALIBRATION, ROBOT
-from gyro_calibration.reproduction import bot_thoughts, hong_park, SOURCES
-from gyro_calibration.reproduction import ojeda_chung_borenstein as ojeda
-from gyro_calibration.reproduction.finding import Comparison
+from gyro_calibration_reproduction import bot_thoughts, hong_park, SOURCES
+from gyro_calibration_reproduction import ojeda_chung_borenstein as ojeda
+from gyro_calibration_reproduction.finding import Comparison
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted((ROOT / 'gyro_calibration/reproduction').glob('*.py'))
+FILES = sorted((ROOT / 'gyro_calibration_reproduction').glob('*.py'))
 each_source = pytest.mark.parametrize('source', SOURCES)
 #: One source; the others, which take some seconds, as evidence.
 one_source = pytest.mark.parametrize('source', [

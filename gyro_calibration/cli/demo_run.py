@@ -44,8 +44,8 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import CALIBRATION, Motion, turns
 from gyro_calibration.model.noise import simulate_noise
-from gyro_calibration.reproduction.hong_park import TABLE_1
 from gyro_calibration.ros.runner import SENSOR_QOS
+from gyro_calibration_reproduction.hong_park import TABLE_1
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor

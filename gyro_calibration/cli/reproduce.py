@@ -19,8 +19,8 @@ import textwrap
 from typing import Any
 
 from gyro_calibration.cli.verb import Answer, bar, verb, whole
-from gyro_calibration.reproduction import SOURCES
-from gyro_calibration.reproduction.finding import Comparison, Reproduction
+from gyro_calibration_reproduction import SOURCES
+from gyro_calibration_reproduction.finding import Comparison, Reproduction
 import numpy as np
 
 HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')

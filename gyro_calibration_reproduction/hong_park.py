@@ -28,7 +28,7 @@ from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import CALIBRATION, from_rates, Motion, ROBOT
 from gyro_calibration.model.noise import Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
-from gyro_calibration.reproduction.finding import (
+from gyro_calibration_reproduction.finding import (
     Comparison,
     Contradiction,
     from_own_figures,

@@ -35,7 +35,7 @@ from gyro_calibration.model.effects import (
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.finding import (
+from gyro_calibration_reproduction.finding import (
     Comparison,
     Contradiction,
     from_own_figures,

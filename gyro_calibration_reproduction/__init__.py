@@ -9,7 +9,10 @@
 # under the License.
 
 """
-Published numbers of the sources of this package beside ours, and contradictions in the sources.
+Published numbers of the sources of gyro_calibration beside ours, and contradictions in them.
+
+This is evidence, not a part of the product: it uses gyro_calibration as any other program does,
+and only the verbs `reproduce` and `demo` use it.
 
 One file a source; `finding` holds what they share. Published numbers are in the units of their
 source. Each has a function ``reproduce(generator, runs, progress)``: the source of the noise; the
@@ -18,7 +21,7 @@ twentieth; and a display of how many are done.
 
 """
 
-from gyro_calibration.reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein
+from gyro_calibration_reproduction import bot_thoughts, hong_park, ojeda_chung_borenstein
 
 #: In the order of their years.
 SOURCES = {'ojeda': ojeda_chung_borenstein.reproduce, 'hong_park': hong_park.reproduce,

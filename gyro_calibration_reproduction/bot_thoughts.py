@@ -25,7 +25,7 @@ from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DEGREE, Progress
 from gyro_calibration.model.motion import CALIBRATION, from_headings, Motion, turns
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.reproduction.finding import (
+from gyro_calibration_reproduction.finding import (
     Comparison,
     Contradiction,
     from_own_figures,
