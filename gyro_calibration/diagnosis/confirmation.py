@@ -79,25 +79,19 @@ class Confirmed:
 
 def candidates(done: SpanFit) -> Iterator[Column]:
     """Give the causes that headings over spans can show, for the channels that the log has."""
-    log, duration = done.spans.log, float(done.spans.time[-1] - done.spans.time[0])
-    fine = done.spans.fine
-    for name in (
-        'scale_factor_asymmetry',
-        'quadratic_nonlinearity',
-        'cubic_nonlinearity',
-        'rate_ramp',
-        'heading_sensitivity',
-    ):
+    log, fine, time = done.spans.log, done.spans.fine, done.spans.time
+    duration = float(time[-1] - time[0])
+    for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity',
+                 'rate_ramp', 'heading_sensitivity', 'reference_once_per_rev'):
         yield Column(name)
-    yield Column('reference_once_per_rev')
     if fine:
         yield Column('bandwidth', positive=True)
-    for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5):
-        yield Column('warm_up', (float(constant),))
-    for moment in np.linspace(done.spans.time[0], done.spans.time[-1], 62 if fine else 22)[1:-1]:
-        yield Column('bias_step', (float(moment),), once=True)
+    for constant in np.geomspace(duration / 50.0, 0.7 * duration, 8 if fine else 5).tolist():
+        yield Column('warm_up', (constant,))
+    for moment in np.linspace(time[0], time[-1], 62 if fine else 22)[1:-1].tolist():
+        yield Column('bias_step', (moment,), once=True)
         if not fine:
-            yield Column('reference_slip', (float(moment),), once=True)
+            yield Column('reference_slip', (moment,), once=True)
     if log.temperature is not None and np.ptp(log.temperature) > 0.2:
         middle = float(log.temperature.mean())
         for name in ('bias_temperature', 'bias_temperature_quadratic', 'scale_factor_temperature'):
@@ -105,8 +99,8 @@ def candidates(done: SpanFit) -> Iterator[Column]:
         for filter_time in (3.0, 10.0):
             yield Column('bias_temperature_rate', (filter_time,))
         if fine:
-            for constant in np.geomspace(5.0, min(duration, 3000.0), 6):
-                yield Column('thermal_lag', (float(constant),))
+            for constant in np.geomspace(5.0, min(duration, 3000.0), 6).tolist():
+                yield Column('thermal_lag', (constant,))
             for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4)):
                 yield Column('thermal_hysteresis', (filter_time, threshold))
     if log.specific_force is not None and np.ptp(log.specific_force) > 0.0:
@@ -127,9 +121,10 @@ def search(done: SpanFit, level: float) -> tuple[SpanFit, list[Confirmed]]:
     columns = {each.cause: each for each in offered if not each.once}
     rich = fit_spans(done.spans, list(columns.values()))
     while len(found) < MOST:
-        taken = {each.column.cause for each in found}
-        open_ones = [each for each in offered if each.cause not in taken]
-        best = _best(done, rich, open_ones, [each.column for each in found], level)
+        taken = [each.column for each in found]
+        names = {each.cause for each in taken}
+        best = _best(done, rich, [each for each in offered if each.cause not in names], taken,
+                     level)
         if best is None:
             break
         found.append(best)
@@ -137,73 +132,47 @@ def search(done: SpanFit, level: float) -> tuple[SpanFit, list[Confirmed]]:
     return (fit_spans(done.spans, inside) if inside else done), found
 
 
-def _best(
-    done: SpanFit,
-    rich: SpanFit,
-    open_ones: Sequence[Column],
-    beside: Sequence[Column],
-    level: float,
-) -> Confirmed | None:
+def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Sequence[Column],
+          level: float) -> Confirmed | None:
     """Return the best of the causes that are open, beside those found; None where it is chance."""
     data = whitened(done, beside, rich, most=True)
     widths = [done.spans.columns(each) for each in open_ones]
     columns = data.columns(np.column_stack(widths))
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])
     places = [slice(begin, end) for begin, end in zip(edges[:-1], edges[1:])]
-    everything = np.ones(len(data.observed), dtype=bool)
     positive = [each.positive for each in open_ones]
-    chances = _evidences(data, columns, places, positive, everything)
+    chances = _evidences(data, columns, places, positive, np.ones(len(data.observed), dtype=bool))
     # what happens once is never established, and does not cost the others a part of the level
     lasting = sum(not each.once for each in open_ones)
-    tried = [
-        chance * (len(open_ones) if each.once else lasting)
-        for each, (chance, _, _) in zip(open_ones, chances)
-    ]
+    tried = [chance * (len(open_ones) if each.once else lasting)
+             for each, (chance, _, _) in zip(open_ones, chances)]
     strongest = int(np.argmin(tried))
     once = open_ones[strongest].once
     if min(tried[strongest], 1.0) > (level if once else _SUSPECTED * level):
         return None
     best_of: dict[str, int] = {}
     for other, each in enumerate(open_ones):
-        name = each.cause
-        if name not in best_of or chances[other][1] > chances[best_of[name]][1]:
-            best_of[name] = other
+        if each.cause not in best_of or chances[other][1] > chances[best_of[each.cause]][1]:
+            best_of[each.cause] = other
     gain = chances[strongest][1]
-    alike = {
-        name: other
-        for name, other in best_of.items()
-        if chances[other][1] > gain - math.log(_LIKELY) or other == strongest
-    }
+    alike = {name: other for name, other in best_of.items()
+             if chances[other][1] > gain - math.log(_LIKELY) or other == strongest}
     # of those that explain the log as well, the simplest
-    place = min(
-        alike.values(), key=lambda other: (_size(open_ones[other], widths[other]), tried[other])
-    )
-    _, _, stretches = chances[place]
-    p_value = min(tried[place], 1.0)
+    place = min(alike.values(),
+                key=lambda other: (_size(open_ones[other], widths[other]), tried[other]))
+    column, p_value, stretches = open_ones[place], min(tried[place], 1.0), chances[place][2]
     found = _cross_fitted(data, columns, places, positive, open_ones, alike)
     # the errors of a course last: there a cause has to predict distant stretches as well
     surely, predicted, chosen = max(found) if done.spans.fine else min(found)
-    column = open_ones[place]
-    weights = {
-        name: float(np.exp(max(min(chances[other][1] - gain, 0.0), -50.0)))
-        for name, other in best_of.items()
-    }
-    total = sum(weights.values())
-    probability = {
-        name: max(weight / total, LEAST_CHANCE)
-        for name, weight in sorted(weights.items(), key=lambda each: -each[1])
-        if name in alike
-    }
-    established = (
-        p_value < level
-        and surely > _SURELY
-        and chosen == 1.0
-        and not column.once
-        and stretches >= FEWEST_STRETCHES
-    )
-    return Confirmed(
-        column, max(p_value, LEAST_CHANCE), predicted, chosen, established, probability
-    )
+    weights = {name: float(np.exp(max(min(chances[other][1] - gain, 0.0), -50.0)))
+               for name, other in best_of.items()}
+    probability = {name: max(weight / sum(weights.values()), LEAST_CHANCE)
+                   for name, weight in sorted(weights.items(), key=lambda each: -each[1])
+                   if name in alike}
+    established = (p_value < level and surely > _SURELY and chosen == 1.0 and not column.once
+                   and stretches >= FEWEST_STRETCHES)
+    return Confirmed(column, max(p_value, LEAST_CHANCE), predicted, chosen, established,
+                     probability)
 
 
 def _size(column: Column, columns: Array) -> int:
@@ -212,30 +181,21 @@ def _size(column: Column, columns: Array) -> int:
     return columns.shape[1] + sum(each.default is None for each in shapes)
 
 
-def _evidences(
-    data: Whitened,
-    columns: Array,
-    places: Sequence[slice],
-    positive: Sequence[bool],
-    rows: Mask,
-) -> list[tuple[float, float, float]]:
+def _evidences(data: Whitened, columns: Array, places: Sequence[slice], positive: Sequence[bool],
+               rows: Mask) -> list[tuple[float, float, float]]:
     """Return chance, gain in log-likelihood and effective stretches of each cause."""
     base, _ = np.linalg.qr(data.plain[rows])
     both = np.column_stack([columns, data.observed])[rows]
     both -= base @ (base.T @ both)
     stretch = data.stretch[rows]
     sizes = np.sqrt(np.sum(columns[rows] ** 2, axis=0)) + 1e-300
-    return [
-        (1.0, 0.0, 0.0)
-        if above and float(both[:, place.start] @ both[:, -1]) <= 0.0
-        else _evidence(both[:, place], both[:, -1], stretch, 1e-6 * sizes[place])
-        for place, above in zip(places, positive)
-    ]
+    return [(1.0, 0.0, 0.0) if above and float(both[:, place.start] @ both[:, -1]) <= 0.0
+            else _evidence(both[:, place], both[:, -1], stretch, 1e-6 * sizes[place])
+            for place, above in zip(places, positive)]
 
 
-def _evidence(
-    x: Array, left: Array, stretch: NDArray[np.intp], least: Array
-) -> tuple[float, float, float]:
+def _evidence(x: Array, left: Array, stretch: NDArray[np.intp],
+              least: Array) -> tuple[float, float, float]:
     """Return chance, gain in log-likelihood (both cluster-robust) and effective stretches."""
     information = x.T @ x
     size = np.sqrt(np.diag(information))
@@ -245,7 +205,7 @@ def _evidence(
     off = left - x @ np.linalg.lstsq(x, left, rcond=None)[0]
     scores = np.array([np.bincount(stretch, part * off) for part in x.T])
     shares = np.bincount(stretch, np.sum((x / size) ** 2, axis=1))
-    effective = float(shares.sum() ** 2 / (shares**2).sum())
+    effective = float(shares.sum() ** 2 / (shares ** 2).sum())
     count = x.shape[1]
     scatter = scores @ scores.T * effective / max(effective - 1.0 - count, 0.5)
     root = np.linalg.inv(np.linalg.cholesky(information + 1e-12 * np.diag(size**2)))
@@ -255,14 +215,9 @@ def _evidence(
     return float(fisher.sf(statistic / count, count, freedom)), 0.5 * statistic, effective
 
 
-def _cross_fitted(
-    data: Whitened,
-    columns: Array,
-    places: Sequence[slice],
-    positive: Sequence[bool],
-    open_ones: Sequence[Column],
-    alike: Mapping[str, int],
-) -> list[tuple[float, float, float]]:
+def _cross_fitted(data: Whitened, columns: Array, places: Sequence[slice],
+                  positive: Sequence[bool], open_ones: Sequence[Column],
+                  alike: Mapping[str, int]) -> list[tuple[float, float, float]]:
     """
     Choose and fit without each fold, and predict it.
 
@@ -290,9 +245,8 @@ def _cross_fitted(
             for design in (data.plain, np.column_stack([data.plain, columns[:, places[best]]])):
                 values = np.linalg.lstsq(design[rest], data.observed[rest], rcond=None)[0]
                 off.append(data.observed[held] - design[held] @ values)
-            won += np.bincount(
-                np.searchsorted(fold, data.stretch[held]), 0.5 * (off[0] ** 2 - off[1] ** 2)
-            ).tolist()
+            won += np.bincount(np.searchsorted(fold, data.stretch[held]),
+                               0.5 * (off[0] ** 2 - off[1] ** 2)).tolist()
         bounded = np.clip(won, -_BOUND, _BOUND)
         scatter = float(np.std(bounded, ddof=1)) * len(won) ** 0.5
         total = float(np.sum(won))

@@ -80,6 +80,11 @@ def bridged(values: Array) -> Array:
     return np.interp(places, places[known], values[known])
 
 
+def integral_of(time: Array, rate: Array) -> Array:
+    """Return the integral of a rate, from 0 on, shape (n,)."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
+
+
 def white_noise(values: Array) -> float:
     """Return the standard deviation of the white part of a signal, by third differences."""
     off = np.abs(np.diff(values, 3))

@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.diagnosis.expected_output import bridged, scale_of
+from gyro_calibration.diagnosis.expected_output import bridged, integral_of, scale_of
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
 from gyro_calibration.diagnosis.unit_confusion import FACTORS, is_far, unit_of_scale
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
@@ -75,12 +75,8 @@ class Agreement:
 
 def gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
     """Return what was checked of a log with a reference, up to the first that failed."""
-    if (
-        log.time is None
-        or log.output is None
-        or log.reference_heading is None
-        and log.reference_rate is None
-    ):
+    if (log.time is None or log.output is None
+            or log.reference_heading is None and log.reference_rate is None):
         return ()
     passed: list[Gate] = []
     for gate in _checked(log, model):
@@ -93,7 +89,12 @@ def gates(log: Log, model: GyroModel | None = None) -> tuple[Gate, ...]:
 def _checked(log: Log, model: GyroModel | None) -> Iterator[Gate]:
     assert log.time is not None
     if log.reference_rate is None:
-        yield _wrapped(log)
+        try:
+            refuse_wrapped(log)
+            yield Gate('wrapped_heading', True, 'the reference heading is continuous')
+        except DataRefused as refusal:
+            yield Gate('wrapped_heading', False, str(refusal).partition(';')[0],
+                       'unwrap the reference heading (--unwrap), and diagnose again')
     found = agreement(log)
     if found is None:
         yield Gate('motion', None, 'the reference turns too little to compare it with the gyro')
@@ -105,59 +106,31 @@ def _checked(log: Log, model: GyroModel | None) -> Iterator[Gate]:
         yield from _units(found, own if 0.1 < abs(own) < 10.0 else 1.0, log)
 
 
-def _wrapped(log: Log) -> Gate:
-    try:
-        refuse_wrapped(log)
-    except DataRefused as refusal:
-        return Gate(
-            'wrapped_heading',
-            False,
-            str(refusal).partition(';')[0],
-            'unwrap the reference heading (--unwrap), and diagnose again',
-        )
-    return Gate('wrapped_heading', True, 'the reference heading is continuous')
-
-
 def _same_motion(found: Agreement, log: Log) -> Gate:
-    share = f'{100.0 * found.coherence:.3g} %'
-    said = f'{share} of the variance of the heading over spans is common to gyro and reference'
-    wanders = (
-        found.grown[0] > _WANDERED
-        and found.grown[1] > _GROWN
-        and found.long < found.short - 0.5 * _DIFFERENT
-    )
+    said = (f'{100.0 * found.coherence:.3g} % of the variance of the heading over spans is common '
+            'to gyro and reference')
+    wanders = (found.grown[0] > _WANDERED and found.grown[1] > _GROWN
+               and found.long < found.short - 0.5 * _DIFFERENT)
     if found.coherence >= _DIFFERENT and not wanders:
         return Gate('motion', True, said)
     if not wanders and (found.grown[0] < _APART or found.range < _TURNED):
-        return Gate(
-            'motion', None, f'{said}; what differs is as small as the errors of a reference'
-        )
+        return Gate('motion', None,
+                    f'{said}; what differs is as small as the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
     axis = f'; or take another axis of the gyro ({", ".join(others[:3])})' if others else ''
+    turned = 'turn the rates of all three axes into the frame of the reference first'
     if wanders:
-        return Gate(
-            'tilt',
-            False,
-            f'{said} over short spans, and {100.0 * found.long:.2g} % over longer ones, where '
-            f'{found.grown[0] / DEGREE:.3g} deg are left: the axis of the gyro tilts',
-            'turn the rates of all three axes into the frame of the reference first, or keep the '
-            'sensor level'
-            + axis,
-        )
-    return Gate(
-        'motion',
-        False,
-        said,
-        'give a reference of this motion and this axis, with stamps of the same clock; where the '
-        'sensor '
-        'tumbles, turn the rates of all three axes into the frame of the reference first' + axis,
-    )
+        return Gate('tilt', False, f'{said} over short spans, and {100.0 * found.long:.2g} % over '
+                    f'longer ones, where {found.grown[0] / DEGREE:.3g} deg are left: the axis of '
+                    'the gyro tilts', f'{turned}, or keep the sensor level{axis}')
+    return Gate('motion', False, said, 'give a reference of this motion and this axis, with '
+                f'stamps of the same clock; where the sensor tumbles, {turned}{axis}')
 
 
 def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
     assert log.time is not None
-    factor, deviation = 1.0 / (found.factor * own), found.deviation / found.factor**2 / abs(own)
+    factor, deviation = 1.0 / (found.factor * own), found.deviation / found.factor ** 2 / abs(own)
     said = f'the output is {factor:.4g} times what the reference says'
     size = factor, (factor - 1.96 * deviation, factor + 1.96 * deviation)
     if not is_far(factor):
@@ -166,60 +139,29 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
         return
     name = unit_of_scale(factor, deviation)
     if name == '-1' or name is None and is_far(-factor) is False:
-        yield Gate(
-            'sense',
-            False,
-            f'{said}: the two count in opposite senses',
-            'give --invert, or change the sign of the column of the gyro',
-            size,
-        )
+        yield Gate('sense', False, f'{said}: the two count in opposite senses',
+                   'give --invert, or change the sign of the column of the gyro', size)
         return
-    power = round(math.log10(abs(factor)))
-    interval = float(np.median(np.diff(log.time)))
-    if (
-        name is None
-        and power
-        and abs(abs(factor) / 10.0**power - 1.0) < 0.3
-        and log.reference_rate is None
-        and (_INTERVALS[0] < interval / 10.0**power < _INTERVALS[1])
-    ):
-        yield Gate(
-            'time_unit',
-            False,
-            f'{said}: the stamps run {10.0**power:g} times too fast, {interval:.4g} s between '
-            f'samples where {interval / 10.0**power:.4g} s would agree',
-            f'divide time_s by {10.0**power:g}, or give --rate '
-            f'{10.0**power / interval:.6g}' + (' (the stamps are in ms)' if power == 3 else ''),
-            size,
-        )
+    power, interval = round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
+    slower = 10.0 ** power
+    if (name is None and power and abs(abs(factor) / slower - 1.0) < 0.3
+            and log.reference_rate is None
+            and _INTERVALS[0] < interval / slower < _INTERVALS[1]):
+        yield Gate('time_unit', False, f'{said}: the stamps run {slower:g} times too fast, '
+                   f'{interval:.4g} s between samples where {interval / slower:.4g} s would agree',
+                   f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
+                   + (' (the stamps are in ms)' if power == 3 else ''), size)
         return
-    yield Gate(
-        'unit',
-        False,
-        f'{said}, and {name} is {FACTORS[name]:.5g}'
-        if name
-        else f'{said}, which is the factor of no gyro',
-        _remedy(name, log),
-        size,
-    )
-
-
-def _remedy(name: str | None, log: Log) -> str:
-    """Return what to do about a factor: which of the two is off, where their sizes say so."""
-    assert log.output is not None
+    remedy = ('mend the unit or the range of the gyro (gyro_dps, gyro_rad_s, --sensitivity), or '
+              'that of the reference')
     if name is not None and '180' in name:
-        fast = float(np.nanquantile(np.abs(log.output), 0.99)) > 4000.0 * DEGREE
-        slow = float(np.nanquantile(np.abs(log.output), 0.99)) < 0.1 * DEGREE
-        heading = (
-            ''
-            if fast or slow or log.reference_heading is None
-            else ', or that of the reference heading (deg or rad)'
-        )
-        return f'mend the unit of the column of the gyro (gyro_dps or gyro_rad_s){heading}'
-    return (
-        'mend the unit or the range of the gyro (gyro_dps, gyro_rad_s, --sensitivity), or that of '
-        'the reference'
-    )
+        assert log.output is not None
+        fastest = float(np.nanquantile(np.abs(log.output), 0.99)) / DEGREE
+        either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
+        remedy = ('mend the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
+                  + (', or that of the reference heading (deg or rad)' if either else ''))
+    yield Gate('unit', False, f'{said}, and {name} is {FACTORS[name]:.5g}' if name
+               else f'{said}, which is the factor of no gyro', remedy, size)
 
 
 def integral(log: Log) -> Array:
@@ -228,8 +170,7 @@ def integral(log: Log) -> Array:
     if log.reference_rate is None:
         assert log.reference_heading is not None
         return bridged(log.reference_heading)
-    rate = bridged(log.reference_rate)
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(log.time))])
+    return integral_of(log.time, bridged(log.reference_rate))
 
 
 def agreement(log: Log) -> Agreement | None:
@@ -240,40 +181,23 @@ def agreement(log: Log) -> Agreement | None:
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 2 * _FEWEST or np.isfinite(log.output).sum() < 2 * _FEWEST:
         return None
-    reference, output = integral(log), bridged(log.output)
-    turned = np.concatenate(
-        [[0.0], np.cumsum(0.5 * (output[1:] + output[:-1]) * np.diff(log.time))]
-    )
+    reference, turned = integral(log), integral_of(log.time, bridged(log.output))
     span = max((log.time[-1] - log.time[0]) / _SPANS, 4.0 * float(np.median(np.diff(log.time))))
-    chosen = known[
-        np.flatnonzero(
-            np.diff(np.floor((log.time[known] - log.time[0]) / span), prepend=-1.0) > 0.0
-        )
-    ]
+    number = np.floor((log.time[known] - log.time[0]) / span)
+    chosen = known[np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0)]
     at, heading = log.time[chosen], reference[chosen]
-    by_length = [
-        _at_best_lag(log.time, turned, at[::together], heading[::together], span)
-        for together in _TOGETHER
-        if len(at[::together]) > _FEWEST
-    ]
+    by_length = [_at_best_lag(log.time, turned, at[::together], heading[::together], span)
+                 for together in _TOGETHER if len(at[::together]) > _FEWEST]
     if not by_length or not np.ptp(heading) > 0.0:
         return None
     factor, deviation, coherence, _ = max(by_length, key=lambda each: each[2])
     short, long = by_length[0], by_length[-1]
-    return Agreement(
-        factor,
-        deviation,
-        coherence,
-        short[2],
-        long[2],
-        (long[3], long[3] / max(short[3], 1e-12)),
-        float(np.ptp(heading)),
-    )
+    return Agreement(factor, deviation, coherence, short[2], long[2],
+                     (long[3], long[3] / max(short[3], 1e-12)), float(np.ptp(heading)))
 
 
-def _at_best_lag(
-    time: Array, turned: Array, at: Array, heading: Array, span: float
-) -> tuple[float, float, float, float]:
+def _at_best_lag(time: Array, turned: Array, at: Array, heading: Array,
+                 span: float) -> tuple[float, float, float, float]:
     """Return factor, its deviation, coherence and what is left, rad, at the lag that is best."""
     change, steps = np.diff(heading), np.diff(at)
     lags = span * np.arange(-_LAGS, _LAGS + 1)
@@ -286,7 +210,7 @@ def _at_best_lag(
 
 def _regressed(gyro: Array, steps: Array, change: Array) -> tuple[float, float, float, float]:
     """Return factor, its deviation, coherence and what is left, without spans far off, rad."""
-    scale = math.sqrt(float(np.mean(gyro**2))) or 1.0
+    scale = math.sqrt(float(np.mean(gyro ** 2))) or 1.0
     columns = np.column_stack([gyro / scale, steps / steps.mean()])
     kept = np.ones(len(change), dtype=bool)
     for _ in range(3):
@@ -297,10 +221,20 @@ def _regressed(gyro: Array, steps: Array, change: Array) -> tuple[float, float, 
             kept[:] = True
     variance, left = float(np.var(change[kept])), float(np.var(off[kept]))
     coherence = max(1.0 - left / variance, 0.0) if variance > 0.0 else 0.0
-    deviation = math.sqrt(
-        left / max(kept.sum() - 2, 1) / max(float(np.var(columns[kept, 0])), 1e-300)
-    )
+    deviation = math.sqrt(left / max(kept.sum() - 2, 1)
+                          / max(float(np.var(columns[kept, 0])), 1e-300))
     return float(values[0]) / scale, deviation / scale, coherence, math.sqrt(left)
+
+
+#: Gate that failed -> what it means, for people.
+_SENTENCES = {
+    'sense': 'Gyro and reference count in opposite senses.',
+    'unit': 'Gyro and reference are of different units.',
+    'time_unit': 'The stamps are in another unit of time.',
+    'wrapped_heading': 'The reference heading is wrapped.',
+    'tilt': 'The axis of the gyro tilts, so that its integral is no heading.',
+    'motion': 'The reference shows another motion than the gyro.',
+    'model': 'The model is of other units than the log, or of another gyro.'}
 
 
 def mismatch(checked: Sequence[Gate]) -> Finding | None:
@@ -309,22 +243,5 @@ def mismatch(checked: Sequence[Gate]) -> Finding | None:
     if failed is None:
         return None
     parameters = {} if failed.factor is None else {'unit_error': Estimate(*failed.factor, '1')}
-    sentences = {
-        'sense': 'Gyro and reference count in opposite senses.',
-        'unit': 'Gyro and reference are of different units.',
-        'time_unit': 'The stamps are in another unit of time.',
-        'wrapped_heading': 'The reference heading is wrapped.',
-        'tilt': 'The axis of the gyro tilts, so that its integral is no heading.',
-        'motion': 'The reference shows another motion than the gyro.',
-        'model': 'The model is of other units than the log, or of another gyro.',
-    }
-    effect = 'unit_error' if parameters else failed.name
-    return Finding(
-        effect,
-        sentences[failed.name],
-        parameters,
-        0.0,
-        evidence=failed.said,
-        along='rate',
-        remedy=failed.remedy,
-    )
+    return Finding('unit_error' if parameters else failed.name, _SENTENCES[failed.name],
+                   parameters, 0.0, evidence=failed.said, along='rate', remedy=failed.remedy)

@@ -16,7 +16,7 @@ import math
 
 from gyro_calibration.calibration.dwells.samples import where_lost
 from gyro_calibration.diagnosis.data_quality import encoder_step
-from gyro_calibration.diagnosis.expected_output import bridged, white_noise
+from gyro_calibration.diagnosis.expected_output import bridged, integral_of, white_noise
 from gyro_calibration.diagnosis.findings import Reference
 from gyro_calibration.logs.log import Array, DEGREE, Log
 import numpy as np
@@ -143,8 +143,3 @@ def _error_ratio(log: Log) -> float:
         return 0.0
     size = 1.4826 * float(np.nanmedian(np.abs(change)))
     return size / (walk * math.sqrt(2.0 * _SPAN))
-
-
-def integral_of(time: Array, rate: Array) -> Array:
-    """Return the integral of a rate, from 0 on, shape (n,)."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])

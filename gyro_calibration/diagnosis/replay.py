@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 import math
 
+from gyro_calibration.diagnosis.expected_output import integral_of
 from gyro_calibration.diagnosis.input_validation import evened, FEWEST, prepared
 from gyro_calibration.diagnosis.spectrum import angles, differentiated, inverse, level, transform
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
@@ -393,5 +394,4 @@ def _heading(time: Array, log: Log, rate: Array) -> Array:
     """Return the heading that effects look at: the reference's, or the integral of its rate."""
     if log.reference_heading is not None and np.isfinite(log.reference_heading).all():
         return log.reference_heading
-    known = np.nan_to_num(rate)
-    return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * np.diff(time))])
+    return integral_of(time, np.nan_to_num(rate))

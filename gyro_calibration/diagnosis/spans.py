@@ -39,8 +39,7 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
     wander,
 )
-from gyro_calibration.diagnosis.expected_output import bridged, white_noise
-from gyro_calibration.diagnosis.reference import integral_of
+from gyro_calibration.diagnosis.expected_output import bridged, integral_of, white_noise
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
@@ -59,6 +58,8 @@ _WILDEST = 10.0
 _NOT = 1e-6
 #: Delays of a reference that are tried first, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
+#: Passes in which values, and points that stand out, are found robustly.
+_PASSES = 2
 #: A gyro rests where its course is lost for so long, s, and its output is as quiet as ever.
 _REST, _QUIET = 3.0, 2.0
 
@@ -181,8 +182,7 @@ class Spans:
     def points(self, values: Array) -> Array:
         """Return the means of a signal at the points, its delay taken off, shape (n + 1,)."""
         assert self.log.time is not None
-        stamps = self.log.time[self.known] + self.delay
-        moved = np.interp(stamps, self.log.time, values)
+        moved = np.interp(self.log.time[self.known] + self.delay, self.log.time, values)
         return np.bincount(self.place, moved) / np.bincount(self.place)
 
     def integrals(self, rate: Array) -> Array:
@@ -206,30 +206,26 @@ class Spans:
     def plain(self) -> Array:
         """Return the columns of scale factor error, bias and delay, shape (n + r, 3)."""
         rate = np.asarray(self.channels.rate)
-        return np.column_stack(
-            [-self.integrals(rate), -self.integrals(np.ones_like(rate)), self.changes(rate)]
-        )
+        return np.column_stack([-self.integrals(rate), -self.integrals(np.ones_like(rate)),
+                                self.changes(rate)])
 
     def columns(self, cause: Column) -> Array:
         """Return the columns of a cause, shape (n + r, k)."""
-        heading = np.asarray(self.channels.heading)
+        channels = self.channels
         if cause.cause == 'reference_once_per_rev':
-            found = [self.changes(wave(heading)) for wave in (np.sin, np.cos)]
-        elif cause.cause == 'reference_slip':
-            found = [
-                self.changes((np.asarray(self.channels.time) >= cause.shapes[0]).astype(float))
-            ]
-        elif cause.cause == 'bandwidth':
+            heading = np.asarray(channels.heading)
+            return np.column_stack([self.changes(np.sin(heading)), self.changes(np.cos(heading))])
+        if cause.cause == 'reference_slip':
+            late = np.asarray(channels.time) >= cause.shapes[0]
+            return self.changes(late.astype(float))[:, None]
+        if cause.cause == 'bandwidth':
             # to first order a lag is a delay; in second order they differ by half of lag² dw/dt
             assert self.log.time is not None
-            found = [-self.changes(np.gradient(np.asarray(self.channels.rate), self.log.time))]
-        else:
-            effect = CATALOGUE[cause.cause]
-            found = [
-                -self.integrals(np.asarray(each))
-                for each in effect.columns(self.channels, *cause.shapes)
-            ]
-        return np.column_stack(found)
+            change = np.gradient(np.asarray(channels.rate), self.log.time)
+            return -self.changes(change)[:, None]
+        return np.column_stack([
+            -self.integrals(np.asarray(each))
+            for each in CATALOGUE[cause.cause].columns(channels, *cause.shapes)])
 
     def rates(self) -> Array:
         """Return the rate at the points, rad/s, shape (n + 1,)."""
@@ -237,17 +233,15 @@ class Spans:
 
     def corrected(self, values: Array) -> Spans:
         """Return the spans with the rate that scale factor error and bias make of the output."""
-        assert self.log.output is not None
-        assert self.log.time is not None
+        assert self.log.output is not None and self.log.time is not None
         rate = (self.log.output - values[1]) / (1.0 + values[0])
         moved = replace(self, delay=self.delay + float(values[2]))
         turned = angle_of(self.log.time, rate)
         # of the reference, and between its points of the gyro
-        away = np.interp(
-            self.log.time - moved.delay, self.time, self.heading - moved.points(turned)
-        )
-        channels = replace(self.channels.moving(rate, self.log.output), heading=turned + away)
-        return replace(moved, channels=channels)
+        away = np.interp(self.log.time - moved.delay, self.time,
+                         self.heading - moved.points(turned))
+        return replace(moved, channels=replace(self.channels.moving(rate, self.log.output),
+                                               heading=turned + away))
 
 
 @dataclass(frozen=True)
@@ -263,7 +257,6 @@ class SpanFit:
     values, covariance : estimates and their cluster-robust covariance
     stretches_of : effective number of stretches that each value rests on
     prior : standard deviations of what is known of scale factor error, bias and delay beforehand
-    outlying : variance of each point beside the usual one
 
     """
 
@@ -274,7 +267,6 @@ class SpanFit:
     covariance: Array
     stretches_of: Array
     prior: Array
-    outlying: Array
 
     def half(self, place: int) -> float:
         """Return half the length of the interval of 95 % of a value."""
@@ -305,51 +297,45 @@ def spans_of(log: Log, kind: str = 'course') -> Spans:
     treatment = treatment_of(kind)
     time, output = log.time - log.time[0], bridged(log.output)
     white = white_noise(log.output)
-    if log.reference_heading is None:
+    reference = log.reference_heading
+    if reference is None:
         assert log.reference_rate is not None
         white = math.hypot(white, white_noise(log.reference_rate))
-        heading = angle_of(time, bridged(log.reference_rate))
-        log = replace(log, reference_heading=heading, reference_rate=None)
-    log = replace(log, time=time, output=output)
-    reference = log.reference_heading
-    assert reference is not None
+        reference = angle_of(time, bridged(log.reference_rate))
+    log = replace(log, time=time, output=output, reference_heading=reference, reference_rate=None)
     known = np.flatnonzero(np.isfinite(reference))
-    interval = float(np.median(np.diff(time)))
-    length = max(treatment.span, float(time[known[-1]] - time[known[0]]) / treatment.most,
-                 2.0 * interval)
+    stamps = time[known]
+    length = max(treatment.span, float(stamps[-1] - stamps[0]) / treatment.most,
+                 2.0 * float(np.median(np.diff(time))))
     # a gap begins a new point
-    number = np.floor((time[known] - time[known[0]]) / length + 1e-6)
-    place = np.cumsum(
-        (np.diff(number, prepend=number[0]) > 0.0)
-        | (np.diff(time[known], prepend=time[known[0]]) > length)
-    )
+    number = np.floor((stamps - stamps[0]) / length + 1e-6)
+    place = np.cumsum((np.diff(number, prepend=number[0]) > 0.0)
+                      | (np.diff(stamps, prepend=stamps[0]) > length))
     if not treatment.averaged:
         known = known[np.diff(place, prepend=-1) > 0]
         place = np.arange(len(known))
     count = np.bincount(place)
-    heading = np.bincount(place, reference[known]) / count
-    middle = np.bincount(place, time[known]) / count
     channels = replace(channels_of(log), rate=output, time=time, heading=integral_of(time, output))
-    return Spans(log, channels, known, place, middle, heading, _rests(log, known), treatment,
-                 white)
+    return Spans(log, channels, known, place, np.bincount(place, time[known]) / count,
+                 np.bincount(place, reference[known]) / count, _rests(time, output, known),
+                 treatment, white)
 
 
 def angle_of(time: Array, rate: Array) -> Array:
     """Return the integral of a rate, its curvature between samples included, shape (n,)."""
     slope = np.gradient(rate, time)
     step = float(np.median(np.diff(time)))
-    return integral_of(time, rate) - step**2 / 12.0 * (slope - slope[0])
+    return integral_of(time, rate) - step ** 2 / 12.0 * (slope - slope[0])
 
 
-def _rests(log: Log, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
+def _rests(time: Array, output: Array, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
     """Return begin and end row of stretches without a course in which the gyro is quiet."""
-    assert log.time is not None and log.output is not None
-    edges = np.concatenate([[0], known, [len(log.time) - 1]])
-    second = max(round(1.0 / float(np.median(np.diff(log.time)))), 2)
-    blocks = len(log.output) // second
+    edges = np.concatenate([[0], known, [len(time) - 1]])
+    second = max(round(1.0 / float(np.median(np.diff(time)))), 2)
+    blocks = len(output) // second
     if blocks < 8:
         return ()
-    scatter = log.output[: blocks * second].reshape(blocks, second).std(axis=1)
+    scatter = output[:blocks * second].reshape(blocks, second).std(axis=1)
     quiet = _QUIET * float(scatter.min()) + 1e-12
     found = []
     for begin, end in zip(edges[:-1], edges[1:]):
@@ -365,7 +351,7 @@ def _rests(log: Log, known: NDArray[np.intp]) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-def fit_spans(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> SpanFit:
+def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
     """
     Fit scale factor error, bias, delay and causes, with the noise of gyro and reference.
 
@@ -373,39 +359,23 @@ def fit_spans(spans: Spans, causes: Sequence[Column] = (), passes: int = 2) -> S
     reference did there. It is left at 0, and its interval is that of the prior.
 
     """
-    spans = replace(spans, delay=spans.delay if spans.delay else _first_delay(spans))
-    outlying: Array = np.ones(len(spans.time))
-    moved = spans
-    for _ in range(passes):
-        columns = all_columns(moved, causes)
-        values = _robust(moved, columns)
-        moved = moved.corrected(values)
-        left = moved.observed - all_columns(moved, causes) @ np.append(
-            values[:2], [0.0, *values[3:]]
-        )
-        outlying = _outlying(left[: len(spans.time) - 1])
     prior = np.array(spans.treatment.prior)
+    free = np.concatenate([prior, np.full(all_columns(spans, causes).shape[1] - 3, np.inf)])
+    moved = replace(spans, delay=spans.delay or _first_delay(spans))
+    outlying: Array = np.ones(len(spans.time))
+    for _ in range(_PASSES):
+        values = _robustly(all_columns(moved, causes), moved.observed, free)[0]
+        moved = moved.corrected(values)
+        values[2] = 0.0
+        left = moved.observed - all_columns(moved, causes) @ values
+        outlying = _outlying(left[:len(spans.time) - 1])
     done = _with_deviations(moved, causes, outlying, prior)
     if done.stretches_of[0] >= FEWEST_STRETCHES:
         return done
     moved = moved.corrected(np.append(0.0, done.fit.values[1:3]))
-    prior[0] *= _NOT
-    done = _with_deviations(moved, causes, outlying, prior)
-    done.covariance[0, 0] = spans.treatment.prior[0] ** 2
+    done = _with_deviations(moved, causes, outlying, prior * [_NOT, 1.0, 1.0])
+    done.covariance[0, 0] = prior[0] ** 2
     return done
-
-
-def _with_deviations(
-    spans: Spans, causes: Sequence[Column], outlying: Array, prior: Array
-) -> SpanFit:
-    fit = _likelihood(spans, all_columns(spans, causes), outlying, prior)
-    values = fit.values.copy()
-    values[2] += spans.delay
-    done = SpanFit(
-        spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior, outlying
-    )
-    covariance, effective = _cluster_robust(whitened(done, causes), fit)
-    return replace(done, covariance=covariance, stretches_of=effective)
 
 
 def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
@@ -415,26 +385,13 @@ def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
 
 def _first_delay(spans: Spans) -> float:
     """Return the delay at which gyro and reference agree best, by the median of what is left."""
-    best = math.inf, 0.0
-    for delay in _DELAYS:
-        moved = replace(spans, delay=float(delay))
-        columns = moved.plain()[:, :2]
-        left = _robustly(
-            columns, moved.observed, np.array(spans.treatment.prior[:2])
-        )[1]
-        best = min(
-            best,
-            (
-                float(np.mean(np.minimum(np.abs(left[: len(spans.time) - 1]), 10.0 * DEGREE))),
-                float(delay),
-            ),
-        )
-    return best[1]
+    def cost(delay: float) -> float:
+        moved = replace(spans, delay=delay)
+        left = _robustly(moved.plain()[:, :2], moved.observed,
+                         np.array(spans.treatment.prior[:2]))[1]
+        return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
 
-
-def _robust(spans: Spans, columns: Array) -> Array:
-    prior = np.concatenate([spans.treatment.prior, np.full(columns.shape[1] - 3, np.inf)])
-    return _robustly(columns, spans.observed, prior)[0]
+    return min(_DELAYS.tolist(), key=cost)
 
 
 def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
@@ -446,11 +403,8 @@ def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Arr
         size = 1.4826 * float(np.median(np.abs(left))) + 1e-12
         weight = 1.0 / np.maximum(np.abs(left) / (2.0 * size), 1.0) / size
         rows = np.vstack([columns * weight[:, None], own])
-        values = np.asarray(
-            np.linalg.lstsq(rows, np.append(observed * weight, np.zeros(len(prior))), rcond=None)[
-                0
-            ]
-        )
+        values = np.asarray(np.linalg.lstsq(
+            rows, np.append(observed * weight, np.zeros(len(prior))), rcond=None)[0])
         left = np.asarray(observed - columns @ values)
     return values, left
 
@@ -458,42 +412,35 @@ def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Arr
 def _outlying(left: Array) -> Array:
     """Return the variance of each point beside the usual one, larger where it stands out."""
     point = np.concatenate([[0.0], np.cumsum(left)])
-    middle = median_filter(point, 9, mode='nearest')
-    off = np.abs(point - middle)
+    off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # what drifts one way is its own median
-    size = (
-        1.4826
-        * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2)))) / math.sqrt(6.0))
-        + 1e-9
-    )
+    size = 1.4826 * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2))))
+                        / math.sqrt(6.0)) + 1e-9
     return np.clip(off / (3.0 * size), 1.0, _WILDEST) ** 2
 
 
-def _likelihood(spans: Spans, columns: Array, outlying: Array, prior: Array) -> GridFit:
+def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
+                     prior: Array) -> SpanFit:
     """Fit by the restricted likelihood over a grid of noise, rests beside the spans."""
     assert spans.log.time is not None
-    walk = _walk(spans)
+    columns, walk = all_columns(spans, causes), _walk(spans)
     still = np.array([spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
     low, high = spans.treatment.walk
-    parts = [
-        replace(
-            part,
-            diagonal=np.concatenate(
-                [part.diagonal, still if part.neighbours is None else 0.0 * still]
-            ),
-            neighbours=None
-            if part.neighbours is None
-            else np.concatenate([part.neighbours, 0.0 * still]),
-        )
-        for part in heading_noise(
-            spans.time, spans.rates(), outlying, angle_random_walk=(low * walk, high * walk)
-        )
-        if spans.treatment.of_heading or part.name == 'angle_random_walk'
-    ]
+    parts = [replace(part, diagonal=np.concatenate([
+        part.diagonal, still if part.neighbours is None else 0.0 * still]),
+        neighbours=None if part.neighbours is None
+        else np.concatenate([part.neighbours, 0.0 * still]))
+        for part in heading_noise(spans.time, spans.rates(), outlying,
+                                  angle_random_walk=(low * walk, high * walk))
+        if spans.treatment.of_heading or part.name == 'angle_random_walk']
     waves, shared = _waves(spans)
-    deviation = np.full(columns.shape[1], np.inf)
-    deviation[:3] = prior
-    return noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
+    deviation = np.concatenate([prior, np.full(columns.shape[1] - len(prior), np.inf)])
+    fit = noise_grid(spans.observed, columns, parts, waves, shared, prior_deviation=deviation)
+    values = fit.values.copy()
+    values[2] += spans.delay
+    done = SpanFit(spans, tuple(causes), fit, values, fit.covariance, np.zeros(len(values)), prior)
+    covariance, effective = _cluster_robust(whitened(done, causes), fit)
+    return replace(done, covariance=covariance, stretches_of=effective)
 
 
 def _walk(spans: Spans) -> float:
@@ -517,13 +464,12 @@ def _cluster_robust(data: Whitened, fit: GridFit) -> tuple[Array, Array]:
     left = data.observed - data.plain @ values
     influence = data.plain @ np.linalg.pinv(data.plain.T @ data.plain)[:, :count]
     scores = np.array([np.bincount(stretch, part * left, clusters) for part in influence.T])
-    found = clusters / max(clusters - 1.0, 1.0) * np.sum(scores**2, axis=1)
+    found = clusters / max(clusters - 1.0, 1.0) * np.sum(scores ** 2, axis=1)
     larger = np.maximum(np.sqrt(found / np.diag(fit.covariance)), 1.0)
     inside = stretch < data.of_log
-    shares = np.array(
-        [np.bincount(stretch[inside], part**2) for part in data.plain[inside, :count].T]
-    )
-    effective = shares.sum(axis=1) ** 2 / np.maximum((shares**2).sum(axis=1), 1e-300)
+    shares = np.array([np.bincount(stretch[inside], part ** 2)
+                       for part in data.plain[inside, :count].T])
+    effective = shares.sum(axis=1) ** 2 / np.maximum((shares ** 2).sum(axis=1), 1e-300)
     return fit.covariance * np.outer(larger, larger), effective
 
 
@@ -532,17 +478,14 @@ def _waves(spans: Spans) -> tuple[Array, list[SharedNoise]]:
     assert spans.log.time is not None
     treatment = spans.treatment
     unit = _walk(spans) if treatment.relative else 1.0
-    flicker, walk = (
-        None if limits is None else (limits[0] * unit, limits[1] * unit)
-        for limits in (treatment.flicker, treatment.random_walk)
-    )
+    flicker, walk = (None if limits is None else (limits[0] * unit, limits[1] * unit)
+                     for limits in (treatment.flicker, treatment.random_walk))
     waves, shared = wander(spans.time, flicker, walk, treatment.cosines)
     begin, end = spans.time[0], spans.time[-1]
     omega = math.pi * np.arange(1, waves.shape[1] + 1) / (end - begin)
     still = [np.clip(spans.log.time[list(rest)], begin, end) - begin for rest in spans.rests]
-    return np.vstack(
-        [waves, *(np.diff(np.sin(omega * each[:, None]), axis=0) / omega for each in still)]
-    ), shared
+    return np.vstack([waves, *(np.diff(np.sin(omega * each[:, None]), axis=0) / omega
+                               for each in still)]), shared
 
 
 def shared_noise(spans: Spans) -> list[SharedNoise]:
@@ -571,17 +514,16 @@ class Whitened:
     plain: Array
     stretch: NDArray[np.intp]
     of_log: int
-    _done: SpanFit
+    _fit: GridFit
 
     def columns(self, columns: Array) -> Array:
         """Return more columns, shape (n + r, k), in units of the noise, shape (n + r + m, k)."""
         more = len(self.observed) - len(columns)
-        return np.pad(self._done.fit.whiten(columns), ((0, more), (0, 0)))
+        return np.pad(self._fit.whiten(columns), ((0, more), (0, 0)))
 
 
-def whitened(
-    done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = None, most: bool = False
-) -> Whitened:
+def whitened(done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = None,
+             most: bool = False) -> Whitened:
     """
     Return the regression of a log on causes, under the noise of a fit of the same log.
 
@@ -596,12 +538,8 @@ def whitened(
     """
     spans, noise = done.spans, noise or done
     waves, shared = _waves(noise.spans)
-    sizes = {
-        part.name: noise.fit.sizes[part.name][2]
-        if most and part.name == 'rate_random_walk'
-        else noise.fit.likely[part.name]
-        for part in shared
-    }
+    sizes = {part.name: noise.fit.sizes[part.name][2] if most and part.name == 'rate_random_walk'
+             else noise.fit.likely[part.name] for part in shared}
     variance = np.sum([sizes[part.name] ** 2 * part.variance for part in shared], axis=0)
     columns = np.column_stack([all_columns(spans, causes), waves])
     width = columns.shape[1] - waves.shape[1]
@@ -610,10 +548,6 @@ def whitened(
     prior[3:, width:] = np.diag(1.0 / np.sqrt(variance))
     stretches = spans.stretches
     of_log = int(stretches.max()) + 1
-    return Whitened(
-        np.append(noise.fit.whiten(spans.observed), np.zeros(len(prior))),
-        np.concatenate([noise.fit.whiten(columns), prior]),
-        np.concatenate([stretches, of_log + np.arange(len(prior))]),
-        of_log,
-        noise,
-    )
+    return Whitened(np.append(noise.fit.whiten(spans.observed), np.zeros(len(prior))),
+                    np.concatenate([noise.fit.whiten(columns), prior]),
+                    np.concatenate([stretches, of_log + np.arange(len(prior))]), of_log, noise.fit)
