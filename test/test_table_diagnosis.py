@@ -57,7 +57,7 @@ LARGE = {'bias': 0.05, 'scale_factor_error': 0.05, 'scale_factor_asymmetry': 0.0
 @pytest.fixture
 def without_gain(monkeypatch):
     """Leave out what takes most of the time, where it does not matter."""
-    monkeypatch.setattr(diagnosis, 'measure_gain', lambda *given: None)
+    monkeypatch.setattr(diagnosis, '_gain', lambda *given: None)
 
 
 def gyro(name, size):
@@ -314,6 +314,9 @@ def test_an_extension_is_measured_on_sweeps_left_out_and_can_be_used(tmp_path):
     assert found.verdict == 'extended' and found.gain.rate.interval[0] > 0.0
     assert found.gain.rate.after < 1.2 * Table().dwell
     assert found.gain.heading.before == pytest.approx(60.0 * found.gain.rate.before)
+    assert found.gain.models['extended'] == pytest.approx(found.gain.heading.after)
+    assert found.gain.models['plain'] == pytest.approx(found.gain.heading.before)
+    assert all(each.remedy for each in found.findings)
     write_model(tmp_path / 'model.yaml', found.model)
     written = read_model(tmp_path / 'model.yaml')
     assert same_effects(written, found.model) and 'sine_response' in written.origin['ambiguous'][0]

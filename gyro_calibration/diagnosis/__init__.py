@@ -24,7 +24,7 @@ people to see), `build_findings`; where the reference limits what is known, `spa
 a regression), `confirmation` (of causes), `noisy_reference` (the diagnosis of such a log);
 `pipeline` (of a diagnosis, in order), `dwell_fit` (of what a model leaves of a rate table),
 `dwell_confounders` (that dwells cannot distinguish), `dwell_structure` (what has no name),
-`dwell_cross_validation` (on sweeps left out), `rate_table` (the diagnosis of a rate table),
-`words` (for people), `markup` (of pages), `charts` (in pages), `report` (the page).
+`rate_table` (the diagnosis of a rate table), `words` (for people), `markup` (of pages), `charts`
+(in pages), `report` (the page).
 
 """

@@ -317,11 +317,6 @@ def _scatter(dwells: Dwells, named: Named) -> Scatter | None:
     return named.fit.scatter if len(named.fit.scatter.kept) == len(dwells) else None
 
 
-def model_after(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
-    """Return the extended model."""
-    return assembled(dwells, model, named.fit)
-
-
 def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
     """Return a model with the values of a fit in place of its own, or beside them."""
     if model is None:

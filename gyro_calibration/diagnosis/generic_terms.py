@@ -18,7 +18,7 @@ none that is known here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 from gyro_calibration.diagnosis.candidates import Candidate, constant
@@ -57,16 +57,21 @@ def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
     variables = dict(_variables(replays))
     found = [each for name, of in variables.items() for each in _of_one(name, of)]
     if 'rate' in variables:
-        found += [*_of_rate(variables['rate']), *_of_heading(variables)]
-    for first, second in combinations(variables, 2):
+        found += _of_turning(variables)
+    for (first, one), (second, other) in combinations(variables.items(), 2):
         if (first, second) != ('rate', 'temperature'):  # their product has a name
-            found.append(_probe(f'{first} and {second}',
-                                _product(variables[first], variables[second])))
-    return [*found, *_of_time(replays)]
+            found.append(_term(f'{first} and {second}', _product(one, other)))
+    for run, each in enumerate(replays):
+        begin = float(each.channels.time[each.kept][0])
+        for width in BUMPS:
+            count = min(MOMENTS, round(1.0 / width)) // len(replays) + 3
+            for moment in begin + each.duration * np.linspace(0.0, 1.0, count)[1:-1]:
+                found.append(_term('time', _bump(moment, width * each.duration), run, moment))
+    return found
 
 
-def _probe(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None,
-           *shapes: float) -> Candidate:
+def _term(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None,
+          *shapes: float) -> Candidate:
     return Candidate(UNNAMED + name, shapes, columns, run)
 
 
@@ -91,68 +96,45 @@ def _scaled(of: Of, low: float, high: float) -> Of:
     return lambda each: np.clip((2.0 * of(each) - low - high) / (high - low), -1.0, 1.0)
 
 
+def _of(of: Of, shape: Callable[..., Sequence[Array]],
+        value: Array | float) -> Callable[[Replay], Sequence[Array]]:
+    """Return the columns of a function of a variable and a value."""
+    return lambda each: shape(of(each), value)
+
+
+def _product(one: Of, other: Of) -> Callable[[Replay], Sequence[Array]]:
+    return lambda each: (one(each) * other(each),)
+
+
 def _of_one(name: str, of: Of) -> Iterator[Candidate]:
     for waves in WAVES.get(name, _OTHER_WAVES):
-        yield _probe(name, _wave(of, waves))
+        yield _term(name, _of(of, lambda x, waves: (np.sin(np.pi * waves * x),
+                                                    np.cos(np.pi * waves * x)), waves))
     for power in (2, 4, 5) if name == 'rate' else (3, 4) if name == 'temperature' else (2, 3):
         if (name, power) != ('rate', 2):
-            yield _probe(name, _power(of, power))
+            yield _term(name, _of(of, lambda x, power: (x ** power,), power))
     for steep in (-8.0, -4.0, 4.0, 8.0):
-        yield _probe(name, _exponential(of, steep))
-    for knots in KNOTS.get(name, _OTHER_KNOTS):
-        yield _probe(name, _spline(of, knots))
+        yield _term(name, _of(of, lambda x, steep: (np.exp(steep * x - abs(steep)),), steep))
+    for count in KNOTS.get(name, _OTHER_KNOTS):
+        knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
+        # together they are constant, which is the bias
+        yield _term(name, _of(of, lambda x, knots: tuple(
+            BSpline.design_matrix(x, knots, 3).toarray().T[1:]), knots))
 
 
-def _wave(of: Of, waves: float) -> Callable[[Replay], Sequence[Array]]:
-    def columns(each: Replay) -> Sequence[Array]:
-        phase = np.pi * waves * of(each)
-        return np.sin(phase), np.cos(phase)
-    return columns
-
-
-def _power(of: Of, power: int) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (of(each) ** power,)
-
-
-def _exponential(of: Of, steep: float) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (np.exp(steep * of(each) - abs(steep)),)
-
-
-def _spline(of: Of, count: int) -> Callable[[Replay], Sequence[Array]]:
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1.0, 1.0, count - 2), [1.0] * 3])
-
-    def columns(each: Replay) -> Sequence[Array]:
-        table = BSpline.design_matrix(of(each), knots, 3).toarray().T
-        return tuple(table[1:])  # together they are constant, which is the bias
-    return columns
-
-
-def _product(first: Of, second: Of) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (first(each) * second(each),)
-
-
-def _of_rate(rate: Of) -> Iterator[Candidate]:
-    for power in (0.25, 0.5, 0.75, 1.5):
-        yield _probe('rate', _root(rate, power, odd=False))
-        yield _probe('rate', _root(rate, power, odd=True))
-
-
-def _root(rate: Of, power: float, odd: bool) -> Callable[[Replay], Sequence[Array]]:
-    def columns(each: Replay) -> Sequence[Array]:
-        value = rate(each)
-        return (np.abs(value) ** power * (np.sign(value) if odd else 1.0),)
-    return columns
-
-
-def _of_heading(variables: dict[str, Of]) -> Iterator[Candidate]:
+def _of_turning(variables: Mapping[str, Of]) -> Iterator[Candidate]:
+    """Give roots of the rate, and harmonics of the heading, alone and times a variable."""
     rate = variables['rate']
+    for power in (0.25, 0.5, 0.75, 1.5):
+        yield _term('rate', _of(rate, lambda x, power: (np.abs(x) ** power,), power))
+        yield _term('rate', _of(rate, lambda x, power: (np.abs(x) ** power * np.sign(x),), power))
     for harmonic in HARMONICS:
-        yield _probe('heading', _harmonic(harmonic, None))
+        yield _term('heading', _harmonic(harmonic, None))
     for harmonic in HARMONICS[:3]:
-        yield _probe('rate and heading', _harmonic(harmonic, rate))
+        yield _term('rate and heading', _harmonic(harmonic, rate))
     for name in ('temperature', 'supply'):
         if name in variables:
-            yield _probe(f'{name} and heading', _harmonic(1, variables[name]))
+            yield _term(f'{name} and heading', _harmonic(1, variables[name]))
 
 
 def _harmonic(number: int, times: Of | None) -> Callable[[Replay], Sequence[Array]]:
@@ -160,15 +142,6 @@ def _harmonic(number: int, times: Of | None) -> Callable[[Replay], Sequence[Arra
         phase, factor = number * each.channels.heading, 1.0 if times is None else times(each)
         return factor * np.sin(phase), factor * np.cos(phase)
     return columns
-
-
-def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
-    for run, each in enumerate(replays):
-        begin = float(each.channels.time[each.kept][0])
-        for width in BUMPS:
-            for moment in begin + each.duration * np.linspace(
-                    0.0, 1.0, min(MOMENTS, round(1.0 / width)) // len(replays) + 3)[1:-1]:
-                yield _probe('time', _bump(moment, width * each.duration), run, moment)
 
 
 def _bump(middle: float, width: float) -> Callable[[Replay], Sequence[Array]]:

@@ -97,7 +97,14 @@ def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
     if log.time is None:
         return log, ()
-    log, said = _chosen(log)
+    counts = [0 if values is None else int(np.isfinite(values).sum())
+              for values in (log.reference_rate, log.reference_heading)]
+    by_rate = counts[0] > 0 and 2 * counts[0] >= counts[1]
+    said = () if by_rate or not counts[0] else (
+        f'The reference rate is known in {counts[0]} samples only; '
+        f'the heading, known in {counts[1]}, is used.',)
+    log = replace(log, reference_rate=log.reference_rate if by_rate else None,
+                  reference_heading=log.reference_heading if counts[1] else None)
     rate = reference_rate(log)
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not rests(log):
         return log, said
@@ -115,23 +122,19 @@ def evened(log: Log) -> Log:
     return replace(log, reference_rate=rate, reference_heading=heading)
 
 
-def _chosen(log: Log) -> tuple[Log, tuple[str, ...]]:
-    rate, heading = (0 if values is None else int(np.isfinite(values).sum())
-                     for values in (log.reference_rate, log.reference_heading))
-    by_rate = rate > 0 and 2 * rate >= heading
-    log = replace(log, reference_rate=log.reference_rate if by_rate else None,
-                  reference_heading=log.reference_heading if heading else None)
-    said = (f'The reference rate is known in {rate} samples only; '
-            f'the heading, known in {heading}, is used.')
-    return log, () if by_rate or not rate else (said,)
-
-
 def rests(log: Log) -> bool:
     """Tell whether a gyro rests all the time: by reference, moving flag, or its own output."""
     rate = reference_rate(log)
     if rate is not None:
         return not np.nanmax(np.abs(rate)) > 0.0 or _stands(log, rate)
-    return bool((log.moving == 0.0).all()) if log.moving is not None else _is_steady(log)
+    if log.moving is not None:
+        return bool((log.moving == 0.0).all())
+    if log.time is None or log.output is None or np.isfinite(log.output).sum() < FEWEST:
+        return False
+    second = np.floor(log.time - log.time[0]).astype(np.int64)
+    second = np.unique(second, return_inverse=True)[1]
+    means = np.bincount(second, bridged(log.output)) / np.bincount(second)
+    return float(np.abs(means - np.median(means)).max()) < REST
 
 
 def _stands(log: Log, rate: Array) -> bool:
@@ -145,15 +148,6 @@ def _stands(log: Log, rate: Array) -> bool:
     # In units of its own, for a rate of next to nothing would be lost beside the line's constant.
     line = line_between(log.time, rate / np.nanmax(np.abs(rate)), log.output)
     return line is None or abs(line.factor) < _FOLLOWED * line.deviation
-
-
-def _is_steady(log: Log) -> bool:
-    if log.time is None or log.output is None or np.isfinite(log.output).sum() < FEWEST:
-        return False
-    second = np.floor(log.time - log.time[0]).astype(np.int64)
-    second = np.unique(second, return_inverse=True)[1]
-    means = np.bincount(second, bridged(log.output)) / np.bincount(second)
-    return float(np.abs(means - np.median(means)).max()) < REST
 
 
 def _refuse_table(log: Log, output: Array) -> None:

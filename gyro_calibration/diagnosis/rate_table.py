@@ -24,35 +24,40 @@ from gyro_calibration.calibration.rate_table import (
     fit_effects,
 )
 from gyro_calibration.calibration.scatter import (
+    FEWEST_SWEEPS,
     freedom_beside_surface,
+    parts_of,
     rms,
+    Scatter,
     SMALLEST_TEMPERATURE_SPREAD,
+    summed,
     Uncertainty,
     Whitener,
 )
 from gyro_calibration.calibration.selection import supported_effects, swapped_effects
+from gyro_calibration.diagnosis.build_findings import with_remedies
 from gyro_calibration.diagnosis.causes import CAUSES
-from gyro_calibration.diagnosis.cross_validation import WINDOW
+from gyro_calibration.diagnosis.cross_validation import change_over, WINDOW
 from gyro_calibration.diagnosis.data_quality import decided, inspect
 from gyro_calibration.diagnosis.dwell_confounders import alternatives
-from gyro_calibration.diagnosis.dwell_cross_validation import curves, measure_gain
 from gyro_calibration.diagnosis.dwell_fit import (
+    assembled,
     change_of,
     doubt,
-    model_after,
     model_before,
     name_causes,
     Named,
     NUISANCES,
     seen,
+    simulated,
     tried,
 )
 from gyro_calibration.diagnosis.dwell_structure import Left, RATE, SINGLE_RATES, what_is_left
 from gyro_calibration.diagnosis.extended_model import notes_of
-from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.findings import Curve, Diagnosis, Estimate, Finding, Gain
 from gyro_calibration.diagnosis.input_validation import refuse
 from gyro_calibration.diagnosis.units import amount
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model.effects import (
     CUBIC_NONLINEARITY,
     Effect,
@@ -83,6 +88,10 @@ _METHOD = (
     'temperature and the order of the',
     'dwells were tried on what is left. What is won was measured on sweeps that took no part in '
     'choice or fit; intervals are of 95 %.')
+#: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
+_MOST_GROUPS = 8
+#: Bins of a curve at most, and dwells in each at least.
+_MOST_BINS, _DWELLS_A_BIN = 40, 4
 #: A name is withdrawn where more than this part of what it explains is left along its variable.
 _WITHDRAWN = 0.1
 
@@ -103,34 +112,32 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
 
     """
     dwells = table if isinstance(table, Dwells) else from_table(table)
-    refuse(_as_log(dwells), model)
-    _refuse_one_rate(dwells)
-    record = decided(inspect(_as_log(dwells), model))
-    dwells = replace(dwells, output=dwells.output * record.factor)
-    known = _conclude(dwells, model, rate)
-    gain = (measure_gain(dwells, lambda part: _models(part, model, rate, known.withdrawn))
-            if known.named.causes else None)
-    before = model_before(dwells, model, known.named)
-    offered = bool(known.named.causes) and not (gain is not None and gain.worse)
-    after = model_after(dwells, model, known.named) if offered else before
-    findings = (*record.findings, *_outliers(dwells, known.named.fit, _OUTLYING * rate),
-                *_findings(known.named))
-    return Diagnosis(
-        findings, known.left.found, Noise(), Noise() if model is None else model.noise, gain,
-        before, _noted(after, findings, before, record.factor), _cannot_show(dwells),
-        curves(dwells, known.named.fit.scatter, before, after),
-        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)),
-        false_alarm_rate=rate, method=' '.join(_METHOD).format(share=100.0 * rate))
-
-
-def _as_log(dwells: Dwells) -> Log:
-    return Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
-
-
-def _refuse_one_rate(dwells: Dwells) -> None:
+    log = Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
+    refuse(log, model)
     if not np.ptp(dwells.rate) > 0.0:
         raise DataRefused('all dwells have one rate, so that nothing tells the scale factor from '
                           'the bias; record several rates, both ways')
+    record = decided(inspect(log, model))
+    dwells = replace(dwells, output=dwells.output * record.factor)
+    known = _conclude(dwells, model, rate)
+    named = known.named
+    gain = _gain(dwells, model, rate, known.withdrawn) if named.causes else None
+    before = model_before(dwells, model, named)
+    offered = bool(named.causes) and not (gain is not None and gain.worse)
+    after = assembled(dwells, model, named.fit) if offered else before
+    strengths = {effect: _strength_of(named, effect) for effect in named.causes}
+    findings = with_remedies([
+        *record.findings, *_outliers(dwells, named.fit, _OUTLYING * rate),
+        *(_finding(named, effect)
+          for effect in sorted(named.causes, key=lambda each: -strengths[each]))], {}, after)
+    if after is not before:
+        after = replace(after, origin={**after.origin, **notes_of(findings, [record.factor])})
+    return Diagnosis(
+        tuple(findings), known.left.found, Noise(), Noise() if model is None else model.noise,
+        gain, before, after, _cannot_show(dwells),
+        curves(dwells, named.fit.scatter, before, after),
+        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)),
+        false_alarm_rate=rate, method=' '.join(_METHOD).format(share=100.0 * rate))
 
 
 # the steps
@@ -146,29 +153,49 @@ class _Known:
 
 def _conclude(dwells: Dwells, model: GyroModel | None, rate: float) -> _Known:
     """Name causes, and withdraw names along a variable where much has none."""
-    named = name_causes(dwells, model, rate)
-    left = what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model))
-    withdrawn = frozenset(effect.name for effect in named.causes if effect not in NUISANCES
-                          and _doubtful(named, left, effect))
-    if not withdrawn:
-        return _Known(named, left)
-    named = name_causes(dwells, model, rate, withdrawn)
-    return _Known(named, what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model)),
-                  withdrawn)
+    def concluded(withdrawn: frozenset[str]) -> _Known:
+        named = name_causes(dwells, model, rate, withdrawn)
+        return _Known(named, what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model)),
+                      withdrawn)
+
+    known = concluded(frozenset())
+    named, misfit = known.named, known.left.misfit
+    withdrawn = frozenset(
+        effect.name for effect in named.causes if effect not in NUISANCES
+        and max((gain for name, gain in misfit.items()
+                 if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
+        > _WITHDRAWN * _strength_of(named, effect))
+    return concluded(withdrawn) if withdrawn else known
 
 
-def _doubtful(named: Named, left: Left, effect: Effect) -> bool:
-    """Tell whether much is left along the variable beside what the effect explains."""
-    along, explained = CAUSES[effect.name].along, _strength_of(named, effect)
-    return max((gain for name, gain in left.misfit.items() if along in name.split('_times_')),
-               default=0.0) > _WITHDRAWN * explained
-
-
-def _models(dwells: Dwells, model: GyroModel | None, rate: float,
-            withdrawn: frozenset[str]) -> tuple[GyroModel, GyroModel]:
-    """Return the simulation before and extended, with causes chosen anew from some dwells."""
-    named = name_causes(dwells, model, rate, withdrawn)
-    return model_before(dwells, model, named), model_after(dwells, model, named)
+def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
+          withdrawn: frozenset[str]) -> Gain | None:
+    """Choose causes anew and fit without some sweeps in turn, and predict these; None if never."""
+    parts = parts_of(dwells)
+    groups = parts * min(_MOST_GROUPS, parts.max() + 1) // (parts.max() + 1)
+    errors = {name: np.full(len(dwells), np.nan) for name in ('given', 'plain', 'extended')}
+    for number in np.unique(groups):
+        hidden = groups == number
+        rest, left_out = take(dwells, ~hidden), take(dwells, hidden)
+        try:
+            named = name_causes(rest, model, rate, withdrawn)
+            models = (model or GyroModel(), model_before(rest, None, named),
+                      assembled(rest, model, named.fit))
+        except DataRefused:
+            continue
+        for each, error in zip(models, errors.values()):
+            error[hidden] = left_out.output - simulated(each, left_out)
+    known = np.isfinite(errors['extended'])
+    if not known.any():
+        return None
+    numbered = np.unique(parts[known], return_inverse=True)[1]
+    both = np.column_stack([errors['plain' if model is None else 'given'], errors['extended']])
+    change = change_over(summed(both[known] ** 2, numbered), np.bincount(numbered).astype(float))
+    what = 'sweeps' if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 'consecutive dwells'
+    # A heading error is that of so long a turn at the rate of a dwell.
+    return Gain(f'{what} left out, each of {groups.max() + 1} groups in turn', change,
+                change.scaled(WINDOW), WINDOW,
+                {name: WINDOW * float(rms(error[known])) for name, error in errors.items()})
 
 
 def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
@@ -200,13 +227,6 @@ def _deviation_from(fit: Calibration) -> Array:
 
 # findings
 
-def _findings(named: Named) -> list[Finding]:
-    """Return the named causes, the strongest first."""
-    strengths = {effect: _strength_of(named, effect) for effect in named.causes}
-    return [_finding(named, effect)
-            for effect in sorted(named.causes, key=lambda each: -strengths[each])]
-
-
 def _strength_of(named: Named, effect: Effect) -> float:
     """Return by what the sum of squares falls with a cause."""
     if effect not in NUISANCES:
@@ -229,28 +249,21 @@ def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
 def _finding(named: Named, effect: Effect) -> Finding:
     cause, others = CAUSES[effect.name], alternatives(named.fit, effect)
     along = 'temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE else cause.along
-    return Finding(effect.name, cause.sentence, _estimates(named, effect), named.chance_of(effect),
+    term, deviations = _with_deviations(named.fit, effect)
+    own, parameters = _own_values(named, effect), effect.parameters
+    # what is added to the model's values; 1.96 deviations hold 95 %
+    estimates = {parameters[place].name: Estimate.about(
+        term.values[place] - own[place], 1.96 * deviation, parameters[place].unit)
+        for place, deviation in zip(term.fitted, deviations)}
+    return Finding(effect.name, cause.sentence, estimates, named.chance_of(effect),
                    _smallest(named, effect), others.names, others.separate_by,
                    _evidence(named, effect), along)
-
-
-def _estimates(named: Named, effect: Effect) -> dict[str, Estimate]:
-    """Return what is added to the model's values of an effect; 1.96 deviations hold 95 %."""
-    term, deviations = _with_deviations(named.fit, effect)
-    own = _own_values(named, effect)
-    return {effect.parameters[place].name: _estimate(term.values[place] - own[place], deviation,
-                                                     effect.parameters[place].unit)
-            for place, deviation in zip(term.fitted, deviations)}
 
 
 def _own_values(named: Named, effect: Effect) -> tuple[float, ...]:
     """Return the values that the model has of an effect, 0 where it has none."""
     return next((term.values for term in named.model.terms if term.effect is effect),
                 (0.0,) * len(effect.parameters))
-
-
-def _estimate(value: float, deviation: float, unit: str) -> Estimate:
-    return Estimate(value, (value - 1.96 * deviation, value + 1.96 * deviation), unit)
 
 
 def _with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float]]:
@@ -313,13 +326,6 @@ def _evidence(named: Named, effect: Effect) -> str:
 
 # what a person should know
 
-def _noted(model: GyroModel, findings: tuple[Finding, ...], before: GyroModel,
-           factor: float) -> GyroModel:
-    """Return the extended model with notes for its file: what is ambiguous, and the factor."""
-    return (model if model is before
-            else replace(model, origin={**model.origin, **notes_of(findings, [factor])}))
-
-
 def _remarks(dwells: Dwells, model: GyroModel | None, known: _Known, gain: Gain | None,
              offered: bool) -> Iterator[str]:
     fit = known.named.fit
@@ -335,17 +341,13 @@ def _remarks(dwells: Dwells, model: GyroModel | None, known: _Known, gain: Gain 
     if any(each.along == SINGLE_RATES for each in known.left.found):
         yield ('What repeats at single rates may be of the table, or of the place within a sweep '
                'where all sweeps have the same order.')
-    yield _scatter_said(fit)
+    scatter = fit.scatter
+    yield (f'Dwells scatter by {scatter.dwell / DEGREE:.2g} deg/s and '
+           f'{100.0 * scatter.dwell_scale:.2g} % of the rate, sweeps by '
+           f'{scatter.sweep_bias / DEGREE:.2g} deg/s in bias and '
+           f'{100.0 * scatter.sweep_scale:.2g} % in scale factor.')
     if model is not None:
         yield from _of_model(dwells, model, fit)
-
-
-def _scatter_said(fit: Calibration) -> str:
-    scatter = fit.scatter
-    return (f'Dwells scatter by {scatter.dwell / DEGREE:.2g} deg/s and '
-            f'{100.0 * scatter.dwell_scale:.2g} % of the rate, sweeps by '
-            f'{scatter.sweep_bias / DEGREE:.2g} deg/s in bias and '
-            f'{100.0 * scatter.sweep_scale:.2g} % in scale factor.')
 
 
 def _of_model(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterator[str]:
@@ -419,3 +421,51 @@ def _cannot_show(dwells: Dwells) -> dict[str, str]:
             thermal, f'the temperature varies by {np.ptp(dwells.temperature):.2g} K only; repeat '
             'the rates at another temperature')}
     return found
+
+
+# curves, for people to see
+
+def curves(dwells: Dwells, scatter: Scatter, before: GyroModel,
+           after: GyroModel) -> tuple[Curve, ...]:
+    """Return the errors of dwells, without outliers, along rate, temperature and their order."""
+    used = take(dwells, scatter.kept)
+    ways, straight = np.sign(used.rate), np.ones(len(used))
+    found = [_curve('rate', 'rad/s', used.rate, straight, used, scatter, before, after),
+             _curve('order_of_dwells', '', np.arange(1.0, len(used) + 1.0), straight, used,
+                    scatter, before, after)]
+    if used.temperature is not None and np.ptp(used.temperature) > 0.0:
+        found.append(_curve('temperature', 'degC', used.temperature, straight, used, scatter,
+                            before, after))
+        # A scale factor that changes with temperature averages out over turns both ways, unless
+        # errors count in the sense of the turn.
+        found.append(_curve('temperature_while_turning', 'degC', used.temperature, ways, used,
+                            scatter, before, after))
+    return tuple(found)
+
+
+def _curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells, scatter: Scatter,
+           before: GyroModel, after: GyroModel) -> Curve:
+    outputs = [simulated(model, dwells) for model in (before, after)]
+    errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]),
+              sign * (outputs[0] - dwells.rate)]
+    bins = list(_bins(values, sign != 0.0))
+    at, *means = (np.array([float(each[chosen].mean()) for chosen in bins])
+                  for each in (values, *errors))
+    deviation = np.array([_deviation(dwells, scatter, sign, chosen) for chosen in bins])
+    return Curve(along, unit, at, means[0], means[1], deviation, means[2])
+
+
+def _bins(values: Array, wanted: Mask) -> Iterator[Mask]:
+    """Give the members of bins of equal width that hold something."""
+    count = max(1, min(_MOST_BINS, len(np.unique(values)), len(values) // _DWELLS_A_BIN))
+    edges = np.linspace(values.min(), values.max(), count + 1)
+    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, count - 1)
+    yield from (chosen for number in range(count) if (chosen := (place == number) & wanted).any())
+
+
+def _deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> float:
+    """Return the standard deviation of the mean error of dwells; a sweep shares a part of it."""
+    part = take(dwells, chosen)
+    shared = summed(sign[chosen, None] * scatter.shared(part),
+                    np.unique(part.sweep, return_inverse=True)[1])
+    return math.sqrt(float(np.sum(scatter.deviation(part) ** 2) + np.sum(shared ** 2))) / len(part)
