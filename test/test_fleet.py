@@ -15,15 +15,20 @@ import os
 import struct
 
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
+from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.outliers import changes, outliers
 from gyro_calibration.fleet.pooling import Observed, Pooled
+from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.run import finished, Lost, processes
 from gyro_calibration.fleet.summary import data, sentences, summarized
 from gyro_calibration.fleet.table import described, entries, Entry, pattern
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Log, write_log
+from gyro_calibration.model.gyro_model import GyroModel, Tolerance
+from gyro_calibration.model.model_file import read_model, write_model
+from gyro_calibration.model.motion import from_rates
 import numpy as np
 import pytest
 from scipy import stats
@@ -125,8 +130,7 @@ def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
     lost = found.pop(KILLS)
     assert isinstance(lost, Lost) and 'killed' in str(lost)
     assert found.pop(TAKES_ALL_MEMORY) == 'no memory'
-    assert found == {number: number for number in range(10)
-                     if number not in (KILLS, TAKES_ALL_MEMORY)}
+    assert found == {number: number for number in {*range(10)} - {KILLS, TAKES_ALL_MEMORY}}
 
 
 # the verb
@@ -227,7 +231,8 @@ def records(ramp=0.0, wander=1.0):
     def of(value, deviation, unit):
         return {'value': value, 'deviation': deviation, 'unit': unit}
     return [{'log': f'{drive}{unit}', 'unit': str(unit), 'type': 'DOT', 'drive': 'hijk'[drive],
-             'date': '', 'temperature': None, 'diagnosis': None, 'page': '', 'values': {
+             'date': '', 'temperature': None, 'diagnosis': None, 'page': '',
+             'noise': {'angle_random_walk': 1e-4}, 'values': {
                  'bias': of(unit + 1e-3 * generator.standard_normal(), 1e-3, 'rad/s'),
                  'time_offset': of(off[drive] + 1e-3 * generator.standard_normal(), 1e-3, 's')},
              'slow': {'rate_ramp': of(ramp + wander * generator.standard_normal(), wander,
@@ -241,3 +246,34 @@ def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
     assert "bias is the unit's" in told and "time_offset is the reference's" in told
     assert said in told and 'stands out' not in told
     json.dumps(data(found), allow_nan=False)
+
+
+# models
+
+def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
+    (found,) = summarized(records())
+    said = dict(models(found))
+    assert set(said) == {'', *'01234'}
+    bias = found.values['bias']
+    for name, interval, place in (('', bias.new_unit, 0), ('3', bias.next_log, 3)):
+        write_model(tmp_path / 'model.yaml', said[name])
+        model = read_model(tmp_path / 'model.yaml')
+        values = {term.effect.name: term.values[0] for term in model.terms}
+        spread = np.sqrt(model.prior[1, 1])
+        assert set(values) == {'bias'} and model.gyro['name'] == 'DOT'
+        assert values['bias'] - 1.96 * spread == pytest.approx(interval.low[place])
+        assert values['bias'] + 1.96 * spread == pytest.approx(interval.high[place])
+    assert GyroModel(tolerance=Tolerance(bias=1.0)).prior is None
+
+
+def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open():
+    """The scale of a gyro whose type is known to 0.1 %, against wheels that slip."""
+    time = np.arange(0.0, 20.0, 0.02)
+    motion = from_rates(time, 0.5 * np.sin(2.0 * np.pi * time / 10.0))
+    noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
+    rate = 1.01 * motion.rate_at(time) + 0.002 + noise
+    alone, drawn = (self_calibrate(time, rate, motion, prior=prior)
+                    for prior in (None, np.diag([1e-3 ** 2, 0.01 ** 2])))
+    assert np.sqrt(alone.covariance[0, 0]) > 5e-3 > 1e-3 > np.sqrt(drawn.covariance[0, 0])
+    assert abs(drawn.scale_factor_error) < 0.05 * abs(alone.scale_factor_error)
+    assert drawn.bias == pytest.approx(alone.bias, rel=0.05)

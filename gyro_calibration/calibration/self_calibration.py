@@ -186,7 +186,8 @@ METHODS = {'likelihood': fit_likelihood, 'heading': fit_heading, 'rate': fit_rat
 
 def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'likelihood',
                    limits: Limits | None = None, noise: Noise | None = None,
-                   reference: Reference | None = None, output: Array | None = None) -> Fit:
+                   reference: Reference | None = None, output: Array | None = None,
+                   prior: Array | None = None) -> Fit:
     """
     Fit a run by one of `METHODS` and refuse one that is not credible.
 
@@ -200,6 +201,8 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
     output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
         dead or at its limit
+    prior : covariance of (s, b) about zero before the run, as `GyroModel.prior` of a fleet, shape
+        (2, 2); what the run leaves open is drawn to it, in a method that gives a covariance
 
     Raises
     ------
@@ -220,8 +223,18 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         fit = METHODS[method](time, rate, motion)
     fit = replace(fit, covariance=fit.covariance + _shared(fit, reference, noise),
                   goodness=_goodness(fit, reference, noise))
+    if prior is not None and np.isfinite(fit.covariance).all():
+        fit = _drawn(fit, prior)
     _refuse_fit(fit, run, motion, limits)
     return fit
+
+
+def _drawn(fit: Fit, prior: Array) -> Fit:
+    """Return the fit together with what was known of (s, b) before, about zero."""
+    gain = prior @ np.linalg.inv(prior + fit.covariance)
+    s, b = gain @ (fit.scale_factor_error, fit.bias)
+    return replace(fit, scale_factor_error=float(s), bias=float(b),
+                   covariance=gain @ fit.covariance)
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,

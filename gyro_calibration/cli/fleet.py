@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -23,11 +24,12 @@ import textwrap
 from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
-from gyro_calibration.cli.verb import Answer, bar, positive, UsageError, verb, whole
+from gyro_calibration.cli.verb import Answer, bar, origin_of, positive, UsageError, verb, whole
 from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.units import amount, quantity
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
+from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
 from gyro_calibration.fleet.summary import (
     data as type_data,
@@ -42,6 +44,7 @@ from gyro_calibration.fleet.summary import (
 from gyro_calibration.fleet.table import entries, Entry, pattern
 from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
 from gyro_calibration.logs.log import DataRefused
+from gyro_calibration.model.model_file import model_text
 import numpy as np
 
 #: Lines for people are not longer.
@@ -115,10 +118,27 @@ def _fleet(given: argparse.Namespace) -> Answer:
             'false_alarm_rate': FALSE_ALARMS,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in left],
             'types': [type_data(found) for found in types]}
-    write_atomically(Path(given.out) / 'fleet.json',
-                     json.dumps(data, indent=1, allow_nan=False).encode())
-    lines += ['', f'Written to {given.out}: fleet.json.']
+    written = _written(given, types, data)
+    lines += ['', f'Written to {given.out}: {", ".join(written)}.']
     return Answer('\n'.join(lines), data)
+
+
+def _written(given: argparse.Namespace, types: Sequence[TypeFound], data: dict[str, Any]
+             ) -> list[str]:
+    """Write the results, and return the names of their files."""
+    content = {'fleet.json': json.dumps(data, indent=1, allow_nan=False) + '\n'}
+    for found in types:
+        for unit, model in models(found):
+            name = _file_name(found.name or 'type') + (f'-unit-{_file_name(unit)}' if unit else '')
+            origin = {**model.origin, **origin_of([])}
+            content[f'models/{name}.yaml'] = model_text(replace(model, origin=origin))
+    for name, text in content.items():
+        write_atomically(Path(given.out) / name, text.encode())
+    return [name for name in content if '-unit-' not in name]
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r'[^A-Za-z0-9_.-]', '_', text)
 
 
 def _lines(found: TypeFound) -> Iterator[str]:

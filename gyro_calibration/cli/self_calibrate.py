@@ -121,7 +121,8 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rates = compensate_log(with_self_calibration(model, None), log)
     fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
-                         reference=_goodness(given, motion), output=output[run])
+                         reference=_goodness(given, motion), output=output[run],
+                         prior=model.prior)
     if given.picture:
         draw_run(given.picture, time[run] - _late(fit), rates[run],
                  (rates[run] - fit.bias) / (1.0 + fit.scale_factor_error), motion)

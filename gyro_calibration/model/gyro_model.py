@@ -248,6 +248,19 @@ class GyroModel:
         return tuple(name for name, value in vars(self.tolerance).items()
                      if value > 0.0 and name not in found)
 
+    @cached_property
+    def prior(self) -> Array | None:
+        """
+        Return the covariance of (s, b) of a self-calibration before its run, shape (2, 2).
+
+        A model of a fleet holds what is usual of its type, and by its tolerance how far a unit may
+        be from that; other tolerances are those of one gyro in a laboratory, and no prior.
+
+        """
+        if 'fleet' not in self.origin:
+            return None
+        return np.diag([self.tolerance.scale_factor_error ** 2, self.tolerance.bias ** 2])
+
     def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
         """
         Return how far outputs and temperatures are outside of those that were seen, rad/s and K.

@@ -534,7 +534,7 @@ class CalibrationSession:
         estimator, now = self._estimator, datetime.fromtimestamp(self._clock.date(), timezone.utc)
         noise = estimator.model.noise
         calibration, remark = calibrated(run, self._rules, noise,
-                                         now.isoformat(timespec='seconds'))
+                                         now.isoformat(timespec='seconds'), estimator.model.prior)
         if run.kind == REST:
             calibration = self._with_scale(calibration)
         difference = changed(estimator.claimed, calibration, noise,
@@ -556,9 +556,12 @@ class CalibrationSession:
         return replace(bias, scale_factor_error=last.scale_factor_error, covariance=covariance)
 
 
-def calibrated(run: Run, rules: Rules, noise: Noise, when: str) -> tuple[SelfCalibration, str]:
+def calibrated(run: Run, rules: Rules, noise: Noise, when: str,
+               prior: Array | None = None) -> tuple[SelfCalibration, str]:
     """
     Return the calibration that a complete run gives, and a remark.
+
+    The prior is that of the model, of a fleet; a run against a motion is drawn to it.
 
     Raises
     ------
@@ -576,7 +579,7 @@ def calibrated(run: Run, rules: Rules, noise: Noise, when: str) -> tuple[SelfCal
         return (record(found.fit, 'turns', when, run.temperature),
                 f'{abs(found.turns)} whole turns in {found.duration:.1f} s')
     begin, motion = (time[0], run.motion) if run.motion is not None else _odometry_motion(run)
-    return _compared(run, time - begin, rate, output, motion, rules, noise, when)
+    return _compared(run, time - begin, rate, output, motion, rules, noise, when, prior)
 
 
 def _odometry_motion(run: Run) -> tuple[float, Motion]:
@@ -596,12 +599,13 @@ def _odometry_motion(run: Run) -> tuple[float, Motion]:
 
 
 def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion, rules: Rules,
-              noise: Noise, when: str) -> tuple[SelfCalibration, str]:
+              noise: Noise, when: str, prior: Array | None) -> tuple[SelfCalibration, str]:
     """Fit a run to its motion, and check it by the rest after it."""
     limits, odometry = rules.limits, run.kind == ODOMETRY
     inside = (time >= -limits.time_offset) & (time <= motion.duration + limits.time_offset)
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
-                         reference=rules.odometry if odometry else None, output=output[inside])
+                         reference=rules.odometry if odometry else None, output=output[inside],
+                         prior=prior)
     remarks = [f'the gyro lags by {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:
         remarks.append(str(fit.goodness))
