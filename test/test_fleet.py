@@ -10,6 +10,8 @@
 
 """A fleet: which log is of which unit, workers that die, and the verb on good and bad input."""
 
+import csv
+import io
 import json
 import os
 import struct
@@ -21,9 +23,11 @@ from gyro_calibration.files import InputError
 from gyro_calibration.fleet.outliers import changes, outliers
 from gyro_calibration.fleet.pooling import Observed, Pooled
 from gyro_calibration.fleet.prior import models
-from gyro_calibration.fleet.run import finished, Lost, processes
+from gyro_calibration.fleet.report import report
+from gyro_calibration.fleet.run import cluster, finished, Lost, processes
 from gyro_calibration.fleet.summary import data, sentences, summarized
 from gyro_calibration.fleet.table import described, entries, Entry, pattern
+from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Log, write_log
 from gyro_calibration.model.gyro_model import GyroModel, Tolerance
@@ -277,3 +281,35 @@ def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open
     assert np.sqrt(alone.covariance[0, 0]) > 5e-3 > 1e-3 > np.sqrt(drawn.covariance[0, 0])
     assert abs(drawn.scale_factor_error) < 0.05 * abs(alone.scale_factor_error)
     assert drawn.bias == pytest.approx(alone.bias, rel=0.05)
+
+
+# pages, tables, clusters
+
+def test_the_page_names_units_drives_and_logs_and_escapes_what_it_shows():
+    logs = [{**each, 'unit': f'<{each["unit"]}>', 'page': 'logs/a.html', 'reason': ''}
+            for each in records()]
+    left = {'log': 'x/<b>.csv', 'type': '', 'unit': '', 'drive': '', 'date': '',
+            'reason': 'holds no gyro'}
+    text = report(summarized(logs), [*logs, left])
+    assert all(f'<td data-key="&lt;{unit}&gt;">&lt;{unit}&gt;</td>' in text for unit in range(5))
+    assert 'href="logs/a.html"' in text and 'holds no gyro' in text and '<b>' not in text
+    assert 'class="sortable"' in text and '1 more logs are no evidence' in text
+
+
+def test_tables_hold_a_row_for_each_log_and_for_each_value_of_a_unit():
+    logs = records()
+    content = tables(summarized(logs), logs)
+    rows = list(csv.DictReader(content['units.csv'].decode().splitlines()))
+    assert [row['unit'] for row in rows if row['value'] == 'bias'] == list('01234')
+    assert len(content['logs.csv'].decode().splitlines()) == 1 + len(logs)
+    parquet = pytest.importorskip('pyarrow.parquet')
+    assert parquet.read_table(io.BytesIO(content['units.parquet'])).num_rows == len(rows)
+
+
+def test_a_cluster_gives_what_processes_give():
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None,
+                                  protocol='tcp') as local, cluster(
+                                      local.scheduler_address) as create:
+        assert dict(finished(abs, range(-3, 3), 2, create)) == {
+            number: abs(number) for number in range(-3, 3)}

@@ -30,6 +30,7 @@ from gyro_calibration.diagnosis.units import amount, quantity
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.prior import models
+from gyro_calibration.fleet.report import report
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes, usual_workers
 from gyro_calibration.fleet.summary import (
     data as type_data,
@@ -42,6 +43,7 @@ from gyro_calibration.fleet.summary import (
     TypeFound,
 )
 from gyro_calibration.fleet.table import entries, Entry, pattern
+from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
 from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.model.model_file import model_text
@@ -118,22 +120,24 @@ def _fleet(given: argparse.Namespace) -> Answer:
             'false_alarm_rate': FALSE_ALARMS,
             'no_evidence': [{'log': each['log'], 'reason': each['reason']} for each in left],
             'types': [type_data(found) for found in types]}
-    written = _written(given, types, data)
+    written = _written(given, types, records, data)
     lines += ['', f'Written to {given.out}: {", ".join(written)}.']
     return Answer('\n'.join(lines), data)
 
 
-def _written(given: argparse.Namespace, types: Sequence[TypeFound], data: dict[str, Any]
-             ) -> list[str]:
+def _written(given: argparse.Namespace, types: Sequence[TypeFound],
+             records: Sequence[dict[str, Any]], data: dict[str, Any]) -> list[str]:
     """Write the results, and return the names of their files."""
-    content = {'fleet.json': json.dumps(data, indent=1, allow_nan=False) + '\n'}
+    content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
+               'report.html': report(types, records).encode(), **tables(types, records)}
     for found in types:
         for unit, model in models(found):
             name = _file_name(found.name or 'type') + (f'-unit-{_file_name(unit)}' if unit else '')
             origin = {**model.origin, **origin_of([])}
-            content[f'models/{name}.yaml'] = model_text(replace(model, origin=origin))
-    for name, text in content.items():
-        write_atomically(Path(given.out) / name, text.encode())
+            text = model_text(replace(model, origin=origin))
+            content[f'models/{name}.yaml'] = text.encode()
+    for name, each in content.items():
+        write_atomically(Path(given.out) / name, each)
     return [name for name in content if '-unit-' not in name]
 
 

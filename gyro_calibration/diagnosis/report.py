@@ -84,11 +84,16 @@ _METHOD = (
 
 def report(diagnosis: Diagnosis) -> str:
     """Return the page, HTML in UTF-8."""
-    template = Template(Path(__file__).with_name('report.html').read_text(encoding='utf-8'))
     title = ', '.join(map(clean, diagnosis.logs)) or 'gyro'
     diagnosis = diagnosis if offered(diagnosis) else _as_it_was(diagnosis)
     body = joined(_header(diagnosis), element('main', *_sections(diagnosis)))
-    return template.substitute(title=element('title', f'Diagnosis of {title}'), body=body)
+    return page(f'Diagnosis of {title}', body)
+
+
+def page(title: str, body: Markup) -> str:
+    """Return a page with this title and body, HTML in UTF-8."""
+    template = Template(Path(__file__).with_name('report.html').read_text(encoding='utf-8'))
+    return template.substitute(title=element('title', title), body=body)
 
 
 def _as_it_was(diagnosis: Diagnosis) -> Diagnosis:

@@ -1,0 +1,229 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""A fleet as one page that needs nothing else, with links to the pages of its logs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from gyro_calibration.diagnosis.charts import Chart, draw, Line
+from gyro_calibration.diagnosis.findings import Estimate
+from gyro_calibration.diagnosis.markup import element, joined, Markup
+from gyro_calibration.diagnosis.report import page
+from gyro_calibration.diagnosis.units import amount, for_people, quantity
+from gyro_calibration.diagnosis.words import sentence, spoken
+from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
+from gyro_calibration.fleet.summary import Found, sentences, TypeFound
+from gyro_calibration.logs.log import Array
+import numpy as np
+
+_SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
+            (DRIVES, 'common to a drive'))
+#: Of a normal distribution, as charts draw it.
+_BAND = 1.96
+#: Sorts a table by the column that is clicked, and shows the rows that hold a text.
+_SCRIPT = Markup("""<script>
+'use strict';
+for (const table of document.querySelectorAll('table.sortable')) {
+  const body = table.tBodies[0], rows = [...body.rows], search = document.createElement('input');
+  search.type = 'search';
+  search.placeholder = 'Search';
+  search.setAttribute('aria-label', 'Search in the table below');
+  table.parentNode.before(search);
+  search.addEventListener('input', () => {
+    const text = search.value.toLowerCase();
+    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(text);
+  });
+  [...table.tHead.rows[0].cells].forEach((head, column) => {
+    const button = document.createElement('button');
+    button.textContent = head.textContent;
+    head.replaceChildren(button);
+    let sign = -1;
+    button.addEventListener('click', () => {
+      sign = -sign;
+      const key = row => row.cells[column].dataset.key;
+      rows.sort((a, b) => sign * (key(a) - key(b) || key(a).localeCompare(key(b))));
+      body.append(...rows);
+    });
+  });
+}
+</script>""")
+_STYLE = Markup("""<style>
+th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
+input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-width: 20rem; }
+.scroll.tall { max-height: 40rem; }
+</style>""")
+
+
+def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> str:
+    """
+    Return the page, HTML in UTF-8.
+
+    Parameters
+    ----------
+    types : as `summary.summarized` returns them
+    records : of all logs, those too that are no evidence
+
+    """
+    used = sum(len(found.records) for found in types)
+    title = (f'{used} logs of {sum(len(found.units) for found in types)} units of '
+             f'{len(types)} {"type" if len(types) == 1 else "types"}')
+    about = f'{len(records) - used} more logs are no evidence.' if used < len(records) else None
+    body = joined(
+        element('header', element('p', 'Fleet', class_='about'), element('h1', title),
+                element('p', about, class_='won') if about else None),
+        element('main', *(part for place, found in enumerate(types)
+                          for part in _type(found, place)), _logs(records)),
+        _STYLE, _SCRIPT)
+    return page(f'Fleet: {title}', body)
+
+
+def _type(found: TypeFound, place: int) -> Iterator[Markup]:
+    name = found.name or 'The type'
+    told = [element('li', sentence(text)) for text in sentences(found)]
+    yield element('section', element('h2', name), element('ul', *told), _variances(found))
+    values = [each for each in found.values.values() if not each.slow]
+    yield element(
+        'section', element('h2', f'{name}: units'),
+        element('p', 'Bars hold the value of a unit, as the mean over its power-ons, with 95 %.',
+                class_='quiet'),
+        element('div', *(draw(_units_chart(found, each, f't{place}-{each.name}-units'))
+                         for each in values), class_='pairs'), _units(found, values))
+    shared = [each for each in found.values.values() if DRIVES in each.components]
+    if shared:
+        yield element(
+            'section', element('h2', f'{name}: drives'),
+            element('p', 'What all units of a drive have in common is of its reference or of '
+                    'the vehicle.', class_='quiet'),
+            element('div', *(draw(_drives_chart(found, each, f't{place}-{each.name}-drives'))
+                             for each in shared), class_='pairs'))
+    if len(found.dates) > 1:
+        yield element('section', element('h2', f'{name}: over time'), element('div', *(
+            draw(_dates_chart(found, each, f't{place}-{each.name}-dates')) for each in values),
+            class_='pairs'))
+
+
+def _variances(found: TypeFound) -> Markup:
+    heads = ['value', 'mean of the type', 'one more unit', *(text for _, text in _SPREADS),
+             'drift']
+    rows = [[_cell(spoken(each.name)), _estimate(each, each.mean, 0),
+             _estimate(each, each.new_unit, 0),
+             *(_spread(each, each.components.get(name)) for name, _ in _SPREADS),
+             _cell('; '.join(f'{_text(slope, 0, f"{each.unit}/{_per(name)}", each.name)}'
+                             for name, slope in each.slopes.items()))]
+            for each in found.values.values()]
+    return _table(heads, rows)
+
+
+def _per(covariate: str) -> str:
+    return 'year' if covariate == 'age' else 'K'
+
+
+def _units(found: TypeFound, values: Sequence[Found]) -> Markup:
+    odd = {found.units[outlier.number] for each in found.values.values()
+           for outlier in each.outlying_units}
+    changed = {found.units[change.unit] for each in found.values.values()
+               for change in each.changed}
+    heads = ['unit', 'logs', *(spoken(each.name) for each in values), 'remark']
+    rows = []
+    for place, name in enumerate(found.units):
+        logs = sum(each['unit'] == name for each in found.records)
+        remark = ', '.join([*(['stands out'] if name in odd else []),
+                            *(['changed'] if name in changed else [])])
+        rows.append([_cell(name), _cell(str(logs), logs),
+                     *(_estimate(each, each.units, place) for each in values), _cell(remark)])
+    return _table(heads, rows)
+
+
+def _logs(records: Sequence[Mapping[str, Any]]) -> Markup:
+    names = list(dict.fromkeys(name for each in records for name in each.get('values', ())))
+    heads = ['log', 'type', 'unit', 'drive', 'date', *map(spoken, names), 'diagnosis', 'remark']
+    rows = []
+    for each in records:
+        file = each['log'].rpartition('/')[2]
+        link = element('a', file, href=each['page']) if each.get('page') else file
+        values = each.get('values', {})
+        shown = [_of_log(values[name], name) if name in values else _cell('')
+                 for name in names]
+        rows.append([element('td', link, data_key=file),
+                     *(_cell(each[key]) for key in ('type', 'unit', 'drive', 'date')), *shown,
+                     _cell((each.get('diagnosis') or {}).get('verdict', '')),
+                     _cell(each['reason'])])
+    return element('section', element('h2', 'Logs'), _table(heads, rows))
+
+
+def _of_log(value: Mapping[str, Any], name: str) -> Markup:
+    size = _BAND * value['deviation']
+    return _cell(str(quantity(Estimate(value['value'], (
+        value['value'] - size, value['value'] + size), value['unit']), name)), value['value'])
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
+    head = element('tr', *(element('th', each, scope='col') for each in heads))
+    table = element('table', element('thead', head),
+                    element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
+    return element('div', table, class_='scroll tall', tabindex='0')
+
+
+def _cell(text: str, key: float | None = None) -> Markup:
+    """Return a cell, and what it is sorted by."""
+    return element('td', text, data_key=text if key is None else f'{key:.9g}')
+
+
+def _estimate(each: Found, of: Interval, place: int) -> Markup:
+    return _cell(_text(of, place, each.unit, each.name), float(of.value[place]))
+
+
+def _text(of: Interval, place: int, unit: str, name: str) -> str:
+    return str(quantity(Estimate(float(of.value[place]), (
+        float(of.low[place]), float(of.high[place])), unit), name))
+
+
+def _spread(each: Found, of: Component | None) -> Markup:
+    if of is None:
+        return _cell('not shown', -1.0)
+    low, high = (amount(end, each.unit, each.name) for end in (of.low, of.high))
+    text = (f'{amount(of.estimate, each.unit, each.name)} ({low} to {high})' if of.low > 0.0
+            else f'less than {high}')
+    return _cell(text, of.estimate)
+
+
+def _units_chart(found: TypeFound, each: Found, name: str) -> Chart:
+    return _chart(each, name, 'unit', found.units, each.units, 'after')
+
+
+def _drives_chart(found: TypeFound, each: Found, name: str) -> Chart:
+    return _chart(each, name, 'drive', found.drives, each.drives, 'before')
+
+
+def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,
+           style: str) -> Chart:
+    unit, factor = for_people(each.unit, each.name)
+    order = ', '.join(f'{place} {text}' for place, text in enumerate(names, 1))
+    middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / _BAND
+    return Chart(name, f'{spoken(each.name)} by {kind}', f'{kind}s: {order}', kind, '',
+                 np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
+                 [Line(kind, style, factor * middle, factor * half, dots=True)])
+
+
+def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
+    """Return the values of logs, less those of their units, over their dates."""
+    unit, factor = for_people(each.unit, each.name)
+    dated = [record for record in each.records if record['date']]
+    place = np.array([found.dates.index(record['date']) + 1.0 for record in dated])
+    value: Array = np.array([
+        record['slow' if each.slow else 'values'][each.name]['value']
+        - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
+    order = ', '.join(f'{count} {text}' for count, text in enumerate(found.dates, 1))
+    return Chart(name, f'{spoken(each.name)} less that of the unit', f'dates: {order}', 'date',
+                 '', place, spoken(each.name), unit,
+                 [Line('log', 'measured', factor * value, dots=True)])
