@@ -10,7 +10,8 @@ ROS := $(or $(ROS_DISTRO),wheels)
 # Stamps of their own for each ROS, so that a change of it is noticed.
 DEPENDENCIES := $(VENV)/.dependencies-$(ROS)
 INSTALLED := $(VENV)/.installed-$(ROS)
-SOURCES := package.xml $(shell find gyro_calibration gyro_calibration_reproduction config launch bin lib -type f -not -name '*.pyc')
+SOURCES := package.xml $(shell find gyro_calibration gyro_calibration_reproduction config samples launch bin lib \
+                                   -type f -not -name '*.pyc')
 PYTEST := $(BIN)/python -m pytest
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 
@@ -18,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 test timed evidence demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))
 
-.PHONY: test style timed computing evidence demo build clean
+.PHONY: test style timed computing evidence demo docs build clean
 
 # What one finds does not keep the others from running, so that one run says everything.
 test: $(INSTALLED)
@@ -48,6 +49,17 @@ evidence: $(INSTALLED)
 
 demo: $(INSTALLED)
 	@$(BIN)/gyro_calibration demo --out demo
+	@echo 'How to go on: `. $(BIN)/activate` puts the program gyro_calibration on the PATH (it is'
+	@echo '$(BIN)/gyro_calibration); then see docs/tutorials/robot.md, or the picture demo/heading.png.'
+
+# the pages as a site, in build/docs; a warning is an error
+docs: $(INSTALLED) $(VENV)/.docs
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
+	@echo 'build/docs/index.html'
+
+$(VENV)/.docs: $(DEPENDENCIES)
+	@$(PIP) '.[docs]'
+	@touch $@
 
 build: $(INSTALLED)
 	@PATH="$(CURDIR)/$(BIN):$$PATH" colcon build --event-handlers console_direct-

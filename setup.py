@@ -38,6 +38,8 @@ ros = wheels(*JAZZY, 'python_version < "3.14"') + wheels(*KILTED, 'python_versio
 plot = ['matplotlib']
 # what a fleet of logs can use: a Dask cluster, and tables in Parquet
 fleet = ['distributed', 'pyarrow']
+# what docs.ros.org builds pages with
+docs = ['sphinx', 'sphinx-rtd-theme', 'myst-parser']
 # hypothesis makes up inputs and finds the shortest that fails; atheris makes them up guided by
 # coverage, and has wheels for Linux on x86-64 alone
 fuzz = ['hypothesis', 'atheris; sys_platform == "linux" and platform_machine == "x86_64"']
@@ -73,7 +75,7 @@ setup(
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'
     ], extras_require={
         'compressed': ['lz4', 'zstandard'], 'ros': ros, 'ros-kilted': wheels(*KILTED),
-        'plot': plot, 'fleet': fleet, 'test': test, 'peers': peers
+        'plot': plot, 'docs': docs, 'fleet': fleet, 'test': test, 'peers': peers
     }, zip_safe=False, entry_points={
         'console_scripts': [
             'gyro_calibration = gyro_calibration.cli.main:main',
@@ -84,5 +86,6 @@ setup(
                    (f'share/{name}', ['package.xml']),
                    (f'share/{name}/config', sorted(glob('config/*.*'))),
                    (f'share/{name}/config/sros2', sorted(glob('config/sros2/*'))),
+                   (f'share/{name}/samples', sorted(glob('samples/*.*'))),
                    (f'share/{name}/launch', sorted(glob('launch/*.launch.py'))), launchers, ],
 )

@@ -26,8 +26,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
-         'gyro_calibration', 'gyro_calibration_reproduction', 'config', 'launch', 'bin', 'lib',
-         'resource']
+         'gyro_calibration', 'gyro_calibration_reproduction', 'config', 'launch', 'samples', 'bin',
+         'lib', 'resource']
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
 COLCON = shutil.which('colcon',
                       path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))
@@ -63,6 +63,8 @@ def expected_data():
     assert 'share/gyro_calibration/config/sros2/policy.xml' in files
     files |= {f'share/gyro_calibration/launch/{file.name}'
               for file in (ROOT / 'launch').glob('*.launch.py')}
+    files |= {f'share/gyro_calibration/samples/{file.name}'
+              for file in (ROOT / 'samples').glob('*.*')}
     files |= {'share/gyro_calibration/package.xml',
               'share/ament_index/resource_index/packages/gyro_calibration'}
     return files | {f'lib/gyro_calibration/{name}' for name in EXECUTABLES}

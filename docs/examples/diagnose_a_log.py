@@ -13,56 +13,49 @@ Diagnose a log of a gyro with a hidden effect, and compensate another log by the
 
     python diagnose_a_log.py [DIR]
 
-The logs are simulated here, so that the truth is known. With logs of your own:
-``diagnose([read_log('drive.csv')], generator, model)``.
+The logs are simulated here, so that the truth is known. With files of your own:
+``diagnose(read_log('drive.csv'), model=read_model('model.yaml'))``.
 
 """
 
-from pathlib import Path
 import sys
 
-from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.words import lines
-from gyro_calibration.heading.integration import integrate
-from gyro_calibration.heading.log_compensation import compensate_log
-from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR, THERMAL_LAG
-from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.model_file import write_model
-from gyro_calibration.model.motion import turns
-from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
+from gyro_calibration import compensate, diagnose, read_model, simulate
 import numpy as np
 
-NOISE = Noise(angle_random_walk=1.5e-4)
-#: The model of the gyro that is in use.
-MODEL = GyroModel((Term(BIAS, (2e-4,)), Term(SCALE_FACTOR_ERROR, (0.01,))), noise=NOISE)
-#: The gyro: its element follows the thermometer beside it only after some minutes.
-TRUE_GYRO = GyroModel((*MODEL.terms, Term(THERMAL_LAG, (120.0, 2e-4))), noise=NOISE)
-DRIVE = turns([(30.0, 0.0), (9.0, 40.0), (20.0, 0.0), (6.0, -60.0), (15.0, 20.0),
-               (40.0, -10.0)] * 8, ramp=1.0)
+KNOWN = {'bias': {'bias': 2e-4}, 'scale_factor_error': {'scale_factor_error': 0.01}}
+HIDDEN = {'thermal_lag': {'time_constant': 120.0, 'thermal_lag': 2e-4}}
+NOISE = {'angle_random_walk': 1.5e-4}
+MODEL = read_model({'effects': KNOWN, 'noise': NOISE})
+TRUE_GYRO = read_model({'effects': KNOWN | HIDDEN, 'noise': NOISE})
 
 
-def drive(generator):
-    """Return a log over 16 min, in which the gyro is heated and cooled twice."""
-    time = np.linspace(0.0, DRIVE.duration, round(25.0 * DRIVE.duration) + 1)
-    temperature = 30.0 + 8.0 * np.abs(np.sin(2.0 * np.pi * time / DRIVE.duration))
-    return simulate(TRUE_GYRO, DRIVE, 25.0, generator, temperature)
+def profile():
+    """Return times, s, and rates, rad/s, of a drive over 16 min."""
+    time, rate = [0.0], [0.0]
+    for seconds, dps in [(30, 0), (9, 40), (20, 0), (6, -60), (15, 20), (40, -10)] * 8:
+        time += [time[-1] + 1.0, time[-1] + seconds]
+        rate += [np.radians(dps)] * 2
+    return np.array(time), np.array(rate)
+
+
+def drive(seed):
+    """Return a log in which the gyro is heated and cooled twice."""
+    time, rate = profile()
+    progress = np.linspace(0.0, 2.0 * np.pi, round(25.0 * time[-1]) + 1)
+    return simulate(TRUE_GYRO, (time, rate), sample_rate=25.0, seed=seed,
+                    temperature=30.0 + 8.0 * np.abs(np.sin(progress)))
 
 
 def main(folder='.'):
-    generator = np.random.default_rng(1)
-    found = diagnose([drive(generator)], generator, MODEL)
-    print('\n'.join(lines(found)))
-    write_model(Path(folder) / 'model.yaml', found.model)
-    (Path(folder) / 'report.html').write_text(report(found))
-
-    other = drive(generator)
+    found = diagnose(drive(1), model=MODEL, seed=1)
+    print(found)
+    found.write(folder)
+    other = drive(2)
     for name, model in (('as it was', MODEL), ('extended', found.model)):
-        error = integrate(other.time, compensate_log(model, other)) - other.reference_heading
+        error = compensate(other, model).heading - other.reference_heading
         print(f'Another drive, compensated by the model {name}: '
-              f'up to {np.abs(error).max() / DEGREE:.2f} deg off the true heading.')
+              f'up to {np.degrees(np.abs(error).max()):.2f} deg off the true heading.')
 
 
 if __name__ == '__main__':

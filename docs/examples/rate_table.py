@@ -14,48 +14,37 @@ Calibrate a gyro on a rate table over temperature, and predict sweeps that were 
     python rate_table.py [MODEL.yaml]
 
 The table is simulated here, so that the truth is known. With one of your own:
-``dwells(read_log('table.csv'))``.
+``fit(read_log('table.csv'))``.
 
 """
 
 import sys
 
-from gyro_calibration.calibration.dwells import dwells
-from gyro_calibration.calibration.selection import select_effects
-from gyro_calibration.logs.log import DEGREE, Log
-from gyro_calibration.model.compensation import compensate
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_TEMPERATURE, SINE_RESPONSE
-from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.model_file import write_model
+from gyro_calibration import fit, Log, read_model, write_model
 import numpy as np
 
-#: An open-loop fibre-optic gyro: 0.01 deg/s of bias, the sine of its phase, and a scale factor
-#: that falls with temperature.
-TRUE_GYRO = GyroModel((Term(BIAS, (0.01 * DEGREE,)), Term(SINE_RESPONSE, (0.25, 1.0)),
-                       Term(SCALE_FACTOR_TEMPERATURE, (35.0, -4e-4))))
-SCATTER = 0.02 * DEGREE  # of a dwell's mean, rad/s
+TRUE_GYRO = read_model({'effects': {
+    'bias': {'bias': np.radians(0.01)}, 'sine_response': {'k': 0.25},
+    'scale_factor_temperature': {'reference_temperature': 35.0,
+                                 'scale_factor_temperature': -4e-4}}})
+SCATTER = np.radians(0.02)  # of a dwell's mean, rad/s
 
 
 def rate_table(generator):
     """Return a log whose rows are dwells: ten sweeps over 21 rates, from 25 to 45 degC."""
-    rate = np.concatenate([np.linspace(-100.0, 100.0, 21)[::way] for way in (1, -1) * 5]) * DEGREE
+    rate = np.radians(np.concatenate(
+        [np.linspace(-100.0, 100.0, 21)[::way] for way in (1, -1) * 5]))
     temperature = np.linspace(25.0, 45.0, len(rate))
     output = TRUE_GYRO.output(rate, temperature) + SCATTER * generator.standard_normal(len(rate))
     return Log(output=output, temperature=temperature, reference_rate=rate)
 
 
 def main(path='model.yaml'):
-    table = dwells(rate_table(np.random.default_rng(1)))
-    selection = select_effects(table, technology='open_loop_fog')
-    fit = selection.calibration
-    for choice in selection.choices:
-        print(f'{choice.effect:28}{"taken" if choice.taken else "not taken":10} {choice.reason}')
-    print(f'error {fit.before_rms / DEGREE:.3f} deg/s rms before, '
-          f'{fit.left_out_rms / DEGREE:.3f} in sweeps left out')
-    write_model(path, fit.model)
-    compensated = compensate(fit.model, TRUE_GYRO.output(1.5, 30.0), 30.0)
-    print(f'written to {path}; a turn of 1.5 rad/s at 30 degC is reported as '
-          f'{compensated.rate:.5f} rad/s')
+    found = fit(rate_table(np.random.default_rng(1)), technology='open_loop_fog')
+    print(found)
+    write_model(path, found.model)
+    rate = found.model.rate(TRUE_GYRO.output(1.5, 30.0), 30.0)
+    print(f'written to {path}; a turn of 1.5 rad/s at 30 degC is reported as {rate:.5f} rad/s')
 
 
 if __name__ == '__main__':

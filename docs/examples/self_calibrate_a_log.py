@@ -13,37 +13,30 @@ Find scale factor error and bias from 20 s of known motion, and write them into 
 
     python self_calibrate_a_log.py [MODEL.yaml]
 
-The log is simulated here, so that the truth is known. With a log of your own:
-``log = read_log('run.csv')``, and ``motion = read_motion('profile.csv')``.
+The log is simulated here, so that the truth is known. With files of your own:
+``self_calibrate(read_log('run.csv'), 'profile.csv', read_model('noise.yaml'))``.
 
 """
 
 import sys
 
-from gyro_calibration.calibration.self_calibration import record, self_calibrate
-from gyro_calibration.logs.log import DataRefused
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term, with_self_calibration
-from gyro_calibration.model.model_file import write_model
-from gyro_calibration.model.motion import CALIBRATION
-from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
-import numpy as np
+from gyro_calibration import read_model, self_calibrate, simulate, write_model
 
-NOISE = Noise(angle_random_walk=7.3e-4, bias_instability=8.7e-5)
-TRUE_GYRO = GyroModel((Term(BIAS, (0.002,)), Term(SCALE_FACTOR_ERROR, (-0.1,))), noise=NOISE)
+NOISE = {'angle_random_walk': 7.3e-4, 'bias_instability': 8.7e-5}
+TRUE_GYRO = read_model({'effects': {'bias': {'bias': 0.002},
+                                    'scale_factor_error': {'scale_factor_error': -0.1}},
+                        'noise': NOISE})
 
 
 def main(path='model.yaml'):
-    log = simulate(TRUE_GYRO, CALIBRATION, 100.0, np.random.default_rng(1))
-    model = GyroModel(noise=NOISE)  # nothing is known of this gyro but its noise
+    log = simulate(TRUE_GYRO, 'calibration', seed=1)
+    model = read_model({'effects': {}, 'noise': NOISE})  # only the noise of the gyro is known
     try:
-        fit = self_calibrate(log.time, log.output, CALIBRATION, noise=model.noise)
-    except DataRefused as reason:
+        found = self_calibrate(log, 'calibration', model)
+    except ValueError as reason:
         sys.exit(f'refused: {reason}')
-    calibration = record(fit, 'likelihood', '2025-01-01T00:00:00+00:00', temperature=None)
-    write_model(path, with_self_calibration(model, calibration))
-    print(f'Found {calibration}; true are -10 % and 0.1146 deg/s. Written to {path}.')
+    write_model(path, found.model)
+    print(f'{found} True are -10 % and 0.1146 deg/s. Written to {path}.')
 
 
 if __name__ == '__main__':

@@ -13,61 +13,44 @@ Find scale factor error and bias on a record player with three speeds, and with 
 
     python turntable.py
 
-Both logs are simulated here, so that the truth is known. With logs of your own:
-``dwells(read_log('speeds.csv'))`` and ``calibrate_encoder(read_log('turntable.csv'))``.
+Both logs are simulated here, so that the truth is known. With a log of your own:
+``fit(read_log('turntable.csv'))``.
 
 """
 
-from dataclasses import replace
-
-from gyro_calibration.calibration.dwells import dwells
-from gyro_calibration.calibration.encoder import calibrate_encoder
-from gyro_calibration.calibration.rate_table import fit_effects
-from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.motion import turns
-from gyro_calibration.model.noise import Noise
-from gyro_calibration.model.simulation import simulate
+from gyro_calibration import fit, Log, read_model, simulate
 import numpy as np
 
-TRUE_GYRO = GyroModel((Term(BIAS, (0.2 * DEGREE,)), Term(SCALE_FACTOR_ERROR, (0.013,))),
-                      noise=Noise(angle_random_walk=5e-4))
-#: 0, 33 1/3 and 45 revolutions a minute, each for 30 s.
-RECORD_PLAYER = turns([(30.0, 0.0), (30.0, 200.0), (30.0, 270.0), (30.0, 0.0)], ramp=2.0)
-#: Turned by hand, both ways, unevenly.
-BY_HAND = turns([(4.0, 0.0), (3.0, 60.0), (4.0, -90.0), (3.0, 30.0), (5.0, 80.0), (4.0, -120.0),
-                 (5.0, 0.0)] * 4, ramp=1.0)
-ENCODER_STEP = 2.0 * DEGREE
+EFFECTS = ['bias', 'scale_factor_error']
+TRUE_GYRO = read_model({'effects': {'bias': {'bias': np.radians(0.2)},
+                                    'scale_factor_error': {'scale_factor_error': 0.013}},
+                        'noise': {'angle_random_walk': 5e-4}})
+ENCODER_STEP = np.radians(2.0)
 
 
-def say(name, model):
-    for term, deviation in zip(model.terms, np.sqrt(np.diag(model.covariance))):
-        value, = term.values
-        unit, factor = (('%', 100.0) if term.effect is SCALE_FACTOR_ERROR
-                        else ('deg/s', 1.0 / DEGREE))
-        print(f'{name:14} {term.effect.name:20}{value * factor:9.4f} '
-              f'+- {deviation * factor:.4f} {unit}')
+def motion(stretches, ramp):
+    """Return times, s, and rates, rad/s, of stretches of s at deg/s."""
+    time, rate = [0.0], [0.0]
+    for seconds, dps in stretches:
+        time += [time[-1] + ramp, time[-1] + seconds]
+        rate += [np.radians(dps)] * 2
+    return np.array(time), np.array(rate)
 
 
-def record_player(generator):
+def record_player():
     """Calibrate by three speeds, known from the pulley or a strobe: the reference is a rate."""
-    log = simulate(TRUE_GYRO, RECORD_PLAYER, 100.0, generator)
-    say('record player', fit_effects(dwells(log), [BIAS, SCALE_FACTOR_ERROR]).model)
+    speeds = motion([(30, 0), (30, 200), (30, 270), (30, 0)], ramp=2.0)
+    return fit(simulate(TRUE_GYRO, speeds, seed=1), effects=EFFECTS)
 
 
-def encoder(generator):
+def encoder():
     """Calibrate by an encoder with steps of 2 deg: the reference is a heading."""
-    log = simulate(TRUE_GYRO, BY_HAND, 50.0, generator)
-    found = calibrate_encoder(replace(
-        log, reference_heading=np.round(log.reference_heading / ENCODER_STEP) * ENCODER_STEP))
-    say('encoder', found.model)
-    print(f'{"":14} heading error {found.before.rms / DEGREE:.2f} deg rms before, '
-          f'{found.after.rms / DEGREE:.2f} after')
+    by_hand = motion([(4, 0), (3, 60), (4, -90), (3, 30), (5, 80), (4, -120), (5, 0)] * 4, 1.0)
+    log = simulate(TRUE_GYRO, by_hand, sample_rate=50.0, seed=1)
+    steps = np.round(log.reference_heading / ENCODER_STEP) * ENCODER_STEP
+    return fit(Log(log.time, log.output, reference_heading=steps))
 
 
 if __name__ == '__main__':
-    generator = np.random.default_rng(1)
-    record_player(generator)
-    encoder(generator)
-    print('true are 0.2 deg/s and 1.3 %')
+    print(f'Record player\n{record_player()}\n\nEncoder\n{encoder()}')
+    print('True are 0.2 deg/s and 0.013.')

@@ -14,17 +14,14 @@ Write a gyro model from the matrix C of Ojeda, Chung and Borenstein (2000), eq. 
     python write_a_model.py [MODEL.yaml]
 
 The matrix is in deg/s and degC, highest powers first. The numbers are made up: put those of your
-own gyro in their place.
+own gyro in their place. Single effects are written with their names: {'bias': {'bias': 0.002}}.
 
 """
 
 import math
 import sys
 
-from gyro_calibration.model.effects import polynomial_from_matrix, polynomial_to_matrix
-from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.model_file import read_model, write_model
-from gyro_calibration.model.noise import Noise
+from gyro_calibration import read_model, write_model
 
 DEGREE = math.radians(1.0)
 MATRIX = [[1e-10, 2e-9, 3e-7, -2e-5],  # T²: its factors of w³, w², w and 1
@@ -33,23 +30,17 @@ MATRIX = [[1e-10, 2e-9, 3e-7, -2e-5],  # T²: its factors of w³, w², w and 1
 
 
 def main(path='model.yaml'):
-    effect, values = polynomial_from_matrix(MATRIX)
-    model = GyroModel(
-        terms=(Term(effect, values),),
-        rate_range=(-100 * DEGREE, 100 * DEGREE),
-        temperature_range=(25.0, 45.0),
-        reference_temperature=35.0,
-        noise=Noise(angle_random_walk=0.1 * DEGREE / 60.0, bias_instability=2.0 * DEGREE / 3600.0),
-        gyro={'name': 'an open-loop fibre-optic gyro', 'technology': 'open_loop_fog'},
-        origin={'note': 'written by write_a_model.py'})
+    model = read_model({
+        'effects': {'rate_temperature_polynomial': {'matrix_dps': MATRIX}},
+        'valid': {'rate': [-100 * DEGREE, 100 * DEGREE], 'temperature': [25.0, 45.0]},
+        'reference_temperature': 35.0,
+        'noise': {'angle_random_walk': 0.1 * DEGREE / 60.0,
+                  'bias_instability': 2.0 * DEGREE / 3600.0},
+        'gyro': {'name': 'an open-loop fibre-optic gyro', 'technology': 'open_loop_fog'},
+        'origin': {'note': 'written by write_a_model.py'}})
     write_model(path, model)
-
-    term, = read_model(path).terms
-    print(f'{path} holds the matrix')
-    for row in polynomial_to_matrix(term.effect, term.values):
-        print('  '.join(f'{value:9.2e}' for value in row))
-    rate = model.rate(50 * DEGREE, 30.0) / DEGREE
-    print(f'An output of 50 deg/s at 30 degC is a rate of {rate:.4f} deg/s.')
+    rate = read_model(path).rate(50.0 * DEGREE, 30.0) / DEGREE
+    print(f'Written to {path}. An output of 50 deg/s at 30 degC is a rate of {rate:.4f} deg/s.')
 
 
 if __name__ == '__main__':

@@ -127,8 +127,8 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     below.legend(loc='best')
     for axes in (above, below):
         axes.grid(alpha=0.3)
-    return _save(figure, path, 'Above: the two must lie on each other in time. Below: after it, '
-                 'what is left is noise, and drawn out it ends near zero.')
+    return _save(figure, path, 'Above: both turn at the same times. Below: the error before '
+                 'follows the turns; after, it stays near zero.')
 
 
 def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
@@ -401,7 +401,8 @@ def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None,
         return axes.scatter(across, up, s=9, linewidths=0, color='black')
     largest, span = float(np.abs(shade).max()), float(np.ptp(shade))
     low, high = ((-largest, largest) if colours == _DIVERGING
-                 else (float(shade.min()) - 0.35 * span, float(shade.max())))
+                 else (float(shade.min()) - (0.35 * span if colours == 'Greys' else 0.0),
+                       float(shade.max())))
     return axes.scatter(across, up, s=14, linewidths=0.3, edgecolors='0.3', c=shade, cmap=colours,
                         vmin=low, vmax=high)
 

@@ -13,7 +13,7 @@ Compare the three methods of self-calibration on simulated runs.
 
 The numbers are those of docs/explanation/self_calibration.md.
 
-    python three_methods.py [RUNS]
+    python benchmarks/three_methods.py [RUNS]
 
 """
 

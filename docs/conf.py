@@ -1,0 +1,43 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Sphinx builds these pages with `make docs`; rosdoc2 builds the same for docs.ros.org."""
+
+from pathlib import Path
+import sys
+from xml.etree import ElementTree
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+_MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
+
+project = str(_MANIFEST.findtext('name'))
+author = str(_MANIFEST.findtext('author'))
+release = version = str(_MANIFEST.findtext('version'))
+project_copyright = '2026 The gyro_calibration maintainers'
+
+extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
+exclude_patterns = ['examples']
+# the anchors of headings as GitHub makes them, so that a link holds in both places
+myst_heading_anchors = 4
+myst_enable_extensions = ['colon_fence']
+highlight_language = 'none'
+
+autodoc_typehints = 'none'
+autodoc_member_order = 'bysource'
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+
+# the theme of docs.ros.org
+html_theme = 'sphinx_rtd_theme'
+html_theme_options = {'navigation_depth': 2, 'prev_next_buttons_location': None}
+html_static_path = ['_static']
+html_css_files = ['tables.css']
+html_show_sourcelink = False
