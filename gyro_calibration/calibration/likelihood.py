@@ -324,20 +324,23 @@ def _points(motion: Motion, block: float, slip: float) -> _Points:
 ASYMMETRY = 1e-4
 #: Prior standard deviations of what a robot follows one turn differently by than the others:
 #: delay, s, and lag, s².
-TURN_DELAY, TURN_LAG = 0.1, 0.02
+_TURN_DELAY, _TURN_LAG = 0.1, 0.02
 #: Of a longer motion, neighbouring turns are taken together, so that they are at most so many.
 _MOST_TURNS = 12
-#: Parts of the prior standard deviations of delays and lags by turn, and of slips, that may hold.
-_LATE, _SLIPS = np.array([0.001, 0.1, 1.0]), np.array([0.001, 0.03, 0.1, 0.3, 1.0])
+#: A response of higher order, as of a robot that overshoots: times, s, of the second differences
+#: of the heading that it consists of, and their prior standard deviation, 1.
+_RESPONSE, _RESPONSE_DEVIATION = (0.15, 0.3, 0.45, 0.6, 0.8), 0.3
+#: Parts of the prior standard deviations of what follows, and of slips, that may hold.
+_FOLLOWING, _SLIPS = np.array([0.001, 0.1, 1.0]), np.array([0.001, 0.03, 0.1, 0.3, 1.0])
 
 
 def following(motion: Motion, time: Array, slip: float) -> tuple[Array, Array, Array]:
     """
     Return what gyro and robot may make of a profile otherwise than scale, bias, delay and lag.
 
-    The gyro's scale may differ between the two senses of turning. The robot may follow each turn
-    with its own delay and lag, as one whose acceleration is limited does, and slip in each, and in
-    each end of one.
+    The gyro's scale may differ between the two senses of turning. The robot may follow by a
+    response of higher order than a lag, follow each turn with its own delay and lag, as one whose
+    acceleration is limited does, and slip in each, and in each end of one.
 
     Parameters
     ----------
@@ -361,16 +364,21 @@ def following(motion: Motion, time: Array, slip: float) -> tuple[Array, Array, A
     # what all turns share is delay, lag and scale
     apart = helmert(count).T
     columns = [rate[:, None] * (inside @ apart), acceleration[:, None] * (inside @ apart)]
-    deviations = [np.full(count - 1, TURN_DELAY), np.full(count - 1, TURN_LAG)]
-    late, slips = _LATE, np.ones(1)
+    columns.append(np.column_stack([
+        heading - 2.0 * motion.heading_at(time - late) + motion.heading_at(time - 2.0 * late)
+        for late in _RESPONSE]))
+    deviations = [np.full(count - 1, _TURN_DELAY), np.full(count - 1, _TURN_LAG),
+                  np.full(len(_RESPONSE), _RESPONSE_DEVIATION)]
+    following, slips = _FOLLOWING, np.ones(1)
     if slip:
         ending = inside & (rate * acceleration < 0.0)[:, None]
         columns += [np.cumsum(turned * part, axis=0) for part in (inside @ apart, ending)]
         deviations.append(np.full(2 * count - 1, slip))
         slips = _SLIPS
-    parts = np.hstack([np.repeat(np.tile(late, len(slips))[:, None], 2 * (count - 1), axis=1),
-                       np.repeat(np.repeat(slips, len(late))[:, None],
-                                 (2 * count - 1) * bool(slip), axis=1)])
+    parts = np.hstack([
+        np.repeat(np.tile(following, len(slips))[:, None], 2 * count - 2 + len(_RESPONSE), axis=1),
+        np.repeat(np.repeat(slips, len(following))[:, None], (2 * count - 1) * bool(slip),
+                  axis=1)])
     if sense.min() < 0.0 < sense.max():
         columns.append(np.cumsum(np.abs(turned), axis=0))
         deviations.append(np.array([ASYMMETRY]))

@@ -31,6 +31,7 @@ from gyro_calibration.calibration.likelihood import (
     BLOCK,
     block_length,
     DELAY_DEVIATION,
+    following,
     LAG_DEVIATION,
 )
 from gyro_calibration.calibration.self_calibration import Limits
@@ -141,7 +142,7 @@ class Forecast:
 
     def predict(self, motion: Motion) -> Prediction:
         """Return the prediction for a motion that turns and has the length of the forecast."""
-        return self._predict(motion, round(self._duration / block_length(motion)))
+        return self._predict(motion, round(self._duration / block_length(motion)), True)
 
     def error(self, motion: Motion) -> float:
         """
@@ -149,19 +150,20 @@ class Forecast:
 
         A fit takes shorter blocks where the motion is fast, and loses less at both ends: the bias
         is better by 0.3 %. A search would find that, and prefer motions that gain it at the cost
-        of the scale.
+        of the scale. So it would prefer slow ones, where senses of turning may differ.
 
         """
-        return self._predict(
-            motion, math.ceil(self._duration / min(BLOCK, self._duration / 40.0))).heading_error
+        blocks = math.ceil(self._duration / min(BLOCK, self._duration / 40.0))
+        return self._predict(motion, blocks, False).heading_error
 
-    def _predict(self, motion: Motion, blocks: int) -> Prediction:
+    def _predict(self, motion: Motion, blocks: int, follows: bool) -> Prediction:
         if blocks not in self._noises:
             self._noises[blocks] = _noises(self._noise, self._duration, blocks, self._length,
                                            self._used.shape[1])
         noises = self._noises[blocks]
-        weights = self._weights(motion, blocks, noises)
-        own, shared = weights @ noises.run @ weights.T, weights @ noises.shared
+        weights, own = self._weights(motion, blocks, noises, follows)
+        own = own + weights @ noises.run @ weights.T
+        shared = weights @ noises.shared
         variance = (noises.drive - 2.0 * (self._used * shared).sum(axis=0)
                     + (self._used * (own @ self._used)).sum(axis=0))
         error = math.sqrt(2.0 / math.pi) * float(np.sqrt(np.maximum(variance, 0.0)).mean())
@@ -171,17 +173,27 @@ class Forecast:
         of_bias = own[1, 1] - 2.0 * shared[1, -1] / self._length + of_mean
         return Prediction(math.sqrt(own[0, 0]), math.sqrt(of_bias), error, self.floor)
 
-    def _weights(self, motion: Motion, blocks: int, noises: _Noises) -> Array:
-        """Return the weights of (s, b) on increments of the gyro's integral, shape (2, n)."""
+    def _weights(self, motion: Motion, blocks: int, noises: _Noises,
+                 follows: bool) -> tuple[Array, Array]:
+        """
+        Return the weights of (s, b) on increments of the gyro's integral, shape (2, n).
+
+        Then their covariance by what the fit leaves open of gyro and robot, shape (2, 2).
+
+        """
         count = blocks * _CELLS * _POINTS
         point = (np.arange(count) + 0.5) * self._duration / count
         rate = motion.rate_at(point)
         known = np.column_stack([motion.heading_at(point), point, rate, np.gradient(rate, point)])
-        columns = np.diff(known.reshape(blocks, -1, 4).mean(axis=1), axis=0)
+        prior = np.array([math.inf, math.inf, DELAY_DEVIATION, LAG_DEVIATION])
+        if follows:
+            columns, deviations, parts = following(motion, point, 0.0)
+            known, prior = np.hstack([known, columns]), np.append(prior, parts[0] * deviations)
+        columns = np.diff(known.reshape(blocks, -1, len(prior)).mean(axis=1), axis=0)
         weighted = noises.inverse @ columns
-        return np.linalg.solve(
-            columns.T @ weighted + np.diag([0.0, 0.0, DELAY_DEVIATION ** -2, LAG_DEVIATION ** -2]),
-            weighted.T)[:2]
+        weights = np.linalg.solve(columns.T @ weighted + np.diag(prior ** -2.0), weighted.T)[:2]
+        left = weights @ columns[:, 4:] * prior[4:]
+        return weights, left @ left.T
 
 
 @dataclass(frozen=True)
