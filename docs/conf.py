@@ -11,6 +11,7 @@
 """Sphinx builds these pages with `make docs`; rosdoc2 builds the same for docs.ros.org."""
 
 from pathlib import Path
+import re
 import sys
 from xml.etree import ElementTree
 
@@ -30,10 +31,13 @@ myst_heading_anchors = 4
 myst_enable_extensions = ['colon_fence']
 highlight_language = 'none'
 
+add_module_names = False
 autodoc_typehints = 'none'
 autodoc_member_order = 'bysource'
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False
 
 # the theme of docs.ros.org
 html_theme = 'sphinx_rtd_theme'
@@ -41,3 +45,18 @@ html_theme_options = {'navigation_depth': 2, 'prev_next_buttons_location': None}
 html_static_path = ['_static']
 html_css_files = ['tables.css']
 html_show_sourcelink = False
+
+
+def described(app, what, name, obj, options, lines):
+    """Put what docstrings write as `name : description` in the place of a description."""
+    lines[:] = [part for line in lines for part in _parted(line)]
+
+
+def _parted(line):
+    found = re.fullmatch(r'( *)(\w+(?:, \w+)*) : (.+)', line)
+    return [found[1] + found[2], f'{found[1]}    {found[3]}'] if found else [line]
+
+
+def setup(app):
+    """Describe before napoleon (priority 500) reads the sections."""
+    app.connect('autodoc-process-docstring', described, priority=400)

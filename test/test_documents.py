@@ -193,7 +193,7 @@ def test_the_quickstarts_run_as_written_and_give_the_numbers_that_are_shown(
         assert code == 0, error
     after, before = off('heading.csv')
     shown = re.search(r'falls from ([\d.]+) to ([\d.]+) deg\.', page)
-    assert [float(each) for each in shown.groups()] == pytest.approx([before, after], rel=0.05)
+    assert [float(each) for each in shown.groups()] == pytest.approx([before, after], rel=0.1)
     found = re.search(r'Error ([\d.]+) deg/s rms before, .*; ([\d.]+) in sweeps', answers['fit'])
     shown = re.search(r'falls from ([\d.]+) to ([\d.]+) deg/s rms', page)
     assert [float(each) for each in shown.groups()] == pytest.approx(

@@ -97,7 +97,9 @@ def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
     selection = select_effects(measured(table, (*LINEAR, TRUTH['sine_response'])), technology)
     expected = SINE_RESPONSE if wide else TECHNOLOGIES[technology]
     assert expected in selection.calibration.effects and selection.twins[0].parted == wide
-    assert wide or technology in selection.twins[0].reason
+    reason = selection.twins[0].reason
+    assert technology in reason or wide and TECHNOLOGIES[technology] is SINE_RESPONSE
+    assert ('although' in reason) == (wide and TECHNOLOGIES[technology] is not SINE_RESPONSE)
 
 
 @pytest.mark.parametrize('runs', [2, pytest.param(12, marks=pytest.mark.evidence)])

@@ -272,6 +272,8 @@ def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect
         reason = (f'{taken.name} is what the physics of {technology} gives, and fits '
                   f'{"better" if sigmas > 0.0 else "worse"} by {abs(sigmas):.1f} '
                   'standard deviations')
+    elif technology is not None and TECHNOLOGIES[technology] is other:
+        reason += f', although the physics of {technology} gives {other.name}'
     if technology is None and bounded is other and sigmas < HARDLY:
         (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
         reason = (f'{taken.name} fits worse by {abs(sigmas):.1f} standard deviations only, and '

@@ -168,6 +168,9 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
             'remarks': list(table.remarks)}
     lines = [*dwell_lines(fit), '', *value_lines(model), '', *quality_lines(fit), '',
              *bin_lines(fit), *choice_lines(selection)]
+    if effects and given.technology:
+        lines.append(f'--technology {given.technology} is kept in the model; it chose nothing, '
+                     'since the effects were given.')
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
