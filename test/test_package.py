@@ -75,6 +75,13 @@ def test_the_version_of_the_manifest_is_the_version_of_the_module():
     assert manifest.findtext('version') == gyro_calibration.__version__
 
 
+def test_bloom_finds_a_dated_section_of_the_version_in_the_changelog():
+    changelog = pytest.importorskip('catkin_pkg.changelog', reason='catkin_pkg is not installed')
+    dates = {version: date
+             for version, date, _ in changelog.get_changelog_from_path(ROOT).foreach_version()}
+    assert dates[gyro_calibration.__version__]
+
+
 def imported():
     """Return the libraries that the package and its launch files import, as rosdep calls them."""
     nodes = [node for folder in ('gyro_calibration', 'launch')
