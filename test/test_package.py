@@ -75,6 +75,7 @@ def test_the_version_of_the_manifest_is_the_version_of_the_module():
     assert manifest.findtext('version') == gyro_calibration.__version__
 
 
+@pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore::PendingDeprecationWarning')
 def test_bloom_finds_a_dated_section_of_the_version_in_the_changelog():
     changelog = pytest.importorskip('catkin_pkg.changelog', reason='catkin_pkg is not installed')
     dates = {version: date
