@@ -241,9 +241,10 @@ def choice_lines(selection: Selection) -> Iterator[str]:
 
 
 def _alike(twins: Twins) -> str:
-    remedy = ('no rate up to three times the fastest would part them' if twins.rate is None
-              else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s would part them')
-    return (f'These data hardly part {twins.taken} from {twins.other}: {twins.reason}. '
+    remedy = ('no rate up to three times the fastest would distinguish them' if twins.rate is None
+              else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s would distinguish '
+              'them')
+    return (f'These data hardly distinguish {twins.taken} from {twins.other}: {twins.reason}. '
             f'It matters beyond the calibrated rates; {remedy}.')
 
 

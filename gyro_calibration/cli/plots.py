@@ -95,8 +95,9 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
     below.set_xlabel('time [s]')
     for axes in (above, middle, below):
         axes.grid(alpha=0.3)
-    return _save(figure, path, 'Each of the lower panels has its own scale. A slope that is left '
-                 'is bias; a step with each turn is scale factor error.')
+    return _save(figure, path, 'The lower panels have their own scales. A slope is bias; what '
+                 'follows the turns is scale factor error; an even band is the '
+                 'resolution of the reference.')
 
 
 def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
@@ -154,8 +155,8 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     below.set(xlabel='time [s]', ylabel='heading [deg]')
     for axes in (above, below):
         axes.grid(alpha=0.3)
-    return _save(figure, path, 'Turns both ways part the scale factor error from the bias; rests '
-                 'show the bias alone.')
+    return _save(figure, path, 'Turns both ways separate the scale factor error from the bias; '
+                 'rests show the bias alone.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
@@ -252,8 +253,8 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
              title='Error over the output')
     axes.legend(loc='best')
     axes.grid(alpha=0.3)
-    return _save(figure, path, 'The error that the model removes; red: the gyro reports too much, '
-                 'blue: too little.' if thermal else 'The error that the model removes.')
+    return _save(figure, path, 'The error that the model removes; red: the output is above the '
+                 'true rate, blue: below it.' if thermal else 'The error that the model removes.')
 
 
 def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Array,
