@@ -15,6 +15,9 @@ SOURCES := package.xml $(shell find gyro_calibration gyro_calibration_reproducti
 PYTEST := $(BIN)/python -m pytest
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
 
+# Tests that were compiled are kept, whatever the shell says: four processes compile them.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Nothing that runs here is heard on the network, and launch finds the package in .venv.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 test timed evidence demo: export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)$(if $(AMENT_PREFIX_PATH),:$(AMENT_PREFIX_PATH))

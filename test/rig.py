@@ -81,8 +81,8 @@ class Rig:
     outputs : list of what `Pipeline.sample` returned, without None
     truth : dict of the true heading, rad, by stamp, ns
     publishers : list of names; who publishes the samples
-    receivers : int
-        Other nodes that receive cmd_vel.
+    receivers, callers : int
+        Other nodes that receive cmd_vel, and clients of the service that calibrates.
     ros_speed : float
         Seconds of the simulation in one second; 0 while it stands.
     speed : float
@@ -100,6 +100,7 @@ class Rig:
         self.commands, self.outputs, self.truth = [], [], {}
         self.publishers, self.receivers, self.ros_speed, self.other = (
             ['/driver_node'], 1, 1.0, None)
+        self.callers = 1
         self.fed, self._steps, self._stamp, self._echoes = BEGIN * NSEC_PER_SEC, 0, 0, []
         if model:
             (folder / 'model.yaml').write_text(model)
@@ -167,6 +168,7 @@ class Rig:
         """Look as the timers of the node do: every 20 ms during a drive, else every 0.2 s."""
         if self._is_due('look', 0.2):
             self.pipeline.publishers(self.publishers)
+            self.session.see_callers(self.callers)
         if self._is_due('watch', 0.02 if self.session.drives else 0.2):
             self.pipeline.watch(self.receivers)
         if self._is_due('learn', 1.0):

@@ -116,6 +116,7 @@ def faults():
         'nobody obeys': (lambda rig: setattr(rig, 'receivers', 0), 'no other node receives'),
         'two publishers': (lambda rig: rig.publishers.append('/other'), '2 publishers send'),
         'forbidden': (lambda rig: rig.set(calibration_drive=False), 'calibration.drive was set'),
+        'caller gone': (lambda rig: setattr(rig, 'callers', 0), 'that called calibrate is gone'),
         'cancelled': (lambda rig: rig.session.cancel(), 'cancelled'),
     }
 
@@ -321,6 +322,12 @@ def test_a_drive_waits_for_somebody_who_receives_its_commands(tmp_path):
     rig.receivers = 1
     assert rig.go(40.0, lambda: rig.ended)
     assert rig.session.conclude()[0]
+
+
+def test_a_drive_whose_callers_are_never_seen_is_not_abandoned(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True)
+    rig.callers = 0
+    assert rig.calibrate()[0]
 
 
 def test_a_drive_that_nobody_receives_ends_after_5_s(tmp_path):

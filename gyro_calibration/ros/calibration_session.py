@@ -215,6 +215,7 @@ class Drive:
         self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
         self._begun = clock.steady()
         self._heard, self._suspected, self._due = False, False, -math.inf
+        self._called = self._alone = False
         # Time of arrival and delay, s, of samples with less delay than any before them.
         self._prompt: deque[tuple[float, float]] = deque()
         self.command_lateness = self.sample_lateness = 0.0
@@ -249,6 +250,12 @@ class Drive:
         before, self._suspected = self._suspected, silence > self._blind()
         return (f'no sample came for {silence:.2f} s while the robot was driven: look at the gyro '
                 'and its driver') if before and self._suspected else ''
+
+    def is_abandoned(self, callers: int) -> bool:
+        """Tell whether the callers of the service, who were there, are gone at two looks."""
+        self._called = self._called or callers > 0
+        before, self._alone = self._alone, self._called and not callers
+        return before and self._alone
 
     def command(self) -> float | None:
         """Return the rate to command now, rad/s; None where the last command is young enough."""
@@ -461,6 +468,12 @@ class CalibrationSession:
         suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
             self.end(f'no sample came for {SILENCE:g} s: look at the gyro and its driver')
+
+    def see_callers(self, count: int) -> None:
+        """Take the number of clients of the service, a few times a second; a drive wants one."""
+        if self._drive and self._drive.is_abandoned(count):
+            self.end('the program that called calibrate is gone, and nobody waits for the answer: '
+                     'let it run until then')
 
     def interrupt(self, reason: str) -> None:
         """End a run over which integration began anew."""
