@@ -70,7 +70,7 @@ def test_driver_and_compensation_go_on_together_where_the_clock_is_set(
         start_node('compensation_node', {'calibration_file': tmp_path / 'calibration.yaml',
                                          'model_file': tmp_path / 'model.yaml'})
         start_node('driver_node', {'port': gyro.path})
-        wait_until(lambda: len(heading) > 200, what='headings')
+        wait_until(lambda: len(heading) > 200, 90.0, 'headings')
         for hours in (3.0, 1.0):
             set_clock(hours * HOUR)
             later, begin = (heading[-1].header.stamp.sec + (HOUR if hours == 3.0 else -2.0 * HOUR),

@@ -90,6 +90,8 @@ class Stage:
             assert answer.result().message.startswith(tuple(
                 f'refused: {words}' for words in (*HELD_UP, 'ROS time stands still'))), (
                     answer.result().message)
+            self.wait_until(lambda: abs(self.base.robot.rate) < 1e-4, what='the robot to stand')
+            time.sleep(1.0)  # a command is remembered for so long
         raise AssertionError('the machine held up five drives')
 
     def refused(self, answer, words, begin):
