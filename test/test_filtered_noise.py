@@ -64,7 +64,7 @@ def test_the_angle_random_walk_behind_a_filter_is_that_of_low_frequencies():
 
 
 @pytest.mark.parametrize('filter, name',
-                         map(tried, FILTERS, ['interference_tone', 'time_offset', 'time_offset']))
+                         map(tried, FILTERS, ['time_offset', 'interference_tone', 'time_offset']))
 def test_what_is_hidden_in_noise_behind_a_filter_is_found(filter, name):
     hidden, log = behind(filter, [name], 8.0, 1)
     found = diagnose([log], np.random.default_rng(0))

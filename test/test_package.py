@@ -137,7 +137,9 @@ def test_colcon_sees_a_ros_package(source, tmp_path):
 
 
 @needs_colcon
-@pytest.mark.parametrize('options', [(), ('--symlink-install',)], ids=['copied', 'symlinked'])
+@pytest.mark.parametrize('options', [
+    pytest.param((), id='copied'),
+    pytest.param(('--symlink-install',), id='symlinked', marks=pytest.mark.evidence)])
 def test_colcon_installs_data_and_executables(source, tmp_path, options):
     bases = ['--build-base', tmp_path / 'build', '--install-base', tmp_path / 'install']
     run(COLCON, '--log-base', tmp_path / 'log', 'build', *bases, *options, folder=source)
