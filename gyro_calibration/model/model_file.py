@@ -83,7 +83,8 @@ def model_of(content: Any, name: str = 'the model') -> GyroModel:
     try:
         return _from_content(content)
     except WrongValue as error:
-        raise ModelError(f'{name}: {error} (see docs/explanation/error_model.md)') from None
+        raise ModelError(f'{name}: {error}; correct it (see docs/explanation/error_model.md) '
+                         'or calibrate again') from None
 
 
 def _from_content(content: Any) -> GyroModel:

@@ -117,7 +117,7 @@ def number(place: str, value: Any, low: float = -LARGEST, high: float = LARGEST)
     if (isinstance(value, bool) or not isinstance(value, (int, float))
             or not low <= value <= high):
         least = '' if low == -LARGEST else f' of at least {low:g}'
-        wanted = (f'a finite number{least}; mend it or calibrate again' if high == LARGEST
+        wanted = (f'a finite number{least}' if high == LARGEST
                   else f'a number from {low:g} to {high:g}')
         raise WrongValue(place, value, wanted)
     return float(value)
