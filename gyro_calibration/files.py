@@ -37,7 +37,7 @@ LARGEST = 1e20
 #: Times that compressed data may grow, where sensor data shrink to a tenth; and bytes that any may
 #: grow to.
 GROWTH, GROWN = 100, 1 << 24
-#: A pipe that nobody has begun to write to after so many ms is given up.
+#: ms; how long a pipe is waited for until a program writes to it.
 _PATIENCE = 900
 
 #: Kind of what is no regular file -> its name.
@@ -112,7 +112,7 @@ def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
         mode = os.fstat(handle).st_mode
         _refuse_kind(path, mode, pipes)
         if stat.S_ISFIFO(mode) and not _is_written_to(handle):
-            raise OSError(errno.EINVAL, 'it is a pipe that nobody writes to', str(path))
+            raise OSError(errno.EINVAL, 'it is a pipe without a writer', str(path))
         os.set_blocking(handle, True)
         return open(handle, 'rb')
     except BaseException:

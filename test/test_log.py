@@ -274,7 +274,7 @@ def test_numbers_are_the_same_whether_other_columns_stand_beside_them_or_not(tmp
 def test_the_reader_says_how_far_it_is(tmp_path, name):
     write_log(tmp_path / name, Log(output=np.random.default_rng(0).normal(size=5000)))
     said = []
-    list(read_log_blocks(tmp_path / name, rows=1000, heard=said.append))
+    list(read_log_blocks(tmp_path / name, rows=1000, on_progress=said.append))
     assert len(said) == 5 and said == sorted(said) and said[-1] == (tmp_path / name).stat().st_size
 
 

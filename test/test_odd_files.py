@@ -125,7 +125,7 @@ def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
                 assert len(read_log(tmp_path / 'log.csv')) == 2
                 return
             except LogError as error:
-                assert 'a pipe that nobody writes to' in str(error)
+                assert 'a pipe without a writer' in str(error)
     raise AssertionError('it was never read')
 
 

@@ -469,7 +469,7 @@ def test_publishers_that_come_late_or_with_another_quality_are_heard(
     robot = Robot(ros)
     recording = record('record', '--reference-topic', 'pose', '--reference-topic', 'note',
                        '--out', tmp_path / 'a.mcap', '--json')
-    wait_until(lambda: 'nobody publishes /imu/data_raw, /imu/temperature, /pose, /note so far'
+    wait_until(lambda: 'no publisher so far of /imu/data_raw, /imu/temperature, /pose, /note'
                in recording.error, 60.0, 'a remark')
     note = ros.publisher(String, 'note', reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL))
     note.publish(String(data='said before anybody listened'))

@@ -390,8 +390,8 @@ def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
                                 f'{alike[0].shown_by}', names)
     advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1]
                                      if effect.shown_by))
-    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be parted; '
-                            f'{advice}, or leave one out', names)
+    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be '
+                            f'distinguished; {advice}, or leave one out', names)
 
 
 # looking at it

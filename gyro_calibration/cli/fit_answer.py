@@ -85,7 +85,7 @@ def dwell_data(selection: Selection) -> dict[str, Any]:
         'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
                     'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
         'choices': [_choice_data(choice) for choice in selection.choices],
-        'look_alikes': [_twins_data(twins) for twins in selection.twins],
+        'look_alikes': [_pair_data(twins) for twins in selection.twins],
         'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
         'by_temperature': [] if table.temperature is None
         else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
@@ -99,7 +99,7 @@ def _choice_data(choice: Choice) -> dict[str, Any]:
             'reason': choice.reason}
 
 
-def _twins_data(twins: Twins) -> dict[str, Any]:
+def _pair_data(twins: Twins) -> dict[str, Any]:
     return {'taken': twins.taken, 'other': twins.other, 'sigmas': twins.sigmas,
             'parted': twins.parted, 'parting_rate_rad_s': twins.rate, 'reason': twins.reason}
 
@@ -204,7 +204,7 @@ def _warnings(fit: Calibration) -> Iterator[str]:
                'surface: something is missing. The intervals are widened by that.')
     if fit.folded_beyond is not None:
         yield (f'From {fit.folded_beyond / DEGREE:.0f} deg/s on the output does not grow with the '
-               'rate, so that no output tells these rates: the model must not be used there.')
+               'rate, so that an output has two rates there: do not use the model beyond it.')
     if not fit.freedom:
         yield 'There are as many values as dwells, so nothing says how sure they are: add dwells.'
 
@@ -241,11 +241,10 @@ def choice_lines(selection: Selection) -> Iterator[str]:
 
 
 def _alike(twins: Twins) -> str:
-    remedy = ('no rate up to three times the fastest would distinguish them' if twins.rate is None
-              else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s would distinguish '
-              'them')
+    remedy = ('no rate up to three times the fastest' if twins.rate is None
+              else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s')
     return (f'These data hardly distinguish {twins.taken} from {twins.other}: {twins.reason}. '
-            f'It matters beyond the calibrated rates; {remedy}.')
+            f'It matters beyond the calibrated rates; {remedy} would distinguish them.')
 
 
 def _shown(value: float, form: str) -> str:

@@ -250,7 +250,7 @@ class _PortSession(_Session):
                                           self._settings, on_change=self._tell)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        self._told = ''
+        self._last_message = ''
         # Fixed at the beginning: the stamps must not jump where somebody sets the clock.
         self._since = time.time_ns() - round(steady() * NSEC_PER_SEC)
         super().__init__(given, stop)
@@ -287,10 +287,10 @@ class _PortSession(_Session):
         if state.name == 'failed':
             self._recorder.flush()  # there is no piece in a silence
         said = state.problem or state.name
-        if (state.name == 'opening' or said == self._told
-                or state.name == 'listening' and self._told):
+        if (state.name == 'opening' or said == self._last_message
+                or state.name == 'listening' and self._last_message):
             return  # it listens again at each attempt
-        found, self._told = self._connection, said
+        found, self._last_message = self._connection, said
         name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
                 if found.protocol else '')
         say(name if state.name == 'reading' else said)
@@ -309,9 +309,9 @@ class _PortSession(_Session):
                                    self._connection.clock)
         warning = (protocol.wrong_rate(self._settings, clock.period)
                    if protocol and clock and clock.is_settled else '')
-        told = {name.replace('_', ' '): count for name, count in counts.items()
-                if name not in ('samples', 'lost_samples') and count}
-        return [*(f'{count} {name}.' for name, count in told.items()),
+        counted = {name.replace('_', ' '): count for name, count in counts.items()
+                   if name not in ('samples', 'lost_samples') and count}
+        return [*(f'{count} {name}.' for name, count in counted.items()),
                 *([f'{warning}.'] if warning else []), *super()._remarks()]
 
 
@@ -395,7 +395,7 @@ class _TopicSession(_Session):
             self._waiting = False
             self._missing, self._known = node.missing, node.known()
             if self._missing:
-                say(f'nobody publishes {", ".join(self._missing)} so far; '
+                say(f'no publisher so far of {", ".join(self._missing)}; '
                     f'there are {", ".join(self._known) or "none"}')
 
     def _details(self) -> dict[str, Any]:

@@ -217,9 +217,9 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     if is_recording(given.log) or given.unwrap:
         yield from blocks_of(read(given))
         return
-    with _bytes_of(given.log) as heard:
-        blocks = read_log_blocks(given.log, _sensitivity(given), given.rate, heard=heard,
-                                 columns=given.names, axis=given.axis)
+    with _bytes_of(given.log) as on_progress:
+        blocks = read_log_blocks(given.log, _sensitivity(given), given.rate,
+                                 on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _inside(given, blocks):
             yield _turned(given, log)
 
@@ -240,8 +240,8 @@ def _show_place(shown: Any, place: int) -> None:
 def _recorded(given: argparse.Namespace) -> Log:
     """Read a recording, and print on standard error what was taken and mended."""
     topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
-    with _bytes_of(given.log) as heard:
-        return read_recording(given.log, topics, given.rate, heard, say)
+    with _bytes_of(given.log) as on_progress:
+        return read_recording(given.log, topics, given.rate, on_progress, say)
 
 
 def _sensitivity(given: argparse.Namespace) -> float | None:

@@ -145,7 +145,7 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     """
     Read a log file (.csv or .csv.gz).
 
-    Values are parted by commas, or by semicolons or tabs; then the decimal mark may be a comma.
+    Values are separated by commas, or by semicolons or tabs; then the decimal mark may be a comma.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
 
 
 def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-                    rows: int = ROWS, heard: Callable[[int], object] | None = None,
+                    rows: int = ROWS, on_progress: Callable[[int], object] | None = None,
                     columns: Mapping[str, str] = {}, axis: str = 'z') -> Iterator[Log]:
     """
     Read a log file row by row, and give blocks of it, so that any length needs little memory.
@@ -194,7 +194,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
     path, sensitivity, rate, columns, axis : as for `read_log`
     rows : of a block, at least 2; the last block has less, and so have those with texts that go
         over several lines
-    heard : is told after each block how many bytes of the file are read, if it is not a pipe
+    on_progress : is called after each block with the bytes of the file that are read, unless it
+        is a pipe
 
     Raises
     ------
@@ -221,8 +222,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             last = _refuse_time(path, places, arrays.get('time'), last)
             if 'output' not in arrays and sensitivity is not None:
                 arrays['output'] = arrays['counts'] * sensitivity
-            if heard is not None and file.seekable():
-                heard(file.tell())
+            if on_progress is not None and file.seekable():
+                on_progress(file.tell())
             if count > 1:
                 yield Log(**arrays, notes=table.notes, others=others)
     if count < 2:

@@ -41,7 +41,7 @@ from gyro_calibration.logs.cdr import (
     TWIST,
 )
 from gyro_calibration.logs.log import Array, Log, LogError, Mask, ROWS, unwrapped
-from gyro_calibration.logs.ros_bag import Contents, Heard, Message, read_messages
+from gyro_calibration.logs.ros_bag import Contents, Message, OnProgress, read_messages
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,8 +174,8 @@ class _Course:
 
 
 def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | None = None,
-                   heard: Heard = lambda place: None,
-                   say: Callable[[str], object] = lambda note: None) -> Log:
+                   on_progress: OnProgress = lambda place: None,
+                   on_note: Callable[[str], object] = lambda note: None) -> Log:
     """
     Read a ROS 2 recording: a folder, or a file .mcap or .db3.
 
@@ -184,8 +184,8 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
     path : the recording
     topics : which of its topics are meant
     rate : Hz; the samples came at this rate, whatever their stamps say
-    heard : is told how many bytes are read
-    say : is told what was taken, and what had to be done for it; the notes of the log have it too
+    on_progress : is called with the bytes that are read
+    on_note : is called with each note: what was taken, and what was corrected
 
     Raises
     ------
@@ -193,7 +193,7 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
 
     """
     contents, series = Contents(), dict[str, _Series]()
-    for message in read_messages(path, contents, heard):
+    for message in read_messages(path, contents, on_progress):
         if message.topic not in series:
             axis = 'z' if _same(message.topic, topics.reference) else topics.axis
             series[message.topic] = _Series(message.topic, message.kind,
@@ -201,7 +201,7 @@ def read_recording(path: str | Path, topics: Topics = Topics(), rate: float | No
         series[message.topic].add(message)
     log = _Reader(path, topics, contents, series).log(rate)
     for note in log.notes:
-        say(note)
+        on_note(note)
     return replace(log, notes=(*log.notes, *contents.about))
 
 
@@ -358,7 +358,7 @@ class _Reader:
         other = int(np.count_nonzero(doubled & ~same))
         if other > 1 + _DOUBLED * len(gyro):
             raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
-                           'the stamp of another sample, so nobody knows when they were taken; '
+                           'the stamp of another sample, so their times are unknown; '
                            'give --rate')
         self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
                            'were left out')

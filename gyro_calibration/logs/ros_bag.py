@@ -62,8 +62,8 @@ _TABLES = {'topics', 'messages', 'message_definitions'}
 #: asks for more memory than there may be.
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
-#: Is told how many bytes of all files are read.
-Heard = Callable[[int], object]
+#: Is called with the bytes of all files that are read.
+OnProgress = Callable[[int], object]
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Contents:
         return kind in self.definitions
 
 
-def said(text: object) -> str:
+def _printable(text: object) -> str:
     """Return a text of a file for a sentence: one line, not too long, no control characters."""
     return plain(' '.join(str(text).split()))[:_MOST_CHARACTERS]
 
@@ -142,7 +142,7 @@ def files_of(path: str | Path) -> list[Path]:
 
 
 def read_messages(path: str | Path, contents: Contents,
-                  heard: Heard = lambda place: None) -> Iterator[Message]:
+                  on_progress: OnProgress = lambda place: None) -> Iterator[Message]:
     """
     Give the messages of a recording that may be of use for a gyro, and fill in its contents.
 
@@ -150,7 +150,7 @@ def read_messages(path: str | Path, contents: Contents,
     ----------
     path : a folder, or a file .mcap or .db3, each perhaps with .zstd
     contents : is filled in
-    heard : is told how far it is
+    on_progress : is called with the bytes that are read
 
     Raises
     ------
@@ -162,7 +162,7 @@ def read_messages(path: str | Path, contents: Contents,
         try:
             with _unpacked_file(file) as source:
                 read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
-                yield from read(source, file, contents, partial(_shifted, heard, done))
+                yield from read(source, file, contents, partial(_shifted, on_progress, done))
             done += file.stat().st_size
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({reason(error)}); '
@@ -173,8 +173,8 @@ def read_messages(path: str | Path, contents: Contents,
         contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
 
 
-def _shifted(heard: Heard, done: int, place: int) -> None:
-    heard(done + place)
+def _shifted(on_progress: OnProgress, done: int, place: int) -> None:
+    on_progress(done + place)
 
 
 def _kind_of(path: Path) -> str | None:
@@ -249,19 +249,20 @@ def _library(name: str) -> Any:
 # MCAP
 
 
-def _from_mcap(source: Path, path: Path, contents: Contents, heard: Heard) -> Iterator[Message]:
+def _from_mcap(source: Path, path: Path, contents: Contents,
+               on_progress: OnProgress) -> Iterator[Message]:
     with open(source, 'rb') as file:
         end = source.stat().st_size
         if file.read(len(_MAGIC)) != _MAGIC:
             raise LogError(f'{path}: is not an MCAP file; name a recording, or record again')
-        reader, told = _McapReader(contents, _Budget(path)), 0
+        reader, reported = _McapReader(contents, _Budget(path)), 0
         for code, body in _records(file, end, contents):
             if code == _DATA_END:
                 return
             yield from reader.read(code, body, torn=file.tell() == end)
-            if file.tell() - told > _PIECE:
-                told = file.tell()
-                heard(told)
+            if file.tell() - reported > _PIECE:
+                reported = file.tell()
+                on_progress(reported)
         contents.notes.append(f'{path.name} is torn after {file.tell()} of {end} bytes, '
                               'and was read up to there')
 
@@ -350,7 +351,7 @@ def _about(body: bytes) -> list[str]:
     while name == ABOUT and place < len(body):
         key, place = _text(body, place)
         value, place = _text(body, place)
-        notes.append(said(f'{key}: {value}'))
+        notes.append(_printable(f'{key}: {value}'))
     return notes
 
 
@@ -409,7 +410,7 @@ def _message_data(data: bytes, budget: _Budget) -> bytes:
 
 
 def _from_database(source: Path, path: Path, contents: Contents,
-                   heard: Heard) -> Iterator[Message]:
+                   on_progress: OnProgress) -> Iterator[Message]:
     with _database(source, path) as (database, tables):
         channels, budget = _topics(database, tables, path, contents), _Budget(path)
         size, last, count = path.stat().st_size, _last_row(database), 0
@@ -417,7 +418,7 @@ def _from_database(source: Path, path: Path, contents: Contents,
             for row, topic, received, data in _rows(database):
                 count += 1
                 if count % 4096 == 0:
-                    heard(int(size * row / last))
+                    on_progress(int(size * row / last))
                 if topic not in channels:
                     continue
                 if not (isinstance(received, int) and isinstance(data, bytes)):
@@ -460,7 +461,7 @@ def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, se
 
 
 def _why(error: Exception | None) -> str:
-    return said(str(error) or 'it asks for more memory than there may be')
+    return _printable(str(error) or 'it asks for more memory than there may be')
 
 
 def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:

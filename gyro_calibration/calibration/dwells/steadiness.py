@@ -64,10 +64,10 @@ def steady(time: Array, rate: Array, limits: Steadiness) -> list[slice]:
     width = max(3, count(time, limits.margin))
     # A single outlier of the reference must not break a dwell.
     smooth = uniform_filter1d(median_filter(rate, 5, mode='nearest'), width, mode='nearest')
-    stray = (maximum_filter1d(smooth, width, mode='nearest')
-             - minimum_filter1d(smooth, width, mode='nearest'))
-    allowed = float(np.clip(5.0 * np.median(stray), 0.02 * DEGREE, limits.rate))
-    calm = stray <= allowed + limits.relative * np.abs(smooth)
+    deviation = (maximum_filter1d(smooth, width, mode='nearest')
+                 - minimum_filter1d(smooth, width, mode='nearest'))
+    allowed = float(np.clip(5.0 * np.median(deviation), 0.02 * DEGREE, limits.rate))
+    calm = deviation <= allowed + limits.relative * np.abs(smooth)
     # The windows of both filters reach over the end of a ramp; half of that is given back, so that
     # the margin stays.
     calm = maximum_filter1d(calm, 2 * (width // 2) + 1)

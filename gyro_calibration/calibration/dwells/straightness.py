@@ -56,10 +56,11 @@ def _crookedness(heading: Array, most: float) -> float:
     # A vibration of the table cannot be seen over a whole number of its periods, so several
     # lengths are used.
     reaches = [reach for reach in (2, 3, 5) if len(heading) > 2 * reach]
-    strays = [np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
-              for reach in reaches]
-    stray = max((float(np.median(each)) for each in strays), default=math.inf)
-    return float(np.clip(3.0 * stray, 0.02 * DEGREE, most))
+    deviations = [
+        np.abs(heading[reach:-reach] - 0.5 * (heading[2 * reach:] + heading[:-2 * reach]))
+        for reach in reaches]
+    deviation = max((float(np.median(each)) for each in deviations), default=math.inf)
+    return float(np.clip(3.0 * deviation, 0.02 * DEGREE, most))
 
 
 def _cones(time: Array, heading: Array, tolerance: float, gap: float) -> Iterator[slice]:
@@ -84,17 +85,17 @@ def _walked(time: Array, heading: Array, cone: slice, tolerance: float, step: fl
     first, last = max(0, cone.start - _length(cone)), min(len(time), cone.stop + _length(cone))
     line = heading[middle].mean() + slope(time[middle], heading[middle]) * (
         time[first:last] - time[middle].mean())
-    stray = np.abs(heading[first:last] - line)
-    beyond = np.flatnonzero(stray > tolerance)
+    deviation = np.abs(heading[first:last] - line)
+    beyond = np.flatnonzero(deviation > tolerance)
     before, after = beyond[beyond < middle.start - first], beyond[beyond >= middle.stop - first]
     begin = (0 if not len(before) else
-             int(before[-1]) + 1 + _step_back(stray[before[-1]::-1], tolerance, step))
-    end = (len(stray) if not len(after) else
-           int(after[0]) - _step_back(stray[after[0]:], tolerance, step))
+             int(before[-1]) + 1 + _step_back(deviation[before[-1]::-1], tolerance, step))
+    end = (len(deviation) if not len(after) else
+           int(after[0]) - _step_back(deviation[after[0]:], tolerance, step))
     return slice(first + begin, first + max(begin, end))
 
 
-def _step_back(stray: Array, tolerance: float, step: float) -> int:
+def _step_back(deviation: Array, tolerance: float, step: float) -> int:
     """
     Return how many blocks of a ramp are within the tolerance, from the deviation beyond them.
 
@@ -103,9 +104,9 @@ def _step_back(stray: Array, tolerance: float, step: float) -> int:
 
     """
     reach = round(0.5 / _BLOCK)
-    if len(stray) <= reach:
+    if len(deviation) <= reach:
         return 0
-    ratio = math.sqrt(max(1.0, stray[reach] / (tolerance + 0.5 * step)))
+    ratio = math.sqrt(max(1.0, deviation[reach] / (tolerance + 0.5 * step)))
     return math.ceil(min(3.0 / _BLOCK, reach / (ratio - 1.0) if ratio > 1.0 else math.inf))
 
 

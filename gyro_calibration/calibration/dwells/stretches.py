@@ -96,9 +96,9 @@ def _not_steady(found: Stretches, limits: Steadiness) -> str:
     line = ('' if found.samples.heading is None
             else f' and straight to {limits.heading / DEGREE:g} deg')
     return (f'the reference is steady to {limits.rate / DEGREE:g} deg/s{line}, for '
-            f'{limits.duration:g} s at a time beside the settling, in {100.0 * found.share:.0f} % '
-            'of the log; hold each rate for longer, or use the heading itself with '
-            '--method likelihood')
+            f'{limits.duration:g} s at a time without the settling, in '
+            f'{100.0 * found.share:.0f} % of the log; hold each rate for longer, or use the '
+            'heading itself with --method likelihood')
 
 
 def _little(share: float) -> Iterator[str]:
@@ -189,4 +189,4 @@ def _pieces(time: Array, temperature: Array, limits: Steadiness) -> int:
 
 def _short(number: int, least: float) -> Iterator[str]:
     if number:
-        yield f'steady stretches shorter than {least:g} s beside the settling, left out: {number}'
+        yield f'steady stretches shorter than {least:g} s without the settling, left out: {number}'
