@@ -365,8 +365,7 @@ def test_everything_but_the_picture_works_without_matplotlib(run, log, model, mo
     assert run(log, '--model', model)[0] == 0
 
 
-@pytest.mark.parametrize('ending', ['png', 'svg'])
-def test_the_picture_is_written(run, log, model, tmp_path, ending):
+def test_the_picture_is_written(run, log, model, tmp_path):
     pytest.importorskip('matplotlib', reason='matplotlib is not installed')
-    assert run(log, '--model', model, '--picture', tmp_path / f'turn.{ending}')[0] == 0
-    assert (tmp_path / f'turn.{ending}').stat().st_size > 1000
+    assert run(log, '--model', model, '--picture', tmp_path / 'turn.svg')[0] == 0
+    assert (tmp_path / 'turn.svg').stat().st_size > 1000

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gyro_calibration.calibration.dwells import Dwells, dwells, join, take
+from gyro_calibration.calibration.dwells import dwells, join, take
 from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
@@ -154,7 +154,8 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
                   for path, log in logs.items()])
     effects = given.effects or given.polynomial
     selection = (Selection(fit_effects(table, effects), (), ()) if effects
-                 else _selected(table, given.technology))
+                 else select_effects(table, given.technology,
+                                     progress=partial(bar, what='effects')))
     fit = selection.calibration
     model = _written(given, fit.model)
     if given.picture:
@@ -174,10 +175,6 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
-
-
-def _selected(table: Dwells, technology: str | None) -> Selection:
-    return select_effects(table, technology, progress=partial(bar, what='effects'))
 
 
 # a reference heading

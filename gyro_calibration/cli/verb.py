@@ -225,16 +225,12 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
 
 
 @contextmanager
-def _bytes_of(path: str) -> Iterator[Callable[[int], None]]:
+def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
     """Show on a terminal how many bytes of a log are read, and give the function that counts."""
     size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
     with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=2.0, leave=False,
               disable=None) as shown:
-        yield lambda place: _show_place(shown, place)
-
-
-def _show_place(shown: Any, place: int) -> None:
-    shown.update(place - shown.n)
+        yield lambda place: shown.update(place - shown.n)
 
 
 def _recorded(given: argparse.Namespace) -> Log:

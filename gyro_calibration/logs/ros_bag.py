@@ -383,10 +383,6 @@ def _expanded(compression: str, data: bytes, size: int, budget: _Budget) -> byte
     return bytes(expanded)
 
 
-def _from_zstandard(data: bytes) -> Iterator[bytes]:
-    return _unpacked(io.BytesIO(data))
-
-
 def _from_lz4(data: bytes) -> Iterator[bytes]:
     decompressor = _library('lz4.frame').LZ4FrameDecompressor()
     try:
@@ -398,7 +394,8 @@ def _from_lz4(data: bytes) -> Iterator[bytes]:
         raise _Damaged from error
 
 
-_COMPRESSIONS = {'zstd': _from_zstandard, 'lz4': _from_lz4}
+_COMPRESSIONS: dict[str, Callable[[bytes], Iterator[bytes]]] = {
+    'zstd': lambda data: _unpacked(io.BytesIO(data)), 'lz4': _from_lz4}
 
 
 def _message_data(data: bytes, budget: _Budget) -> bytes:
