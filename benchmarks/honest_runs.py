@@ -236,7 +236,7 @@ def tried(kind: str, gyro: Gyro, seed: tuple[int, ...]) -> tuple[Array, Array] |
         fit = self_calibrate(TIME[run], output[run], motion, noise=noise)
         rest = rest_after(TIME, output, fit, motion)
         if rest is not None:
-            check_rest(TIME[rest], output[rest], fit, noise)
+            fit = check_rest(TIME[rest], output[rest], fit, noise).fit
     except DataRefused as reason:
         return str(reason)
     later = b + float(drift[TIME > 20.0].mean())

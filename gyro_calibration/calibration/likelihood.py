@@ -786,7 +786,7 @@ class Stretch:
 
 #: A turn that the profile does not have, by hand or by a slip at one place: standard deviation of
 #: its rate, rad/s, and its odds before the run is seen.
-_TURNED, _ODDS = 0.0175, 0.1
+TURNED, TURNED_ODDS = 0.0175, 0.1
 #: Largest number of places of a run at which a stretch begins or ends.
 _EDGES = 150
 
@@ -817,11 +817,11 @@ def _unlikeliest(estimate: _Estimate, data: _Increments) -> tuple[
 def _of_stretch(estimate: _Estimate, data: _Increments, found: Stretch,
                 inside: Array, chance: float) -> tuple[float, Array, Array]:
     """Return the probability of a stretch with a turn of its own, and (1 + s, b) with it."""
-    odds = _ODDS * found.odds(estimate.freedom - 1.0, _TURNED, chance)
+    odds = TURNED_ODDS * found.odds(estimate.freedom - 1.0, TURNED, chance)
     widened = replace(data, columns=np.insert(data.columns, 4, inside, axis=1),
                       expected=np.insert(data.expected, 4, 0.0))
     other = _estimate(widened, estimate.noise, widened.columns,
-                      np.insert(estimate.prior, 4, _TURNED))
+                      np.insert(estimate.prior, 4, TURNED))
     return odds / (1.0 + odds), other.values[:2], other.covariance[:2, :2]
 
 

@@ -34,6 +34,8 @@ from gyro_calibration.calibration.likelihood import (
     fit_likelihood,
     FOLLOWING,
     Goodness,
+    TURNED,
+    TURNED_ODDS,
 )
 from gyro_calibration.calibration.run_faults import (
     EXPLAINED,
@@ -396,12 +398,14 @@ class RestCheck:
     rate : mean of the corrected rate, rad/s
     deviation : its standard deviation by noise, calibration and wander, rad/s
     limit : largest mean that is accepted, rad/s
+    fit : the calibration, with what the rest says of its bias
 
     """
 
     rate: float
     deviation: float
     limit: float
+    fit: Fit
 
 
 def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
@@ -429,8 +433,10 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
                           f'wanted {limits.rest:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
     deviation = _rest_deviation(duration, corrected, fit, noise)
-    check = RestCheck(float(corrected.mean()), deviation,
-                      max(limits.drift, -float(ndtri(0.5 * false_refusals)) * deviation))
+    mean = float(corrected.mean())
+    check = RestCheck(mean, deviation,
+                      max(limits.drift, -float(ndtri(0.5 * false_refusals)) * deviation),
+                      _turned_throughout(fit, mean, deviation))
     begun, ended = (float(half.mean()) for half in np.array_split(corrected, 2))
     if abs(ended - begun) > 2.0 * CHANCE * max(_white(corrected, duration), limits.drift / CHANCE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
@@ -442,6 +448,26 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
                           f'{check.limit / DEGREE:.4f} are explained: the robot still turned, or '
                           'the run was not what it seemed; run again and leave it at rest')
     return check
+
+
+def _turned_throughout(fit: Fit, rate: float, deviation: float) -> Fit:
+    """
+    Return the fit with the chance that the robot turned steadily throughout the run.
+
+    Such a turn passes for a bias; the rest after it shows that, as well as its noise allows.
+
+    Parameters
+    ----------
+    rate, deviation : mean of the corrected rate at rest, and its standard deviation, rad/s
+
+    """
+    wider = deviation ** 2 + TURNED ** 2
+    odds = TURNED_ODDS * deviation / math.sqrt(wider) * math.exp(
+        min(0.5 * (rate / deviation) ** 2 * TURNED ** 2 / wider, 100.0))
+    part, step = odds / (1.0 + odds), (1.0 + fit.scale_factor_error) * rate
+    covariance = fit.covariance.copy()
+    covariance[1, 1] += part * (deviation ** 2 - covariance[1, 1]) + part * (1 - part) * step ** 2
+    return replace(fit, bias=fit.bias + part * step, covariance=covariance)
 
 
 def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,

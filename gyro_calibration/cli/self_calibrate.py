@@ -129,6 +129,7 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     rest = rest_after(time[known], rates[known], fit, motion)
     check = (None if rest is None
              else check_rest(time[known][rest], rates[known][rest], fit, model.noise))
+    fit = fit if check is None else check.fit
     return _answer(given, model, log, fit, run, given.method, _figures(fit, check),
                    list(_sentences(fit, check, given.method)))
 

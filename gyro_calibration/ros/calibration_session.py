@@ -628,6 +628,7 @@ def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion,
         after = rest_after(time, rate, fit, motion, limits) if odometry else time > begin
         if after is not None:
             rest = check_rest(time[after], rate[after], fit, noise, limits)
+            fit = rest.fit
             remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, up to '
                            f'{rest.limit / DEGREE:.4f} is explained')
     method = 'odometry' if odometry else 'likelihood'
