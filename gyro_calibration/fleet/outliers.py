@@ -52,7 +52,8 @@ class Outlier:
     chance: float
 
 
-def outliers(observed: Observed, kind: str, level: float) -> list[Outlier]:
+def outliers(observed: Observed, kind: str, level: float, pooled: Pooled | None = None
+             ) -> list[Outlier]:
     """
     Return the units or drives that stand out.
 
@@ -61,6 +62,7 @@ def outliers(observed: Observed, kind: str, level: float) -> list[Outlier]:
     observed : one value over the logs of a type
     kind : `pooling.UNITS` or `pooling.DRIVES`
     level : chance that any stands out where none does
+    pooled : the value, where it is pooled already
 
     """
     number = observed.unit if kind == UNITS else observed.drive
@@ -70,7 +72,7 @@ def outliers(observed: Observed, kind: str, level: float) -> list[Outlier]:
     most = min(len(groups) // _PART, _MOST) if len(groups) >= _MANY else 1
     found: list[Outlier] = []
     without: Observed = observed
-    pooled = Pooled(observed)
+    pooled = pooled or Pooled(observed)
     for _ in range(most):
         if kind not in pooled.names:
             break
@@ -105,7 +107,8 @@ class Change:
     chance: float
 
 
-def changes(observed: Observed, date: Numbers, level: float) -> list[Change]:
+def changes(observed: Observed, date: Numbers, level: float, pooled: Pooled | None = None
+            ) -> list[Change]:
     """
     Return the units that change between dates, beyond how they repeat; the clearest change alone.
 
@@ -114,9 +117,10 @@ def changes(observed: Observed, date: Numbers, level: float) -> list[Change]:
     observed : one value over the logs of a type
     date : number of the date of each log, in their order, or -1, shape (n,)
     level : chance that any changes where none does
+    pooled : the value, where it is pooled already
 
     """
-    pooled = Pooled(observed)
+    pooled = pooled or Pooled(observed)
     if POWER_ONS not in pooled.names:
         return []
     candidates = [(int(unit), int(since)) for unit in np.unique(observed.unit)

@@ -39,6 +39,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from types import MappingProxyType
 from typing import Any
 
 from gyro_calibration.logs.log import Array, DataRefused
@@ -307,16 +308,10 @@ class Pooled:
                     column for name, column in zip(self.names, points[part].T) if name != OWN)
         return np.concatenate(found)
 
-    def _search(self, without: str = '') -> Array:
-        """
-        Return the point of the largest restricted likelihood.
-
-        A variance may be held at zero; with that of drives all errors are then a log's own.
-
-        """
+    def _search(self, held: Mapping[str, int] = MappingProxyType({})) -> Array:
+        """Return the point of the largest restricted likelihood, some held at an end (0 or 1)."""
         if not self.names:
             return np.empty(0)
-        held = {without: 0, **({OWN: 1} if without == DRIVES else {})}
         bounds = [(self._bounds[name][held[name]],) * 2 if name in held else self._bounds[name]
                   for name in self.names]
         point = np.array([low + 0.3 * (high - low) for low, high in bounds])
@@ -374,28 +369,43 @@ class Pooled:
 
         """
         found = {}
-        usual = float(np.median(self._scaled.deviation))
         for name in self.names:
-            best, sample = (self._deviation(name, points, usual)
-                            for points in (self._best[None], self._sample))
-            order = np.argsort(sample)
-            total = np.cumsum(self._weight[order]) - 0.5 * self._weight[order]
-            low, high = np.interp([0.025, 0.975], total, sample[order]).tolist()
-            if name != OWN:
-                likely, without = self._log_likelihood(
-                    np.vstack([self._best, self._search(name)])).tolist()
-                limit = _BOTH_REJECTED if name == DRIVES else _REJECTED
-                low = low if 2.0 * (likely - without) > limit else 0.0
+            best, low, high = self._spread(*self._at(name))
+            if name != OWN and self._gain({name: 0, OWN: 1} if name == DRIVES else {name: 0}
+                                          ) <= (_BOTH_REJECTED if name == DRIVES else _REJECTED):
+                low = 0.0
+            elif name == DRIVES and self._gain({name: 0}) <= _REJECTED:
+                # the common part of the errors alone may be all
+                low = self._spread(*self._at(name, errors_alone=True))[1]
             size = 1.0 if name == OWN else self._size
-            found[name] = Component(size * float(best[0]), size * low, size * high)
+            found[name] = Component(size * best, size * low, size * high)
         return found
 
-    def _deviation(self, name: str, points: Array, usual: float) -> Array:
-        sizes = self._sizes(points)
-        if name == OWN:
-            return sizes[OWN]
-        common = (1.0 - sizes[OWN]) * usual ** 2 if name == DRIVES else 0.0
-        return np.sqrt(sizes[name] + common)
+    def _gain(self, held: Mapping[str, int]) -> float:
+        """Return twice the gain in log likelihood over what is held."""
+        known = {name: end for name, end in held.items() if name in self.names}
+        best, without = self._log_likelihood(np.vstack([self._best, self._search(known)]))
+        return 2.0 * float(best - without)
+
+    def _at(self, name: str, errors_alone: bool = False) -> tuple[float, Array]:
+        """Return a standard deviation, or the share, at the likeliest point and at all points."""
+        usual = float(np.median(self._scaled.deviation))
+        found = []
+        for points in (self._best[None], self._sample):
+            sizes = self._sizes(points)
+            if name == OWN:
+                found.append(sizes[OWN])
+                continue
+            common = (1.0 - sizes[OWN]) * usual ** 2 if name == DRIVES else 0.0
+            found.append(np.sqrt(common + (0.0 if errors_alone else sizes[name])))
+        return float(found[0][0]), found[1]
+
+    def _spread(self, best: float, sample: Array) -> tuple[float, float, float]:
+        """Return an estimate with the bounds that hold 95 % of the weight."""
+        order = np.argsort(sample)
+        total = np.cumsum(self._weight[order]) - 0.5 * self._weight[order]
+        low, high = np.interp([0.025, 0.975], total, sample[order]).tolist()
+        return best, low, high
 
     # estimates
 

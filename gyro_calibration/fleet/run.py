@@ -19,7 +19,7 @@ done again one by one, the one that kills its worker again is reported, and the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
@@ -47,7 +47,8 @@ class Lost(Exception):
 
 
 @contextmanager
-def processes(workers: int, memory: float | None = None) -> Iterator[Callable[[int], Executor]]:
+def processes(workers: int, memory: float | None = None, preload: Sequence[str] = ()
+              ) -> Iterator[Callable[[int], Executor]]:
     """
     Give what makes executors of processes on this machine, and end all of them.
 
@@ -55,13 +56,17 @@ def processes(workers: int, memory: float | None = None) -> Iterator[Callable[[i
     ----------
     workers : of an executor, at most
     memory : bytes that a worker may allocate; None without a limit
+    preload : modules that are imported once, and not by each worker that takes the place of
+        another
 
     """
+    context = get_context('forkserver')
+    context.set_forkserver_preload(list(preload))
     made: list[ProcessPoolExecutor] = []
 
     def create(wanted: int) -> Executor:
-        made.append(ProcessPoolExecutor(min(wanted, workers), get_context('forkserver'),
-                                        _limit, (memory,)))
+        made.append(ProcessPoolExecutor(min(wanted, workers), context, _limit,
+                                        (memory,)))
         return made[-1]
     try:
         yield create

@@ -19,6 +19,7 @@ many logs what repeats is an effect, and what does not is wander.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 import math
 from typing import Any
 
@@ -36,7 +37,8 @@ _SPANS, _SHORTEST = 60, 2.0
 _LEAST = 60.0
 
 
-def slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]]:
+def slow_effects(log: Log, time_offset: float = 0.0, names: Collection[str] | None = None
+                 ) -> dict[str, dict[str, Any]]:
     """
     Return the slow effects of a log in time, by name: value, standard deviation and unit.
 
@@ -44,6 +46,7 @@ def slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]
     ----------
     log : with a reference, or at rest
     time_offset : by which the gyro lags its reference, s
+    names : of the effects; None for all
 
     """
     assert log.time is not None and log.output is not None
@@ -66,6 +69,8 @@ def slow_effects(log: Log, time_offset: float = 0.0) -> dict[str, dict[str, Any]
     noise = _noise(at, rate, rest=heading is None)
     found: dict[str, dict[str, Any]] = {}
     for name, (unit, column) in _effects(log, at).items():
+        if names is not None and name not in names:
+            continue
         fit = noise_grid(seen, np.column_stack([*columns, np.diff(at), column]), noise,
                          *wander(at), noisy_column=0 if columns else None,
                          wandering=len(columns))

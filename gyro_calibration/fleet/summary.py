@@ -180,8 +180,8 @@ def _of_value(name: str, slow: bool, records: Sequence[Record], units: Sequence[
         pooled.estimate(pooled.wanted(unit=each, fixed=rows, power_ons=1.0)),
         pooled.estimate(pooled.wanted(fixed=fixed, units=1.0, power_ons=1.0)),
         pooled.estimate(pooled.wanted(drive=np.arange(len(drives)), fixed=none, error=error)),
-        slopes, float(pooled.chance(mean)[0]), outliers(observed, UNITS, level),
-        outliers(observed, DRIVES, level), changes(observed, numbers, level))
+        slopes, float(pooled.chance(mean)[0]), outliers(observed, UNITS, level, pooled),
+        outliers(observed, DRIVES, level, pooled), changes(observed, numbers, level, pooled))
 
 
 def _observed(records: Sequence[Record], name: str, key: str, units: Sequence[str],

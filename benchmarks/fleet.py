@@ -1,0 +1,309 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+A fleet: predicted drives, variances, alarms, smallest effects, slow effects, scale and priors.
+
+    python benchmarks/fleet.py drives FOLDER [OUT]    # rc_car_*.csv.gz of the wheeled drives
+    python benchmarks/fleet.py variances alarms smallest slow scale prior
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+import os
+from pathlib import Path
+import sys
+import tempfile
+import time
+from typing import Any
+
+from fleet_tasks import calibrate
+from gyro_calibration.calibration.self_calibration import Reference, self_calibrate
+from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, UNITS
+from gyro_calibration.fleet.run import finished, Lost, processes
+from gyro_calibration.fleet.slow_effects import slow_effects
+from gyro_calibration.fleet.summary import lacking, summarized
+from gyro_calibration.fleet.table import entries
+from gyro_calibration.fleet.work import done, Task
+from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.model.motion import from_rates
+import numpy as np
+from numpy.random import Generator
+
+#: Units, drives; standard deviations between units, drives and power-ons, and the stated error;
+#: the share of the error that is a log's own.
+FLEETS = ((5, 4, 0.44, 0.0, 0.01, 0.02, 0.5), (5, 4, 0.3, 0.5, 0.1, 0.7, 0.1),
+          (4, 3, 0.0, 0.5, 0.3, 0.3, 1.0), (20, 5, 1.0, 0.5, 0.5, 0.3, 0.5))
+Fleet = tuple[int, int, float, float, float, float, float]
+
+
+def drawn(generator: Generator, fleet: Fleet) -> tuple[Observed, Array]:
+    """Return values of a fleet whose type has the mean 3, and the true values of its units."""
+    units, drives, between, common, power_on, error, own = fleet
+    unit, drive = np.indices((units, drives)).reshape(2, -1)
+    sigma = error * np.exp(0.3 * generator.standard_normal(len(unit)))
+    true = 3.0 + between * generator.standard_normal(units)
+    value = (true[unit] + common * generator.standard_normal(drives)[drive]
+             + power_on * generator.standard_normal(len(unit))
+             + np.sqrt(own) * sigma * generator.standard_normal(len(unit))
+             + np.sqrt(1.0 - own) * sigma * generator.standard_normal(drives)[drive])
+    return Observed(value, sigma, unit, drive), true
+
+
+def variances(generator: Generator, fleets: int = 100) -> Iterator[str]:
+    """Give how often the intervals of 95 % hold, and the root mean square of the estimates."""
+    yield ('| units, drives | true: units, drives, power-ons | estimated | mean | units | '
+           'one more |')
+    yield '|---|---|---|---:|---:|---:|'
+    for fleet in FLEETS:
+        units, _, between, common, power_on, error, own = fleet
+        true = {UNITS: between, DRIVES: np.hypot(common, np.sqrt(1.0 - own) * error),
+                POWER_ONS: power_on}
+        held: dict[str, list[Any]] = {name: [] for name in (*true, 'mean', 'unit', 'new')}
+        estimates = []
+        for _ in range(fleets):
+            observed, values = drawn(generator, fleet)
+            pooled = Pooled(observed)
+            found = pooled.components
+            for name, value in true.items():
+                held[name].append(found[name].low <= value <= found[name].high)
+            estimates.append([found[name].estimate for name in true])
+            for name, wanted, value in (
+                    ('mean', pooled.wanted(), np.array([3.0])),
+                    ('unit', pooled.wanted(unit=np.arange(units)), values),
+                    ('new', pooled.wanted(units=1.0),
+                     3.0 + between * generator.standard_normal(1))):
+                interval = pooled.estimate(wanted)
+                held[name].extend((interval.low < value) & (value < interval.high))
+        size = np.sqrt(np.mean(np.square(estimates), axis=0))
+        yield (f'| {fleet[0]}, {fleet[1]} | ' + ', '.join(f'{each:.3g}' for each in true.values())
+               + ' | ' + ', '.join(f'{each:.3g} ({100 * np.mean(held[name]):.0f} %)'
+                                   for name, each in zip(true, size))
+               + ''.join(f' | {100 * np.mean(held[name]):.1f} %' for name in
+                         ('mean', 'unit', 'new')) + ' |')
+
+
+def drives(folder: str, out: str = '') -> Iterator[str]:
+    """
+    Predict each log from the other drives, and from those and the other units of its drive.
+
+    What the verb `fleet` has done in `out` is not done again.
+
+    """
+    with tempfile.TemporaryDirectory() as new:
+        records = [done(Task(entry, out or new)) for entry in entries([f'{folder}/rc_car_*'])]
+    units, named = (sorted({each[key] for each in records}) for key in ('unit', 'drive'))
+    unit, drive = (np.array([names.index(each[key]) for each in records])
+                   for names, key in ((units, 'unit'), (named, 'drive')))
+    yield ('| value | one other log, rms | pooled, drive left out, rms | held | '
+           'pooled, log left out, rms | held | ratio |')
+    yield '|---|---:|---:|---:|---:|---:|---:|'
+    for name, factor, spoken in (('bias', 1.0 / DEGREE, 'deg/s'),
+                                 ('scale_factor_error', 100.0, '%'), ('time_offset', 1.0, 's')):
+        value, sigma = (np.array([each['values'][name][what] for each in records])
+                        for what in ('value', 'deviation'))
+        single = np.array([value[place] - value[other] for place in range(len(value))
+                           for other in np.flatnonzero(unit == unit[place]) if other != place])
+        apart = [_predicted(value, sigma, unit, drive, drive == each, False)
+                 for each in range(len(named))]
+        alone = [_predicted(value, sigma, unit, drive, np.arange(len(value)) == each, True)
+                 for each in range(len(value))]
+        rms = [factor * np.sqrt(np.mean(np.concatenate(each) ** 2))
+               for each in ([single], [one for one, _ in apart], [one for one, _ in alone])]
+        hold = [100.0 * np.mean(np.concatenate([one for _, one in each]))
+                for each in (apart, alone)]
+        yield (f'| {name}, {spoken} | {rms[0]:.3g} | {rms[1]:.3g} | {hold[0]:.0f} % | '
+               f'{rms[2]:.3g} | {hold[1]:.0f} % | {rms[2] / rms[0]:.2f} |')
+
+
+def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, known: bool
+               ) -> tuple[Array, Array]:
+    """Return errors of predicted values of the logs that are left out, and whether they hold."""
+    pooled = Pooled(Observed(value[~left], sigma[~left], unit[~left], drive[~left] if known
+                             else np.unique(drive[~left], return_inverse=True)[1]))
+    wanted = (pooled.wanted(unit=unit[left], drive=drive[left], error=sigma[left], measured=True,
+                            power_ons=1.0) if known
+              else pooled.wanted(unit=unit[left], error=sigma[left], measured=True,
+                                 power_ons=1.0, drives=1.0))
+    found = pooled.estimate(wanted)
+    return (value[left] - found.value,
+            (found.low < value[left]) & (value[left] < found.high))
+
+
+def _records(generator: Generator, units: int, drives: int, effect: float = 0.0
+             ) -> list[dict[str, Any]]:
+    """Return records of a fleet in which nothing stands out."""
+    found = []
+    size = {'bias': (0.4, 0.01, 0.01, 0.02), 'scale_factor_error': (0.3, 0.6, 0.1, 0.4),
+            'time_offset': (0.0, 0.4, 0.02, 0.002)}
+    values = {name: drawn(generator, (units, drives, *each, 0.5))[0]
+              for name, each in size.items()}
+    values |= {name: drawn(generator, (units, drives, 0.0, 0.0, 0.3, 1.0, 1.0))[0]
+               for name in ('rate_ramp', 'warm_up_60s')}
+    for place in range(units * drives):
+        unit, drive = divmod(place, drives)
+        of = {name: {'value': float(each.value[place]) + (
+            0.0 if name in size else effect - 3.0), 'deviation': float(each.deviation[place]),
+            'unit': '1'} for name, each in values.items()}
+        found.append({'log': str(place), 'unit': str(unit), 'type': '', 'drive': str(drive),
+                      'date': f'2026-01-{drive + 1:02d}', 'temperature': None, 'noise': {},
+                      'diagnosis': None, 'values': {name: of[name] for name in size},
+                      'slow': {name: each for name, each in of.items() if name not in size}})
+    return found
+
+
+def alarms(generator: Generator, fleets: int = 100) -> Iterator[str]:
+    """Give how many fleets in which nothing is give any alarm; 1 % is stated."""
+    yield '| units, drives | fleets | with an alarm |'
+    yield '|---|---:|---:|'
+    for units, count in ((5, 4), (16, 3)):
+        found = 0
+        for _ in range(fleets):
+            (each,) = summarized(_records(generator, units, count))
+            found += bool(lacking(each)) or any(
+                one.outlying_units or one.outlying_drives or one.changed
+                for one in each.values.values())
+        yield f'| {units}, {count} | {fleets} | {found} |'
+
+
+def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
+    """Give the smallest effect of a type that is found, against the number of its units."""
+    yield '| units, each on a drive of its own | smallest found | times root of units |'
+    yield '|---:|---:|---:|'
+    for units in (5, 10, 20, 40, 80, 160):
+        sizes = []
+        for _ in range(fleets):
+            observed = Observed(generator.standard_normal(units), np.full(units, 0.3),
+                                np.arange(units), np.full(units, -1))
+            pooled = Pooled(observed)
+            found = pooled.estimate(pooled.wanted(), level=0.99)
+            sizes.append(0.5 * float(found.high[0] - found.low[0]))
+        yield f'| {units} | {np.mean(sizes):.3g} | {np.mean(sizes) * np.sqrt(units):.3g} |'
+
+
+def _log(generator: Generator, ramp: float) -> Log:
+    """Return 10 min beside an exact reference, with a bias that walks, and a ramp."""
+    times = np.arange(0.0, 600.0, 0.1)
+    rate = 0.5 * np.sin(2.0 * np.pi * times / 20.0)
+    walk = 2e-6 * np.cumsum(generator.standard_normal(len(times)))
+    output = rate + walk + ramp * times + 1e-3 * generator.standard_normal(len(times))
+    heading = np.concatenate([[0.0], np.cumsum(0.05 * (rate[1:] + rate[:-1]))])
+    return Log(time=times, output=output, reference_heading=heading)
+
+
+def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]:
+    """Give how often a ramp is found by one log and by ten, and none where it is wander."""
+    ramp = 'rate_ramp'
+    level = 0.01
+    usual = [slow_effects(_log(generator, 0.0), names=[ramp])[ramp]['deviation']
+             for _ in range(10)]
+    size = 1.2 * 4.8 * float(np.median(usual))
+    yield f'A ramp of 1.2 times 4.8 deviations of a usual log, {size:.2g} rad/s².'
+    yield ''
+    yield '| ramp | found in single logs | found by ten |'
+    yield '|---|---:|---:|'
+    for name, each in (('the same in all logs', size), ('half of that', 0.5 * size),
+                       ('a quarter', 0.25 * size), ('none: wander', 0.0)):
+        single, pooled_found = 0, 0
+        for _ in range(fleets):
+            found = [slow_effects(_log(generator, each), names=[ramp])[ramp]
+                     for _ in range(logs)]
+            value, sigma = (np.array([one[what] for one in found])
+                            for what in ('value', 'deviation'))
+            single += int(np.sum(np.abs(value) > 2.576 * sigma))
+            pooled = Pooled(Observed(value, sigma, np.arange(logs), np.full(logs, -1)))
+            pooled_found += bool(pooled.chance(pooled.wanted())[0] < level)
+        yield f'| {name} | {single} of {fleets * logs} | {pooled_found} of {fleets} |'
+
+
+def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
+    """Give the cost of a task, the memory of the coordinator, and what killed workers cost."""
+    begin = time.process_time()
+    for number in range(200):
+        calibrate(number)
+    single = (time.process_time() - begin) / 200.0
+    yield '| logs | killed workers | survived | CPU a log over that alone | memory, MB |'
+    yield '|---:|---:|---:|---:|---|'
+    for count, fatal in ((logs, False), (logs // 10, True)):
+        given = (range(count) if not fatal
+                 else [-1 - number if number % (count // killed) == 7 else number
+                       for number in range(count)])
+        begin = time.process_time()
+        done_, lost, memory, used = 0, 0, [], {}
+        with processes(2, preload=['gyro_calibration.cli.fleet', 'fleet_tasks']) as create:
+            for _, found in finished(calibrate, iter(given), 2, create):
+                lost += isinstance(found, Lost)
+                done_ += not isinstance(found, Lost)
+                if not isinstance(found, Lost):
+                    used[found[1]] = found[2]
+                if (done_ + lost) % (count // 4) == 0:
+                    memory.append(_memory())
+        ratio = (time.process_time() - begin + sum(used.values())) / count / single
+        yield (f'| {count} | {lost} | {done_} of {count - (killed if fatal else 0)} | '
+               f'{ratio:.2f} | {", ".join(f"{each:.0f}" for each in memory)} |')
+
+
+def _memory() -> float:
+    """Return the memory of this process now, MB."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
+    """Give the errors of runs of 20 s of one more unit, without and with the prior of its type."""
+    spread, slip = np.array([0.003, 0.05 * DEGREE]), 0.0058
+    times = np.arange(0.0, 20.0, 0.02)
+    motion = from_rates(times, 0.5 * np.sin(2.0 * np.pi * times / 10.0))
+    yield '| | scale factor error, rms, % | held | bias, rms, deg/s | held |'
+    yield '|---|---:|---:|---:|---:|'
+    found: dict[str, list[Any]] = {'without': [], 'with': []}
+    for _ in range(runs):
+        s, b = spread * generator.standard_normal(2)
+        driven = 1.0 + slip * generator.standard_normal()
+        noise = 3e-3 * generator.standard_normal(len(times))
+        rate = (1.0 + s) * driven * motion.rate_at(times) + b + noise
+        for name, covariance in (('without', None), ('with', np.diag(spread ** 2))):
+            fit = self_calibrate(times, rate, motion, reference=Reference(slip), prior=covariance)
+            error = np.array([fit.scale_factor_error - s, fit.bias - b])
+            found[name].append([*error, *(np.abs(error) < 1.96 * np.sqrt(
+                np.diag(fit.covariance)))])
+    for name, rows in found.items():
+        (s, b, *held) = (np.array(each, float) for each in zip(*rows))
+        yield (f'| {name} prior | {100 * np.sqrt(np.mean(s ** 2)):.3f} | '
+               f'{100 * np.mean(held[0]):.0f} % | {np.sqrt(np.mean(b ** 2)) / DEGREE:.4f} | '
+               f'{100 * np.mean(held[1]):.0f} % |')
+
+
+PARTS = {each.__name__: each for each in (variances, alarms, smallest, slow, scale, prior)}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('what', nargs='+', help=f'drives FOLDER, or of {", ".join(PARTS)}')
+    parser.add_argument('--seed', type=int, default=None, help='default: a fresh one')
+    parser.add_argument('--fleets', type=int, help='as many, or runs')
+    given = parser.parse_args(arguments)
+    if given.what[0] == 'drives':
+        print('\n'.join(drives(*given.what[1:])))
+        return
+    for name in given.what:
+        generator = np.random.default_rng(given.seed)
+        print(f'{name}:\n')
+        for line in PARTS[name](generator, *([given.fleets] if given.fleets else [])):
+            print(line, flush=True)
+        print()
+
+
+if __name__ == '__main__':
+    sys.exit(main())
