@@ -45,8 +45,8 @@ def test_every_effect_of_the_gyro_takes_its_sentence_from_the_effects():
 def test_a_cause_says_what_it_is_and_what_parts_it_from_its_twins(name):
     cause = CAUSES[name]
     assert cause.name == name and cause.sentence.endswith('.') and cause.units and cause.along
-    assert bool(cause.twins) == bool(cause.separate_by)
-    assert all(name in CAUSES[twin].twins for twin in cause.twins), 'a twin is one on both sides'
+    assert bool(cause.confounders) == bool(cause.separate_by)
+    assert all(name in CAUSES[other].confounders for other in cause.confounders)
     assert (cause.needs <= {*QUANTITIES, 'reference'}
             and cause.of in {'gyro', 'reference', 'record', 'noise'})
 

@@ -16,9 +16,9 @@ import runpy
 
 from gyro_calibration.calibration.dwells import join
 from gyro_calibration.calibration.selection import (
+    DISTINGUISHED,
     FALSE_ALARM_RATE,
     HARDLY,
-    PARTED,
     select_effects,
     TECHNOLOGIES,
 )
@@ -96,8 +96,9 @@ def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
     table = replace(WANDERING, fastest=300.0 * DEGREE) if wide else WANDERING
     selection = select_effects(measured(table, (*LINEAR, TRUTH['sine_response'])), technology)
     expected = SINE_RESPONSE if wide else TECHNOLOGIES[technology]
-    assert expected in selection.calibration.effects and selection.twins[0].parted == wide
-    reason = selection.twins[0].reason
+    assert expected in selection.calibration.effects
+    assert selection.confounders[0].distinguishable == wide
+    reason = selection.confounders[0].reason
     assert technology in reason or wide and TECHNOLOGIES[technology] is SINE_RESPONSE
     assert ('although' in reason) == (wide and TECHNOLOGIES[technology] is not SINE_RESPONSE)
 
@@ -108,15 +109,15 @@ def test_the_rate_that_is_said_to_part_look_alikes_parts_them(runs):
     truth = GyroModel((*LINEAR, TRUTH['sine_response']))
     for _ in range(runs):
         table = Table().measure(truth, generator)
-        rate = select_effects(table).twins[0].rate
+        rate = select_effects(table).confounders[0].rate
         more, fast = (Table(sweeps=1, rates=4).measure(truth, generator),
                       np.array([rate, -rate, rate, -rate]))
         noise = more.output - truth.output(more.rate, more.temperature)
         more = replace(more, rate=fast, output=truth.output(fast, more.temperature) + noise)
-        pair = select_effects(join([table, more])).twins[0]
+        pair = select_effects(join([table, more])).confounders[0]
         sigmas.append(pair.sigmas if pair.taken == 'sine_response' else -pair.sigmas)
     # The aim is one sigma more than needed; a single pair of fits varies by one sigma.
-    assert np.mean(sigmas) > PARTED - 3.7 / np.sqrt(runs), sigmas
+    assert np.mean(sigmas) > DISTINGUISHED - 3.7 / np.sqrt(runs), sigmas
 
 
 def test_every_effect_has_its_reason():
@@ -151,7 +152,7 @@ def test_of_look_alikes_that_fit_alike_the_bounded_one_is_taken_where_nobody_say
     for _ in range(2):
         fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
                                                generator))
-        pair, = fit.twins
+        pair, = fit.confounders
         assert pair.taken == 'sine_response' or pair.sigmas >= HARDLY
 
 
@@ -166,7 +167,7 @@ def test_on_the_recorded_table_sine_and_cubic_are_hardly_parted_and_the_rates_th
     dwells = RATE_TABLE['table'](data)
     selection = select_effects(dwells, 'open_loop_fog')
     assert names(selection) == {'bias', 'scale_factor_error', 'sine_response', *SLOPES}
-    pair, = selection.twins
-    assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < PARTED
+    pair, = selection.confounders
+    assert (pair.other == CUBIC_NONLINEARITY.name and 1.5 < pair.sigmas < DISTINGUISHED
             and 110.0 < pair.rate / DEGREE < 200.0)
     assert selection.calibration.left_out_rms < 0.05 * DEGREE

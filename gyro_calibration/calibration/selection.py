@@ -48,13 +48,13 @@ import numpy as np
 FALSE_ALARM_RATE = 0.01
 #: Standard deviations from which on two causes are distinguished: the wrong one is then taken in
 #: one of thirty thousand calibrations.
-PARTED = 4.0
+DISTINGUISHED = 4.0
 #: With fewer, the data hardly prefer one of two causes.
 HARDLY = 2.0
 #: Of effects that look alike, the one that the physics of an instrument gives.
 TECHNOLOGIES = {'open_loop_fog': SINE_RESPONSE, 'closed_loop_fog': CUBIC_NONLINEARITY,
                 'mems': CUBIC_NONLINEARITY}
-_TWINS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
+_CONFOUNDERS = ((SINE_RESPONSE, CUBIC_NONLINEARITY),)
 #: What every gyro has, if the dwells determine it better than these standard deviations, of what
 #: data sheets leave open.
 _SLOPES = {BIAS_TEMPERATURE: BIAS_SLOPE, SCALE_FACTOR_TEMPERATURE: SCALE_SLOPE}
@@ -86,7 +86,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Twins:
+class Confounders:
     """
     Two effects that explain the same.
 
@@ -108,9 +108,9 @@ class Twins:
     reason: str
 
     @property
-    def parted(self) -> bool:
-        """Tell whether the data part them."""
-        return abs(self.sigmas) >= PARTED
+    def distinguishable(self) -> bool:
+        """Tell whether the data distinguish them."""
+        return abs(self.sigmas) >= DISTINGUISHED
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Selection:
 
     calibration: Calibration
     choices: tuple[Choice, ...]
-    twins: tuple[Twins, ...]
+    confounders: tuple[Confounders, ...]
 
 
 def select_effects(dwells: Dwells, technology: str | None = None,
@@ -138,18 +138,19 @@ def select_effects(dwells: Dwells, technology: str | None = None,
     DataRefused : too few dwells for anything
 
     """
-    best, twins = supported_effects(dwells, technology, progress)
+    best, confounders = supported_effects(dwells, technology, progress)
     best = with_slopes(best)
     if technology is None:
-        best, twins = part_twins(best, None, SINE_RESPONSE)
+        best, confounders = decided(best, None, SINE_RESPONSE)
     tried = _tried(best.effects)
-    choices = tuple(_choice(best, effect, tried, twins)
+    choices = tuple(_choice(best, effect, tried, confounders)
                     for effect in progress(list(STEADY.values())))
-    return Selection(best, choices, twins)
+    return Selection(best, choices, confounders)
 
 
 def supported_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter,
-                      rate: float = FALSE_ALARM_RATE) -> tuple[Calibration, tuple[Twins, ...]]:
+                      rate: float = FALSE_ALARM_RATE
+                      ) -> tuple[Calibration, tuple[Confounders, ...]]:
     """Fit the supported effects, without reasons, at a false alarm rate."""
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
@@ -157,7 +158,7 @@ def supported_effects(dwells: Dwells, technology: str | None = None, progress: P
     limit = rate / len(candidates)
     best = _grow(base, candidates, limit, progress)
     best = _prune(best, base.effects, limit)
-    return part_twins(best, technology)
+    return decided(best, technology)
 
 
 def with_slopes(fit: Calibration) -> Calibration:
@@ -214,7 +215,7 @@ def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float,
 
 def _may_join(effect: Effect, effects: Sequence[Effect]) -> bool:
     return effect not in effects and not any(
-        effect in pair and any(each in effects for each in pair) for pair in _TWINS)
+        effect in pair and any(each in effects for each in pair) for pair in _CONFOUNDERS)
 
 
 def _joined(effects: Sequence[Effect], effect: Effect) -> tuple[Effect, ...]:
@@ -236,10 +237,10 @@ def _prune(fit: Calibration, base: Sequence[Effect], limit: float) -> Calibratio
     return fit
 
 
-# twins
+# confounders
 
-def part_twins(fit: Calibration, technology: str | None,
-               bounded: Effect | None = None) -> tuple[Calibration, tuple[Twins, ...]]:
+def decided(fit: Calibration, technology: str | None,
+            bounded: Effect | None = None) -> tuple[Calibration, tuple[Confounders, ...]]:
     """
     Decide between effects that explain the same.
 
@@ -247,25 +248,25 @@ def part_twins(fit: Calibration, technology: str | None,
 
     """
     found = []
-    for pair in _TWINS:
+    for pair in _CONFOUNDERS:
         for taken, other in (pair, pair[::-1]):
             swapped = None
             if taken in fit.effects:
                 swapped = _try(fit.dwells, swapped_effects(fit.effects, taken, other),
                                fit.scatter)
             if swapped is not None:
-                fit, twins = _decide((fit, taken), (swapped, other), technology, bounded)
-                found.append(twins)
+                fit, confounders = _decide((fit, taken), (swapped, other), technology, bounded)
+                found.append(confounders)
                 break
     return fit, tuple(found)
 
 
 def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect],
-            technology: str | None, bounded: Effect | None) -> tuple[Calibration, Twins]:
+            technology: str | None, bounded: Effect | None) -> tuple[Calibration, Confounders]:
     (fit, taken), (swapped, other) = sorted((first, second), key=lambda each: each[0].misfit)
     sigmas = math.sqrt(max(swapped.misfit - fit.misfit, 0.0))
     reason = f'{taken.name} fits better by {sigmas:.1f} standard deviations'
-    if sigmas < PARTED and technology is not None:
+    if sigmas < DISTINGUISHED and technology is not None:
         physical = TECHNOLOGIES[technology]
         if physical is other:
             (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
@@ -278,7 +279,7 @@ def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect
         (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
         reason = (f'{taken.name} fits worse by {abs(sigmas):.1f} standard deviations only, and '
                   'its error stays bounded beyond the rates that were seen')
-    return fit, Twins(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
+    return fit, Confounders(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
 
 
 def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
@@ -286,7 +287,7 @@ def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):
         if separation(fit, swapped, np.array([rate, rate, -rate, -rate]),
-                      fit.model.reference_temperature) >= PARTED + 1.0:
+                      fit.model.reference_temperature) >= DISTINGUISHED + 1.0:
             return float(rate)
     return None
 
@@ -308,9 +309,10 @@ def separation(fit: Calibration, swapped: Calibration, rates: Array,
 
 # reasons
 
-def _choice(fit: Calibration, effect: Effect, tried: int, twins: Sequence[Twins]) -> Choice:
-    """Return the gain of a fit with the effect over one without it, or with its twin."""
-    for pair in twins:
+def _choice(fit: Calibration, effect: Effect, tried: int,
+            confounders: Sequence[Confounders]) -> Choice:
+    """Return the gain of a fit with the effect over one without it, or with its confounder."""
+    for pair in confounders:
         if effect.name == pair.other:
             swapped = fit_effects(
                 fit.dwells, swapped_effects(fit.effects, STEADY[pair.taken], effect), fit.scatter)

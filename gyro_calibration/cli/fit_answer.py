@@ -21,7 +21,7 @@ from gyro_calibration.calibration.dwells import listed
 from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.rate_table import Bin, binned, Calibration
 from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
-from gyro_calibration.calibration.selection import Choice, Selection, Twins
+from gyro_calibration.calibration.selection import Choice, Confounders, Selection
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import Parameter, polynomial_to_matrix
 from gyro_calibration.model.gyro_model import GyroModel
@@ -85,7 +85,7 @@ def dwell_data(selection: Selection) -> dict[str, Any]:
         'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
                     'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
         'choices': [_choice_data(choice) for choice in selection.choices],
-        'look_alikes': [_pair_data(twins) for twins in selection.twins],
+        'look_alikes': [_confounders_data(pair) for pair in selection.confounders],
         'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
         'by_temperature': [] if table.temperature is None
         else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
@@ -99,9 +99,10 @@ def _choice_data(choice: Choice) -> dict[str, Any]:
             'reason': choice.reason}
 
 
-def _pair_data(twins: Twins) -> dict[str, Any]:
-    return {'taken': twins.taken, 'other': twins.other, 'sigmas': twins.sigmas,
-            'parted': twins.parted, 'parting_rate_rad_s': twins.rate, 'reason': twins.reason}
+def _confounders_data(pair: Confounders) -> dict[str, Any]:
+    return {'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
+            'parted': pair.distinguishable, 'parting_rate_rad_s': pair.rate,
+            'reason': pair.reason}
 
 
 def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
@@ -237,13 +238,14 @@ def choice_lines(selection: Selection) -> Iterator[str]:
         numbers = f'{without} {with_it} {_shown(choice.chance, ".1g"):>7s}'
         yield _wrapped(f'{choice.effect:26s} {numbers}  '
                        f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
-    yield from (_wrapped(_alike(twins)) for twins in selection.twins if not twins.parted)
+    yield from (_wrapped(_alike(pair)) for pair in selection.confounders
+                if not pair.distinguishable)
 
 
-def _alike(twins: Twins) -> str:
-    remedy = ('no rate up to three times the fastest' if twins.rate is None
-              else f'two dwells each way at {twins.rate / DEGREE:.0f} deg/s')
-    return (f'These data hardly distinguish {twins.taken} from {twins.other}: {twins.reason}. '
+def _alike(pair: Confounders) -> str:
+    remedy = ('no rate up to three times the fastest' if pair.rate is None
+              else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
+    return (f'These data hardly distinguish {pair.taken} from {pair.other}: {pair.reason}. '
             f'It matters beyond the calibrated rates; {remedy} would distinguish them.')
 
 

@@ -65,14 +65,14 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
     weights = {name: math.exp(-max(lack, 0.0)) for name, lack in lacks.items()}
     probability = {name: max(weight / sum(weights.values()), LEAST_CHANCE)
                    for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
-    twins = tuple(dict.fromkeys(each.candidate.cause for each, _ in members
-                                if each.candidate.cause != candidate.cause))
+    confounders = tuple(dict.fromkeys(each.candidate.cause for each, _ in members
+                                      if each.candidate.cause != candidate.cause))
     unit = _unit(candidate.cause, parameters, found)
     size = next(iter(parameters.values()))
     half = 0.5 * (size.interval[1] - size.interval[0]) / _DEVIATIONS
     return Finding(candidate.cause, cause.sentence, parameters, p_value,
-                   _detectable(search, found.named[place], half), (*twins, *unit),
-                   separate_by or (cause.separate_by if twins or unit else ''),
+                   _detectable(search, found.named[place], half), (*confounders, *unit),
+                   separate_by or (cause.separate_by if confounders or unit else ''),
                    _evidence(size, half, candidate.run, len(found.replays)), cause.along,
                    probability=probability, where=_where(found, candidate))
 

@@ -405,22 +405,22 @@ def _cycles(seen: ObservedRange) -> Iterator[Conditions]:
 # how far they distinguish causes
 
 def distinguishing(whole: RegressionProblem, named: Sequence[Named], known: Named,
-                   rivals: Sequence[Named], generator: np.random.Generator) -> Experiment:
+                   confounders: Sequence[Named], generator: np.random.Generator) -> Experiment:
     """
-    Return the shortest experiment that tells a named cause from its rivals, or else the best.
+    Return the shortest experiment that tells a named cause from its confounders, or else the best.
 
     Parameters
     ----------
     whole : the logs
     named : all causes that are named, with values
     known : one of them
-    rivals : causes that may stand in its place, with the shapes that fit best; values are fitted
-        where they have none
+    confounders : causes that may stand in its place, with the shapes that fit best; values are
+        fitted where they have none
     generator : source of what fills lost samples
 
     """
     others = tuple(each for each in named if each is not known)
-    members = tuple(_valued(whole, others, each, known) for each in (known, *rivals))
+    members = tuple(_valued(whole, others, each, known) for each in (known, *confounders))
     done = fitted(whole, [*others, members[0]])
     best = int(done.by_noise.likelihood[0].argmax())
     question = _Question(others, members, done.problem.shapes[best],
@@ -468,22 +468,22 @@ def _gone(known: Named) -> Named:
     return replace(known, candidate=replace(known.candidate, run=-1)) if once else known
 
 
-def _valued(whole: RegressionProblem, others: tuple[Named, ...], rival: Named,
+def _valued(whole: RegressionProblem, others: tuple[Named, ...], confounder: Named,
             known: Named) -> Named:
     """Return a cause with the values that fit best, where it has none."""
-    candidate = rival.candidate
-    if rival.values:
-        return rival
+    candidate = confounder.candidate
+    if confounder.values:
+        return confounder
     if candidate.amplitude is not None:
-        return replace(rival, values=(candidate.amplitude,))
+        return replace(confounder, values=(candidate.amplitude,))
     if known.candidate.cause == 'bias':
         column = np.concatenate([candidate.columns(each)[0] for each in whole.replays])
-        return replace(rival, values=(known.values[0] / float(column.mean()),))
-    done = fitted(whole, [*others, rival])
+        return replace(confounder, values=(known.values[0] / float(column.mean()),))
+    done = fitted(whole, [*others, confounder])
     found = dict(zip(done.owner, done.estimates[0]))
     width = len(candidate.columns(whole.replays[0]))
-    return replace(rival, values=tuple(float(found.get((len(others), place), 0.0))
-                                       for place in range(width)))
+    return replace(confounder, values=tuple(float(found.get((len(others), place), 0.0))
+                                            for place in range(width)))
 
 
 def _root(question: _Question, replays: Sequence[Replay]) -> Array:

@@ -38,7 +38,7 @@ class Cause:
     sentence : what it is, for people
     units : parameter -> SI unit, for those that a diagnosis estimates
     needs : columns of a log without which it cannot be shown; 'reference' is one of `REFERENCES`
-    twins : the causes that may look the same
+    confounders : the causes that may look the same
     separate_by : the experiment that parts it from them; '' where it has none
     along : the variable along which it shows
     of : 'gyro', 'reference', 'record' or 'noise': what is to be mended
@@ -49,7 +49,7 @@ class Cause:
     sentence: str
     units: Mapping[str, str]
     needs: frozenset[str]
-    twins: tuple[str, ...]
+    confounders: tuple[str, ...]
     separate_by: str
     along: str
     of: str
@@ -60,7 +60,7 @@ class _Likeness:
     """What is said of an effect beside its entry in the catalogue of effects."""
 
     along: str
-    twins: tuple[str, ...] = ()
+    confounders: tuple[str, ...] = ()
     separate_by: str = ''
 
 
@@ -129,14 +129,15 @@ def _of_an_effect(name: str, likeness: _Likeness) -> Cause:
     needs = effect.looks_at & {'temperature', 'specific_force', 'supply'}
     turned = likeness.along in {'rate', 'heading', 'rate_change'} and name != 'bias'
     needs = needs | {'time'} | ({'reference'} if turned or 'rate' in effect.looks_at else set())
-    return Cause(name, effect.cause, units, frozenset(needs), likeness.twins,
+    return Cause(name, effect.cause, units, frozenset(needs), likeness.confounders,
                  likeness.separate_by, likeness.along, 'gyro')
 
 
 def _other(name: str, sentence: str, unit: str, of: str, along: str,
-           needs: tuple[str, ...] = ('time',), twins: tuple[str, ...] = (),
+           needs: tuple[str, ...] = ('time',), confounders: tuple[str, ...] = (),
            separate_by: str = '') -> Cause:
-    return Cause(name, sentence, {name: unit}, frozenset(needs), twins, separate_by, along, of)
+    return Cause(name, sentence, {name: unit}, frozenset(needs), confounders, separate_by, along,
+                 of)
 
 
 _WITH_REFERENCE = ('time', 'reference')
@@ -145,7 +146,7 @@ _OTHERS = (
     _other('outliers', 'Single samples are wild, as from a disturbed line or a mended checksum.',
            '1', 'record', 'time'),
     _other('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record',
-           'time', twins=('quantization',),
+           'time', confounders=('quantization',),
            separate_by='turn without rest: an honest code does not stay then'),
     _other('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time'),
     _other('reference_once_per_rev',
@@ -168,9 +169,9 @@ _OTHERS = (
     _other('angle_random_walk', 'The white noise of the rate is not the one simulated.',
            'rad/√s', 'noise', 'frequency'),
     _other('bias_instability', 'The bias flickers otherwise than simulated.', 'rad/s', 'noise',
-           'frequency', twins=('rate_random_walk',), separate_by='record at rest for hours'),
+           'frequency', confounders=('rate_random_walk',), separate_by='record at rest for hours'),
     _other('rate_random_walk', 'The bias walks otherwise than simulated.', 'rad/s/√s', 'noise',
-           'frequency', twins=('bias_instability', 'rate_ramp'),
+           'frequency', confounders=('bias_instability', 'rate_ramp'),
            separate_by='record at rest for hours, and again: a walk does not repeat'),
 )
 

@@ -134,12 +134,13 @@ def _mended(line: Line, factor: float) -> Line:
 
 
 def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str,
-            twins: tuple[str, ...] = ()) -> Finding:
+            confounders: tuple[str, ...] = ()) -> Finding:
     """Return a finding of a cause with one parameter."""
     cause = CAUSES[name]
     unit = next(iter(cause.units.values()))
     return Finding(name, cause.sentence, {name: Estimate(value, interval, unit)}, p_value,
-                   ambiguous_with=twins, separate_by=cause.separate_by if twins else '',
+                   ambiguous_with=confounders,
+                   separate_by=cause.separate_by if confounders else '',
                    evidence=evidence, along=cause.along)
 
 
@@ -153,13 +154,13 @@ def _unit(line: Line, own: float) -> Iterator[tuple[str, Finding]]:
     name = unit_of_scale(factor, deviation)
     if name is None:
         return
-    twins = () if is_far(factor) else ('scale_factor_error',)
+    confounders = () if is_far(factor) else ('scale_factor_error',)
     chance = float(2.0 * stats.norm.sf(abs(factor - 1.0) / max(deviation, 1e-300)))
     said = (f'the output is {factor:.5g} +- {deviation:.2g} times what the reference says, and '
             f'{name} is {FACTORS[name]:.5g}')
     yield name, finding('unit_error', factor,
                         (factor - 1.96 * deviation, factor + 1.96 * deviation),
-                        chance, said, twins)
+                        chance, said, confounders)
 
 
 def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
@@ -261,21 +262,18 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
     wild = outlying_samples(seen, good if band is None else good & ~band.holds(seen.output),
                             0.5 * codes.step, LEVEL)
     good = good if wild is None else good & ~wild.samples
-    findings = [*found.findings, *_quantized(codes, seen.white, model),
-                *_limited(limit, at_limit, model), *_stuck(stuck, log), *_wild(wild, log),
-                *_rounded(found.heading_step, log, seen.white)]
+    free = np.ones(len(output), dtype=bool)
+    if limit is not None and seen.expected is not None:
+        # what no limit cuts, by what is expected, for the noise of the samples would bias it
+        near = _NEAR_LIMIT * max(seen.white, seen.scatter)
+        free = ~((seen.expected > limit.high - near) | (seen.expected < limit.low + near))
+    findings = (*found.findings, *_of_codes(codes, seen, limit, at_limit, model),
+                *_of_single_samples(stuck, wild, log),
+                *_rounded(found.heading_step, log, seen.white))
     matters = codes.step >= STEP * seen.white
-    return replace(found, findings=tuple(findings), trusted=good & _free(limit, seen),
+    return replace(found, findings=findings, trusted=good & free,
                    limit=None if limit is None else limit.size,
                    step=codes.step if matters else 0.0)
-
-
-def _free(limit: Limit | None, seen: Compared) -> Mask:
-    """Mark the samples that no limit cuts, by what is expected, for their noise would bias it."""
-    if limit is None or seen.expected is None:
-        return np.ones(len(seen.output), dtype=bool)
-    near = _NEAR_LIMIT * max(seen.white, seen.scatter)
-    return ~((seen.expected > limit.high - near) | (seen.expected < limit.low + near))
 
 
 def _knows(model: GyroModel | None, name: str, value: float) -> bool:
@@ -285,49 +283,42 @@ def _knows(model: GyroModel | None, name: str, value: float) -> bool:
                for term in terms)
 
 
-def _quantized(codes: Codes, white: float, model: GyroModel | None) -> Iterator[Finding]:
-    if codes.step < STEP * white or codes.step == 0.0 or _knows(model, 'quantization', codes.step):
-        return
-    chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
-    within = 1.96 * codes.deviation
-    yield finding('quantization', codes.step, (codes.step - within, codes.step + within), chance,
-                  f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s '
-                  f'apart, where its white noise is {white / DEGREE:.3g} deg/s')
+def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
+              model: GyroModel | None) -> Iterator[Finding]:
+    """Give steps and limit of the output, unless a model has them."""
+    if (codes.step >= STEP * seen.white and codes.step
+            and not _knows(model, 'quantization', codes.step)):
+        chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
+        within = 1.96 * codes.deviation
+        yield finding('quantization', codes.step, (codes.step - within, codes.step + within),
+                      chance, f'the output has {len(codes.values)} codes, '
+                      f'{codes.step / DEGREE:.4g} deg/s apart, where its white noise is '
+                      f'{seen.white / DEGREE:.3g} deg/s')
+    if limit is not None and not _knows(model, 'saturation', limit.size):
+        sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
+                 if np.isfinite(value)]
+        yield finding('saturation', limit.size, (limit.size, limit.size), limit.p_value,
+                      f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) '
+                      f'have the extreme code {" or ".join(sides)}')
 
 
-def _limited(limit: Limit | None, at_limit: Mask, model: GyroModel | None) -> Iterator[Finding]:
-    if limit is None or _knows(model, 'saturation', limit.size):
-        return
-    sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
-             if np.isfinite(value)]
-    yield finding('saturation', limit.size, (limit.size, limit.size), limit.p_value,
-                  f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) have '
-                  f'the extreme code {" or ".join(sides)}')
-
-
-def _count_and_first(samples: Mask, log: Log) -> tuple[int, float]:
-    """Return how many samples are marked, and the stamp of the first of them, s."""
+def _of_single_samples(stuck: RepeatedSamples | None, wild: Outliers | None,
+                       log: Log) -> Iterator[Finding]:
+    """Give repeated samples and outliers, with their number and the stamp of the first."""
     assert log.time is not None
-    return int(np.count_nonzero(samples)), float(log.time[int(np.argmax(samples))])
-
-
-def _stuck(stuck: RepeatedSamples | None, log: Log) -> Iterator[Finding]:
-    if stuck is None:
-        return
-    count, first = _count_and_first(stuck.repeats, log)
-    yield _counted('stuck_samples', count, stuck.p_value,
-                   f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
-                   f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the '
-                   'whole log')
-
-
-def _wild(wild: Outliers | None, log: Log) -> Iterator[Finding]:
-    if wild is None:
-        return
-    count, first = _count_and_first(wild.samples, log)
-    yield _counted('outliers', count, wild.p_value,
-                   f'{count} single samples are up to {wild.largest:.0f} standard deviations off '
-                   f'their neighbours, the first at {first:.3f} s')
+    if stuck is not None:
+        count = int(np.count_nonzero(stuck.repeats))
+        first = log.time[int(np.argmax(stuck.repeats))]
+        yield _counted('stuck_samples', count, stuck.p_value,
+                       f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
+                       f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the '
+                       'whole log')
+    if wild is not None:
+        count = int(np.count_nonzero(wild.samples))
+        first = log.time[int(np.argmax(wild.samples))]
+        yield _counted('outliers', count, wild.p_value,
+                       f'{count} single samples are up to {wild.largest:.0f} standard deviations '
+                       f'off their neighbours, the first at {first:.3f} s')
 
 
 def _rounded(step: float, log: Log, white: float) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ import math
 from gyro_calibration.calibration.dwells import take
 from gyro_calibration.calibration.rate_table import Calibration, channels_of, columns_of
 from gyro_calibration.calibration.scatter import Whitener
-from gyro_calibration.calibration.selection import PARTED, separation, swapped_effects
+from gyro_calibration.calibration.selection import DISTINGUISHED, separation, swapped_effects
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.dwell_fit import tried
 from gyro_calibration.logs.log import Array, DEGREE
@@ -39,7 +39,7 @@ import numpy as np
 #: Of bias and scale factor, what dwells in one pose on one table never rule out.
 _ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
 #: Further dwells are aimed at this, for two fits vary by one standard deviation.
-_AIM = PARTED + 1.0
+_AIM = DISTINGUISHED + 1.0
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
     if effect in _ALWAYS:
         return Alternatives((_ALWAYS[effect],), CAUSES[effect.name].separate_by)
     steady = [(sigmas, other) for other in _others(fit, effect)
-              if (sigmas := sigmas_of(fit, other)) < PARTED]
+              if (sigmas := sigmas_of(fit, other)) < DISTINGUISHED]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
     found += [(sigmas, name) for name, columns in _beyond(fit, effect)
-              if (sigmas := _sigmas(fit, effect, columns)) < PARTED]
+              if (sigmas := _sigmas(fit, effect, columns)) < DISTINGUISHED]
     if not found:
         return Alternatives()
     said = [_experiment(fit, steady[0][1])] if steady else []
@@ -107,59 +107,48 @@ def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]
 def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
     """Return by how many sigma an effect is better than the best column with a free factor."""
     used = take(fit.dwells, fit.scatter.kept)
-    rest = [term for term in fit.terms if term.effect is not effect]
-    whitener = Whitener(used, fit.scatter)
-    error, known = whitener.whiten(_error(fit, effect)), whitener.whiten(columns_of(used, rest))
-    best = min(_misfit(np.column_stack([known, whitener.whiten(column[fit.scatter.kept])]), error)
-               for column in columns)
-    return math.sqrt(max(best - fit.misfit, 0.0))
-
-
-def _error(fit: Calibration, effect: Effect) -> Array:
-    """Return the residual with what one effect explains, rad/s, of the dwells that are fitted."""
     term = next(each for each in fit.terms if each.effect is effect)
-    return (fit.residual + term.error(channels_of(fit.dwells)))[fit.scatter.kept]
+    whitener = Whitener(used, fit.scatter)
+    # the residual with what the effect explains
+    error = whitener.whiten((fit.residual
+                             + term.error(channels_of(fit.dwells)))[fit.scatter.kept])
+    known = whitener.whiten(columns_of(used, [each for each in fit.terms if each is not term]))
+    misfits = []
+    for column in columns:
+        both = np.column_stack([known, whitener.whiten(column[fit.scatter.kept])])
+        lengths = np.linalg.norm(both, axis=0)
+        both = both / np.where(lengths > 0.0, lengths, 1.0)
+        left = error - both @ np.linalg.lstsq(both, error, rcond=None)[0]
+        misfits.append(float(np.sum(left ** 2)))
+    return math.sqrt(max(min(misfits) - fit.misfit, 0.0))
 
 
-def _misfit(columns: Array, error: Array) -> float:
-    lengths = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(lengths > 0.0, lengths, 1.0)
-    return float(np.sum((error - columns @ np.linalg.lstsq(columns, error, rcond=None)[0]) ** 2))
+# what would distinguish them
 
-
-# what would part them
-
-def _menu(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
+def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
     """Give sweeps that may be added, the easiest first: in words, rates, and temperature."""
     fastest = float(np.abs(fit.dwells.rate).max())
     middle = fit.model.reference_temperature
     slow = fastest * np.array([0.0, 0.02, 0.05, 0.1, 0.2])
     yield ('two dwells each way at 2, 5, 10 and 20 % of the fastest rate, and rests',
            np.tile([*slow, *-slow], 2), middle)
-    for factor in np.arange(1.0, 3.0, 0.05).tolist():
-        rate = factor * fastest
+    for rate in (fastest * np.arange(1.0, 3.0, 0.05)).tolist():
         yield (f'two dwells each way at {rate / DEGREE:.0f} deg/s',
                np.array([rate, rate, -rate, -rate]), middle)
-    yield from _thermal(fit, fastest)
-
-
-def _thermal(fit: Calibration, fastest: float) -> Iterator[tuple[str, Array, float]]:
-    if fit.dwells.temperature is None:
-        return
-    low, high = float(fit.dwells.temperature.min()), float(fit.dwells.temperature.max())
-    rates = np.repeat(fastest * np.linspace(-1.0, 1.0, 9), 2)
-    for beyond in (0.0, 5.0, 10.0, 20.0, 30.0):
-        for temperature in (high + beyond, low - beyond):
-            yield f'a sweep of 18 dwells at {temperature:.0f} degC', rates, temperature
+    if fit.dwells.temperature is not None:
+        low, high = float(fit.dwells.temperature.min()), float(fit.dwells.temperature.max())
+        rates = np.repeat(fastest * np.linspace(-1.0, 1.0, 9), 2)
+        for beyond in (0.0, 5.0, 10.0, 20.0, 30.0):
+            for temperature in (high + beyond, low - beyond):
+                yield f'a sweep of 18 dwells at {temperature:.0f} degC', rates, temperature
 
 
 def _experiment(fit: Calibration, other: Calibration) -> str:
     """Return the easiest sweep that would part two fits, or the best one, in words."""
     tried_sweeps = []
-    for words, rates, temperature in _menu(fit):
-        sigmas = separation(fit, other, rates, temperature)
-        tried_sweeps.append((sigmas, words))
-        if sigmas >= _AIM:
+    for words, rates, temperature in _sweeps(fit):
+        tried_sweeps.append((separation(fit, other, rates, temperature), words))
+        if tried_sweeps[-1][0] >= _AIM:
             break
     sigmas, words = max(tried_sweeps)
     return (f'add {words}: that parts them by {sigmas:.1f} standard deviations'

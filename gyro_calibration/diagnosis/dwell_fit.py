@@ -31,7 +31,7 @@ from gyro_calibration.calibration.rate_table import (
     fit_effects,
 )
 from gyro_calibration.calibration.scatter import Scatter, Uncertainty, Whitener
-from gyro_calibration.calibration.selection import part_twins, supported_effects, TECHNOLOGIES
+from gyro_calibration.calibration.selection import decided, supported_effects, TECHNOLOGIES
 from gyro_calibration.diagnosis.extended_model import origins_before, wider
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.effects import (
@@ -83,8 +83,8 @@ class Named:
     rate: float
 
     def changed(self, effect: Effect) -> Effect:
-        """Return the effect of the change that stands for one of the fit: itself, or its twin."""
-        return _or_twin(effect, self.change)
+        """Return the change that stands for an effect of the fit: itself, or its confounder."""
+        return _or_confounder(effect, self.change)
 
     def level_of(self, effect: Effect) -> float:
         """Return the chance at which an effect is named."""
@@ -160,7 +160,8 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
     fit = _refitted(dwells, model, change)
     moved = [each for each in NUISANCES
              if each in fit.effects and _chance_of_change(fit, model, each) < _level(rate, True)]
-    return Named(fit, change, (*(_or_twin(each, fit) for each in guilty), *moved), tested, rate)
+    return Named(fit, change, (*(_or_confounder(each, fit) for each in guilty), *moved), tested,
+                 rate)
 
 
 def _level(rate: float, nuisance: bool = False) -> float:
@@ -180,14 +181,14 @@ def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibrat
     """Fit the values that changed as a whole: the model's own and the change of them are one."""
     own = {term.effect.name for term in model.terms}
     effects = tuple(
-        twin if (twin := _twin(each)) is not None and twin.name in own - {each.name} else each
-        for each in change.effects)
-    fit, _ = part_twins(fit_effects(beside(dwells, model, effects), effects, change.scatter),
-                        technology(model))
+        other if (other := _confounder(each)) is not None and other.name in own - {each.name}
+        else each for each in change.effects)
+    fit, _ = decided(fit_effects(beside(dwells, model, effects), effects, change.scatter),
+                     technology(model))
     return counted_from(fit, model.reference_temperature)
 
 
-def _twin(effect: Effect) -> Effect | None:
+def _confounder(effect: Effect) -> Effect | None:
     return {SINE_RESPONSE: CUBIC_NONLINEARITY, CUBIC_NONLINEARITY: SINE_RESPONSE}.get(effect)
 
 
@@ -257,10 +258,10 @@ def doubt(fit: Calibration, model: GyroModel) -> Array:
     return np.column_stack(rows) @ (directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
-def _or_twin(effect: Effect, fit: Calibration) -> Effect:
-    """Return the effect, or its twin where that stands for it in a fit."""
-    twin = _twin(effect)
-    return effect if effect in fit.effects or twin is None else twin
+def _or_confounder(effect: Effect, fit: Calibration) -> Effect:
+    """Return the effect, or its confounder where that stands for it in a fit."""
+    confounder = _confounder(effect)
+    return effect if effect in fit.effects or confounder is None else confounder
 
 
 def _counted_well(fit: Calibration, model: GyroModel | None,
@@ -335,10 +336,10 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
 
 
 def _replaced(effect: Effect, model: GyroModel, fit: Calibration) -> bool:
-    """Tell whether the twin of an effect of the model stands in its place."""
-    twin = _twin(effect)
-    return (twin in fit.effects and effect not in fit.effects
-            and all(term.effect is not twin for term in model.terms))
+    """Tell whether the confounder of an effect of the model stands in its place."""
+    confounder = _confounder(effect)
+    return (confounder in fit.effects and effect not in fit.effects
+            and all(term.effect is not confounder for term in model.terms))
 
 
 def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Array | None:

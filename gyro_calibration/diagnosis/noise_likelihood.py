@@ -159,7 +159,7 @@ class Marginalized:
     towards : the nuisances that each column looks like, shape (g, q, p)
     left : of each candidate, the information of its columns beside the nuisances, shape (g, k, k)
     log_determinant : of `own` and of the noise, shape (g,)
-    tied : candidates that the nuisances leave nothing of
+    unidentifiable : candidates that the nuisances leave nothing of
     freedom : coefficients less nuisances
 
     """
@@ -168,7 +168,7 @@ class Marginalized:
     towards: Array
     left: tuple[Array, ...]
     log_determinant: Array
-    tied: tuple[bool, ...]
+    unidentifiable: tuple[bool, ...]
     freedom: float
 
 
@@ -177,14 +177,14 @@ def marginalized(known: Sums, groups: Sequence[Group], noises: Noises) -> Margin
     own = np.tensordot(noises.weights, known.own, 1)
     crossing = np.tensordot(noises.weights, known.towards, 1)
     towards = np.linalg.solve(own, crossing)
-    left, tied = [], []
+    left, unidentifiable = [], []
     for group, block in zip(groups, known.blocks):
         whole = np.tensordot(noises.weights, block, 1)
         part = whole - np.swapaxes(crossing[:, :, list(group)], 1, 2) @ towards[:, :, list(group)]
         left.append(part)
-        tied.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
+        unidentifiable.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
     return Marginalized(own, towards, tuple(left),
-                        noises.log_determinant + np.linalg.slogdet(own)[1], tuple(tied),
+                        noises.log_determinant + np.linalg.slogdet(own)[1], tuple(unidentifiable),
                         float(known.count.sum()) - own.shape[1])
 
 
@@ -227,7 +227,7 @@ def noise_likelihood(given: Sample, noises: Noises, by: Marginalized) -> NoiseLi
 
 
 def evidence(judged: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
-    """Return the evidence of candidates, shape (d, groups), -inf where tied to nuisances."""
+    """Return the evidence of candidates, shape (d, groups), -inf if like nuisances."""
     if not groups:
         return np.empty((len(judged.squares), 0))
     return np.column_stack([_evidence(judged, by, place, list(group))
@@ -235,7 +235,7 @@ def evidence(judged: NoiseLikelihood, by: Marginalized, groups: Sequence[Group])
 
 
 def _evidence(judged: NoiseLikelihood, by: Marginalized, place: int, group: list[int]) -> Array:
-    if by.tied[place]:
+    if by.unidentifiable[place]:
         return np.full(len(judged.squares), -np.inf)
     own, pull = by.left[place], judged.pull[:, :, group]
     own = own + 1e-10 * np.eye(len(group)) * _diagonal(own)[:, None]

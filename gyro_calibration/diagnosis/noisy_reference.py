@@ -174,19 +174,19 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
                    1.96 * done.spans.treatment.prior[place])
         cause, remedy = CAUSES[name], ''
         sentence = cause.sentence
-        twins = [] if name != 'scale_factor_error' else ['reference_scale']
+        confounders = [] if name != 'scale_factor_error' else ['reference_scale']
         if name == 'time_offset':
             of_reference = not 0.0 < value < _OF_A_LAG
             if not (of_reference or lag) and _may_lag(done, value):
-                twins = ['bandwidth']
+                confounders = ['bandwidth']
             if own_clock:
                 remedy = 'synchronize the clocks of gyro and reference; the model has none of it'
                 if of_reference:
                     sentence = 'Gyro and reference are not of the same time.'
         yield Finding(
             name, sentence, {name: Estimate.about(value, half, next(iter(cause.units.values())))},
-            max(chance, LEAST_CHANCE), SEEN * deviation, ambiguous_with=tuple(twins),
-            separate_by=cause.separate_by if twins else '',
+            max(chance, LEAST_CHANCE), SEEN * deviation, ambiguous_with=tuple(confounders),
+            separate_by=cause.separate_by if confounders else '',
             evidence=f'it rests on {effective:.0f} stretches', along=cause.along, remedy=remedy)
 
 

@@ -37,7 +37,7 @@ _TAILS = (0.05, 0.01)
 #: So many side by side are no single samples any more.
 _LONGEST = 2
 #: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on it.
-_TIED = 0.85
+_DUE_TO_MOTION = 0.85
 #: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
 _FEW, _BY_CHANCE = 3, 1e-3
 #: From here to wild there must be half as many samples as wild ones at most, in standard
@@ -88,7 +88,7 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     count, near = (int(np.count_nonzero(wild)),
                    int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
     if (not count or near > 0.5 * count + stats.poisson.isf(
-            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _tied(wild, moved, seen)):
+            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _due_to_motion(wild, moved, seen)):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
     return Outliers(wild, float(far[wild].max()), p_value) if p_value < level else None
@@ -173,12 +173,13 @@ def _single(wild: Mask) -> Mask:
     return single
 
 
-def _tied(wild: Mask, moved: Array, seen: Compared) -> bool:
+def _due_to_motion(wild: Mask, moved: Array, seen: Compared) -> bool:
     """Tell whether wild samples stand where motion changes most, or at certain rates."""
     if np.count_nonzero(wild) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
         return False
     ranks = _ranks(moved[wild], moved)
-    if ranks.mean() > max(_TIED, 0.5 + stats.norm.isf(_BY_CHANCE) / np.sqrt(12.0 * len(ranks))):
+    by_chance = 0.5 + stats.norm.isf(_BY_CHANCE) / np.sqrt(12.0 * len(ranks))
+    if ranks.mean() > max(_DUE_TO_MOTION, by_chance):
         return True
     turning = (moved > 3.0 * seen.white) & np.isfinite(seen.expected)
     if np.count_nonzero(wild & turning) < _FEW:

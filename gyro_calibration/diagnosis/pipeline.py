@@ -318,7 +318,7 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
                      for name in NAMES[1:]))
     doubts = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
     different = []
-    for name, value, deviation, twins in (
+    for name, value, deviation, confounders in (
             ('bias', bias, float(doubts[0]), ()),
             ('scale_factor_error', scale.value, float(doubts[1]), ('reference_scale',))):
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
@@ -327,7 +327,7 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
             different.append(Finding(
                 name, cause.sentence, {name: Estimate.about(value, 1.96 * deviation,
                                                             next(iter(cause.units.values())))},
-                chance, 5.4 * deviation, twins, cause.separate_by if twins else '',
+                chance, 5.4 * deviation, confounders, cause.separate_by if confounders else '',
                 f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard '
                 'deviations from nothing', cause.along))
     return different
@@ -383,7 +383,8 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
         told.update({cause.name: reason for cause in CAUSES.values()
                      if cause.along == name and cause.name not in told})
     alike = 'in these logs it would look exactly like a bias or a scale factor error'
-    told.update(dict.fromkeys(sorted(search.tied & (CAUSES.keys() - told.keys())), alike))
+    hidden = sorted(search.unidentifiable & (CAUSES.keys() - told.keys()))
+    told.update(dict.fromkeys(hidden, alike))
     return told
 
 

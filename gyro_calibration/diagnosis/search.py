@@ -96,7 +96,7 @@ PRICE_OF_COLUMN = 1.2
 #: By so much a structure without a name must be better than every cause.
 MARGIN = 4.0
 #: So many causes at most are refined before one is taken.
-MOST_RIVALS = 9
+MOST_CONFOUNDERS = 9
 #: So many causes at most are named.
 MOST_CAUSES = 6
 
@@ -174,7 +174,7 @@ class Search:
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
     scanned : causes that are scanned for over all frequencies, or all moments
-    tied : causes of which these logs leave nothing beside bias and scale factor error
+    unidentifiable : causes of which these logs leave nothing beside bias and scale factor error
     banks, looked : what was made before, by the causes that were named then
 
     """
@@ -184,7 +184,7 @@ class Search:
     chance: Chance
     rate: float
     scanned: frozenset[str] = SCANNED
-    tied: frozenset[str] = frozenset()
+    unidentifiable: frozenset[str] = frozenset()
     banks: dict[Key, Bank] = field_of(default_factory=dict)
     looked: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
 
@@ -251,8 +251,10 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator,
     shown, places = screen(done, stock), by_cause(found)
     if shown.max() > STRONG:
         whole, done = everywhere, fitted(everywhere, [])
-    tied = frozenset(cause for cause, own in places.items() if not np.isfinite(shown[own]).any())
-    return Search(whole, stock, chances(done, stock, generator), rate / len(places), tied=tied)
+    hidden = frozenset(cause for cause, own in places.items()
+                       if not np.isfinite(shown[own]).any())
+    return Search(whole, stock, chances(done, stock, generator), rate / len(places),
+                  unidentifiable=hidden)
 
 
 def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
@@ -538,7 +540,8 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
     worth = [each for each in worth if is_named(each.candidate)
              or search.excess(each.candidate.cause, each.mean) > 0.0]
     worth.sort(key=lambda each: -each.most)
-    steps = [refined(done, each.candidate, each.most - each.mean) for each in worth[:MOST_RIVALS]]
+    steps = [refined(done, each.candidate, each.most - each.mean)
+             for each in worth[:MOST_CONFOUNDERS]]
     # The screen takes a column at its first shape and with a free size; refined, it may explain
     # less than its price.
     steps = sorted((step for step in steps if step.score > done.score),
