@@ -151,6 +151,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     on_progress('search')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate)
     named, unnamed = _withdrawn(search, everything)
+    named, vetoed = _without_contradictions(search, named)
     on_progress('sets')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
@@ -208,7 +209,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         tuple(unexplained(search, found, unnamed)), noise, simulated, won, before, after,
         _cannot_show(search, logs), curves(left, shown), heading_curve(left, shown),
         noise_curve(found, noise, simulated),
-        tuple(_remarks(quality, names, found, unnamed, out, won, model)), rate,
+        tuple(_remarks(quality, names, found, unnamed, vetoed, out, won, model)), rate,
         heading_shares=of_heading)
 
 
@@ -261,6 +262,28 @@ def _is_small(search: Search, known: Named) -> bool:
                                       1)).max()) for each in search.problem.replays]
     return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max())
                                       for each in search.problem.replays)
+
+
+def _without_contradictions(
+        search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
+    """Take out causes whose interval holds 0, whatever their evidence is, and name them."""
+    vetoed: list[str] = []
+    while named:
+        found = FittedValues(fitted(search.problem, named), search.problem.replays)
+        sigmas = []
+        for place, known in enumerate(named):
+            sizes = found.coefficients(place) or list(found.shapes(place).values())
+            # of a wave, sine and cosine alone may be 0
+            wave = len(sizes) == 2 and known.candidate.cause != 'reference_slip'
+            sigmas.append(math.inf if wave or not sizes or not sizes[0].deviation
+                          else abs(sizes[0].value) / sizes[0].deviation)
+        weakest = int(np.argmin(sigmas))
+        if sigmas[weakest] >= 1.96:
+            break
+        vetoed.append(named[weakest].candidate.cause)
+        rest = named[:weakest] + named[weakest + 1:]
+        named = polished(search, rest) if rest else rest
+    return named, vetoed
 
 
 def _same(one: Named, other: Named) -> bool:
@@ -389,8 +412,8 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: FittedValues,
-             unnamed: Sequence[Named], out: Sequence[Named], won: Gain | None,
-             model: GyroModel | None) -> Iterator[str]:
+             unnamed: Sequence[Named], vetoed: Sequence[str], out: Sequence[Named],
+             won: Gain | None, model: GyroModel | None) -> Iterator[str]:
     """Give what a person should know: of the records, of withdrawn names, and of the model."""
     for place, clean in enumerate(quality):
         where = f'{names[place]}: ' if len(quality) > 1 and names else ''
@@ -400,6 +423,9 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
         why = ('it is at many frequencies' if name == 'interference_tone'
                else 'it differs from log to log, or is not alone')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
+    for name in dict.fromkeys(vetoed):
+        yield (f'What looks like {name.replace("_", " ")} is not named: the interval of its size '
+               'holds 0.')
     scale, own = (found.scale_factor_error,
                   {term.effect.name for term in ([] if model is None else model.terms)})
     if doubts_scale(found):
