@@ -14,7 +14,8 @@ import math
 
 from gyro_calibration.heading.integration import integrate, Threshold
 from gyro_calibration.heading.kalman import begin, HEADING, smoothed, Turn
-from gyro_calibration.heading.tracker import HeadingTracker, Settings, track
+from gyro_calibration.heading.log_heading import track
+from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import from_rates, turns
 from gyro_calibration.model.noise import Noise, simulate_noise

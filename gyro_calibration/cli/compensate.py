@@ -40,7 +40,8 @@ from gyro_calibration.heading.log_compensation import (
     plausible,
     rows_of,
 )
-from gyro_calibration.heading.tracker import in_hindsight, Settings
+from gyro_calibration.heading.log_heading import in_hindsight
+from gyro_calibration.heading.tracker import Settings
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask, write_log_blocks
 from gyro_calibration.model.compensation import covariance, quadratic_form
 from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration

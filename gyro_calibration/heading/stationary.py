@@ -11,7 +11,8 @@
 """
 Whether a gyro rests: the energy of its rate against the known noise, and how unlikely a mean is.
 
-Each test has its share of the false alarms per hour at rest.
+Each test has its share of the false alarms per hour at rest. What passes for a rest may be a
+straight way; how likely that is follows from the scatter of its means.
 
 """
 
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.heading.gaps import CLOSE
+from gyro_calibration.heading.kalman import Drift, Turn
 from gyro_calibration.model.noise import Noise
 from scipy.special import chdtri, ndtri
 
@@ -37,6 +39,15 @@ _SAMPLES = 8
 #: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
 #: of the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
+#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much
+#: scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for so
+#: long, s.
+_RESTS, _STRAIGHT, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
+#: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
+#: squared standard deviations.
+_STRETCHES, _SCATTER_MEMORY, SCATTER_MOST = 20.0, 200.0, 40.0
+#: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
+BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
 
 
 @dataclass(slots=True)
@@ -200,3 +211,83 @@ class Energy:
             self._sudden = limit * self.factor * math.sqrt(
                 self._noise.rate_variance(self._interval))
         return self._sudden
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """
+    State at some time of a rest.
+
+    Attributes
+    ----------
+    drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
+    turn : what the rates came to since it began
+    squares, means : sum of the squared surprises of the steps since it began, and their number
+    excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
+    odds : logarithm of how much likelier they are on a straight way than at a rest
+
+    """
+
+    drift: Drift
+    turn: Turn
+    deleted: float
+    steps: int
+    squares: float = 0.0
+    means: int = 0
+    excess: float = 0.0
+    weight: float = 0.0
+    odds: float = 0.0
+
+
+@dataclass
+class StraightWays:
+    """
+    How often a straight way passed for a rest, and how much the rates scatter there.
+
+    Attributes
+    ----------
+    rests, ways : how many there were
+    excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
+
+    """
+
+    rests: float = _RESTS
+    ways: float = _STRAIGHT
+    excess: float = _SCATTER * _SCATTER_SEEN
+    weight: float = _SCATTER_SEEN
+
+    @property
+    def scatter(self) -> float:
+        """Return the scatter on a way, over the variance of the noise."""
+        return max(self.excess / self.weight, 0.0)
+
+    def chance(self, odds: float) -> float:
+        """Return the probability that what passes for a rest is a way."""
+        return 1.0 / (1.0 + self.rests / self.ways * math.exp(min(-odds, 700.0)))
+
+    def learn(self, last: Snapshot) -> None:
+        """Take in all of what passed for a rest."""
+        way = self.chance(last.odds)
+        kept = _STRETCHES / max(_STRETCHES, self.rests + self.ways)
+        self.rests, self.ways = kept * self.rests + 1.0 - way, kept * self.ways + way
+        kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
+        self.excess, self.weight = (kept * self.excess + way * last.excess,
+                                    kept * self.weight + way * last.weight)
+
+
+@dataclass
+class DoubtfulTurn:
+    """
+    A turn that was seen late, and is so slow that the bias may have moved instead.
+
+    Attributes
+    ----------
+    before : the state when it began
+    rate : of the turn, rad/s
+    turn : what the rates came to since
+
+    """
+
+    before: Snapshot
+    rate: float
+    turn: Turn

@@ -24,28 +24,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
-from gyro_calibration.heading.gaps import block_ends, CLOSE, FASTEST, Gaps, Intervals, LONGEST
-from gyro_calibration.heading.integration import integrate, Threshold, ThresholdFilter
-from gyro_calibration.heading.kalman import begin, Drift, HEADING, smoothed, Turn, WALK
+from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
+from gyro_calibration.heading.integration import Threshold, ThresholdFilter
+from gyro_calibration.heading.kalman import begin, Drift, HEADING, Turn, WALK
+from gyro_calibration.heading.sample_blocks import Epoch, EvenSamples, Samples, SETTLING
 from gyro_calibration.heading.stationary import (
+    BEGINS,
     BLOCK,
     Block,
+    DoubtfulTurn,
     Energy,
     LAGS,
     most_scatter,
+    SCATTER_MOST,
     SCATTERED,
     sigmas,
+    Snapshot,
+    StraightWays,
     WINDOW,
 )
-from gyro_calibration.logs.log import Array, DEGREE, Mask, SHORTEST
+from gyro_calibration.logs.log import Array, DEGREE, SHORTEST
 from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: A rate that changes from one sample to the next by more than this, rad/s, and this acceleration,
 #: rad/s², and then comes back, is no motion of a robot.
-_JUMP, _ACCELERATION = 0.5, 200.0
-#: A correction of the heading is taken over with this time constant while the robot moves, s.
-SETTLING = 1.0
+JUMP, ACCELERATION = 0.5, 200.0
 #: The state goes on at least so often, s.
 _STEP = 1.0
 #: A sample at rest may be off by so many standard deviations of the bias.
@@ -63,19 +67,8 @@ _DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
 #: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
 #: goes on is found again.
 _RECOGNIZED = 1.0
-#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much
-#: scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for so
-#: long, s.
-_RESTS, _WAYS, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
-#: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
-#: squared standard deviations.
-_STRETCHES, _SCATTER_MEMORY, _SCATTER_MOST = 20.0, 200.0, 40.0
-#: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
-_BEGINS = math.log(3.0) / (1.0 - 1.0 / 3.0)
 #: Samples of a log that are taken at once.
 _AT_ONCE = 1 << 15
-#: Blocks at rest whose samples are compared with the bias at once; it is known anew each second.
-_LOOKED_AHEAD = 12
 #: States of a rest that are remembered.
 _SNAPSHOTS = round(LAGS[-1] / _STEP) + 8
 #: The slowest turn that is noticed is missed with a probability of 5 %.
@@ -99,258 +92,6 @@ class Settings:
     false_alarms: float = 0.1
     threshold: Threshold = field(default_factory=lambda: Threshold(0.0))
     maximum_gap: float = 1.0
-
-
-@dataclass(frozen=True)
-class _Snapshot:
-    """
-    State at some time of a rest.
-
-    Attributes
-    ----------
-    drift, deleted, steps : the state, heading deleted until then, rad, and steps kept
-    turn : what the rates came to since it began
-    squares, means : sum of the squared surprises of the steps since it began, and their number
-    excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
-    odds : logarithm of how much likelier they are on a straight way than at a rest
-
-    """
-
-    drift: Drift
-    turn: Turn
-    deleted: float
-    steps: int
-    squares: float = 0.0
-    means: int = 0
-    excess: float = 0.0
-    weight: float = 0.0
-    odds: float = 0.0
-
-
-@dataclass
-class _Ways:
-    """
-    How often a straight way passed for a rest, and how much the rates scatter there.
-
-    Attributes
-    ----------
-    rests, ways : how many there were
-    excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
-
-    """
-
-    rests: float = _RESTS
-    ways: float = _WAYS
-    excess: float = _SCATTER * _SCATTER_SEEN
-    weight: float = _SCATTER_SEEN
-
-    @property
-    def scatter(self) -> float:
-        """Return the scatter on a way, over the variance of the noise."""
-        return max(self.excess / self.weight, 0.0)
-
-    def chance(self, odds: float) -> float:
-        """Return the probability that what passes for a rest is a way."""
-        return 1.0 / (1.0 + self.rests / self.ways * math.exp(min(-odds, 700.0)))
-
-    def learn(self, last: _Snapshot) -> None:
-        """Take in all of what passed for a rest."""
-        way = self.chance(last.odds)
-        kept = _STRETCHES / max(_STRETCHES, self.rests + self.ways)
-        self.rests, self.ways = kept * self.rests + 1.0 - way, kept * self.ways + way
-        kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
-        self.excess, self.weight = (kept * self.excess + way * last.excess,
-                                    kept * self.weight + way * last.weight)
-
-
-@dataclass
-class _Doubt:
-    """
-    A turn that was seen late, and is so slow that the bias may have moved instead.
-
-    Attributes
-    ----------
-    before : the state when it began
-    rate : of the turn, rad/s
-    turn : what the rates came to since
-
-    """
-
-    before: _Snapshot
-    rate: float
-    turn: Turn
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """Samples as `HeadingTracker.follow` is given them."""
-
-    time: Array
-    rate: Array
-    moving: Array
-    resting: Array
-    wheels: Sequence[bool | None] | None
-    still: Array | None
-
-    def still_at(self, place: int) -> Array | None:
-        return self.still if self.still is None or self.still.ndim == 1 else self.still[place]
-
-    def sample(self, place: int, resting: bool,
-               ) -> tuple[float, float, Array, bool | None, Array | None]:
-        """Return what `HeadingTracker.add` wants."""
-        return (float(self.time[place]), float(self.rate[place]),
-                (self.resting if resting else self.moving)[place],
-                None if self.wheels is None else self.wheels[place], self.still_at(place))
-
-
-@dataclass
-class _Epoch:
-    """
-    Samples over which nothing is learned; heading and what is pending of it at the begin, rad.
-
-    Attributes
-    ----------
-    place : of the sample behind which it begins
-    taken : counts the epochs
-    opens : behind which samples blocks ended, and what the rates came to since the state
-    end : behind its last sample
-
-    """
-
-    place: int
-    taken: int
-    drift: Drift
-    resting: bool
-    heading: float
-    pending: float
-    opens: list[tuple[int, Turn]]
-    end: int = -1
-
-
-class _Piece:
-    """
-    Samples without jumps and gaps, n of them, and their sums by blocks, k of them.
-
-    Attributes
-    ----------
-    time, rate, intervals, halves, turned : stamps, rates, the intervals before them, half of them,
-        and the integrals of the rates over them, shape (n,)
-    moving, resting : sensitivities, shape (n, m)
-    seen : those that were used, with that of the sample before, shape (n + 1, m)
-    begins, ends, whole : of the blocks, and which of them are whole
-    sums : duration, integral, share of a pending correction that stays, half of the first
-        interval, and sums of the rates, their squares, and the squares of their steps, by block
-    weighted, weighted_at_rest : integrals of the sensitivities without the sample before, (k, m)
-    found : what `HeadingTracker.follow` returns
-    epochs : begun so far
-
-    """
-
-    def __init__(self, given: _Samples, where: slice, last: tuple[float, float, float, Array],
-                 begun: float, found: Array):
-        """Begin behind the last sample, with a block that has begun for some time, s."""
-        self._given, self._first, self.found = given, where.start, found
-        self.time, self.rate = given.time[where], given.rate[where]
-        self.moving, self.resting = given.moving[where], given.resting[where]
-        count = len(self.time)
-        self.intervals = np.diff(self.time, prepend=last[0])
-        self.halves, steps = 0.5 * self.intervals, np.diff(self.rate, prepend=last[1])
-        self.turned = self.halves * (2.0 * self.rate - steps)
-        self.seen = np.empty((count + 1, len(last[3])))
-        self.seen[0] = last[3]
-        self.ends = block_ends(self.intervals, BLOCK, begun)
-        whole = len(self.ends)
-        if not self.ends or self.ends[-1] < count:
-            self.ends.append(count)
-        self.begins = [0, *self.ends[:-1]]
-        self.whole = range(bool(begun), whole)
-        weights = self.halves + np.append(self.halves[1:], 0.0)
-        weights[np.array(self.ends) - 1] = self.halves[np.array(self.ends) - 1]
-        self.weighted = self._by_blocks(weights[:, None] * self.moving)
-        self.weighted_at_rest = (self.weighted if self.resting is self.moving
-                                 else self._by_blocks(weights[:, None] * self.resting))
-        sums = [self._by_blocks(values).tolist() for values in (
-            self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
-        self._kept = 1.0 - self.intervals / SETTLING
-        sums[2:2] = [np.multiply.reduceat(self._kept, self.begins).tolist(),
-                     self.halves[self.begins].tolist()]
-        self.sums = list(zip(*sums))
-        self.epochs = list[_Epoch]()
-        self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
-
-    def _by_blocks(self, values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, self.begins))
-
-    def moved(self, number: int) -> Sequence[bool | None]:
-        """Return what the wheels said in a block."""
-        wheels = self._given.wheels
-        return () if wheels is None else wheels[self._first + self.begins[number]:
-                                                self._first + self.ends[number]]
-
-    def still(self, place: int) -> Array | None:
-        return self._given.still_at(self._first + place)
-
-    def extremes(self, number: int, offset: float, values: Array,
-                 taken: int) -> tuple[float, float]:
-        """Return the highest and the lowest corrected rate at rest of a block, rad/s."""
-        known, first, highest, lowest = self._extremes
-        if known != taken or number >= first + len(highest):
-            first, last = number, min(number + _LOOKED_AHEAD, len(self.ends))
-            rows = slice(self.begins[first], self.ends[last - 1])
-            rate = self.rate[rows] + self.resting[rows] @ values
-            rate -= offset
-            places = np.array(self.begins[first:last]) - self.begins[first]
-            highest, lowest = (which.reduceat(rate, places).tolist()
-                               for which in (np.maximum, np.minimum))
-            self._extremes = taken, first, highest, lowest
-        return highest[number - first], lowest[number - first]
-
-    def close(self, end: int) -> None:
-        """Fill in heading and variance up to a sample where the last epoch ends."""
-        if not self.epochs:
-            return
-        epoch = self.epochs[-1]
-        begin, epoch.end = max(epoch.place, 0), end
-        if end <= begin:
-            return
-        rows = self.found[begin:end]
-        rows[:, 4] = epoch.resting
-        if epoch.resting:
-            rows[:, 0] = epoch.heading
-            rows[:, 1] = float(epoch.drift.covariance[HEADING, HEADING]) + epoch.pending ** 2
-            return
-        inside, offset, values = slice(epoch.place + 1, end), epoch.drift.offset[0], (
-            epoch.drift.values[0])
-        pending, turned = (np.empty(end - epoch.place) for _ in range(2))
-        intervals = self.intervals[inside]
-        pending[0], pending[1:] = epoch.pending, self._kept[inside]
-        np.cumprod(pending, out=pending)
-        turned[0] = epoch.heading + epoch.pending
-        turned[1:] = self.turned[inside] - intervals * offset + self.halves[inside] * (
-            (self.seen[1:][inside] + self.seen[:-1][inside]) @ values)
-        np.cumsum(turned, out=turned)
-        known = epoch.drift.heading_variances([turn for _, turn in epoch.opens])
-        places = [place for place, _ in epoch.opens]
-        since = np.append(0.0, np.cumsum(intervals))
-        block = np.searchsorted(places, np.arange(epoch.place, end), side='right') - 1
-        since -= since[np.array(places) - epoch.place][block]
-        variance = known[block] + epoch.drift.noise.angle_random_walk ** 2 * since + pending ** 2
-        rows[:, 0] = (turned - pending)[begin - epoch.place:]
-        rows[:, 1] = variance[begin - epoch.place:]
-
-    def rates(self, usual: Array) -> None:
-        """Fill in the rates and their variances; `usual` are the intervals behind each sample."""
-        found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
-        for epoch in self.epochs:
-            here = slice(max(epoch.place, 0), epoch.end)
-            (offset, variance), (values, covariance, shared) = (
-                epoch.drift.offset, epoch.drift.values)
-            rows = self.seen[1:][here]
-            found[here, 2] = (0.0 if epoch.resting
-                              else self.rate[here] + rows @ values - offset)
-            found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
-                              + epoch.drift.noise.angle_random_walk ** 2
-                              / (WINDOW if epoch.resting else interval[here]))
 
 
 @dataclass(frozen=True)
@@ -400,10 +141,10 @@ class HeadingTracker:
         self.renewed = list[tuple[int, Drift]]()
         self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
         self._known: float | None = None
-        self._doubt: _Doubt | None = None
+        self._doubt: DoubtfulTurn | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
-        self._ways, self.outliers, self._taken = _Ways(), 0, 0
+        self._ways, self.outliers, self._taken = StraightWays(), 0, 0
         self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
@@ -543,7 +284,7 @@ class HeadingTracker:
         if self._last is None:
             return False
         interval, step = time - self._last[0], abs(rate - self._last[1])
-        return (step > _JUMP and step > _JUMP + _ACCELERATION * interval
+        return (step > JUMP and step > JUMP + ACCELERATION * interval
                 and 0.0 <= interval <= self._settings.maximum_gap)
 
     def _add(self, time: float, rate: float, sensitivity: Array, wheels: bool | None,
@@ -597,8 +338,8 @@ class HeadingTracker:
         heading, its variance, rate, its variance, and 1 at rest, as `add` leaves them, (n, 5)
 
         """
-        given = _Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
-                         wheels, still)
+        given = Samples(time, rate, sensitivity, sensitivity if resting is None else resting,
+                        wheels, still)
         found, begin = np.empty((len(time), 5)), 0
         while begin < len(time):
             count = self._even(time[begin:begin + _AT_ONCE], rate[begin:begin + _AT_ONCE])
@@ -622,18 +363,18 @@ class HeadingTracker:
             steps = np.abs(np.diff(rate, prepend=self._last[1]))
             even = ((np.abs(rate) < FASTEST) & (intervals >= 0.0)
                     & (intervals <= self._settings.maximum_gap)
-                    & (steps <= _JUMP + _ACCELERATION * intervals))
+                    & (steps <= JUMP + ACCELERATION * intervals))
         return len(even) if even.all() else int(np.argmin(even))
 
-    def _follow_even(self, given: _Samples, begin: int, end: int, found: Array) -> int:
+    def _follow_even(self, given: Samples, begin: int, end: int, found: Array) -> int:
         """Take samples without jumps up to the next lost ones; return behind which sample."""
         assert self._last is not None
         usual, lost = self.intervals.add_many(
             np.diff(given.time[begin:end], prepend=self._last[0]))
         count = len(usual) - bool(lost)
         if count:
-            piece = _Piece(given, slice(begin, begin + count), self._last, self._block.duration,
-                           found[begin:begin + count])
+            piece = EvenSamples(given, slice(begin, begin + count), self._last,
+                                self._block.duration, found[begin:begin + count])
             self._gaps.add_many(piece.intervals, piece.rate, self._last[1])
             if not self._block.duration:
                 piece.epochs.append(self._epoch(-1))
@@ -662,11 +403,11 @@ class HeadingTracker:
             found[begin + count] = self._found()
         return begin + len(usual)
 
-    def _epoch(self, place: int) -> _Epoch:
-        return _Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
-                      [(place, self._open)])
+    def _epoch(self, place: int) -> Epoch:
+        return Epoch(place, self._taken, self._drift, self.resting, self.heading, self._pending,
+                     [(place, self._open)])
 
-    def _take_block(self, piece: _Piece, number: int) -> bool:
+    def _take_block(self, piece: EvenSamples, number: int) -> bool:
         """Take a whole block; return False, and take nothing, where it ends a rest within."""
         begin, end, moved = piece.begins[number], piece.ends[number], piece.moved(number)
         driven = True in moved
@@ -859,7 +600,7 @@ class HeadingTracker:
                 return
             if last.squares - before.squares > self._scatter_limit(lag, last.means - before.means):
                 self._notice(lag, max(self._snapshots, key=lambda each: (
-                    last.squares - each.squares - _BEGINS * (last.means - each.means))))
+                    last.squares - each.squares - BEGINS * (last.means - each.means))))
                 return
 
     def _scatter_limit(self, lag: float, means: int) -> float:
@@ -868,7 +609,7 @@ class HeadingTracker:
                 lag, means, self._settings.false_alarms)
         return self._most_scatter[lag, means]
 
-    def _before(self, lag: float) -> _Snapshot | None:
+    def _before(self, lag: float) -> Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
         snapshots, until = self._snapshots, self._rested.duration - lag + CLOSE
         if snapshots[0].turn.duration > until:
@@ -885,7 +626,7 @@ class HeadingTracker:
     def _rest(self) -> None:
         """Take the robot for standing from here on."""
         self.resting, self._rested, self._hesitates = True, self._nothing, 0.0
-        self._snapshots = [_Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
+        self._snapshots = [Snapshot(self._drift, self._nothing, self.deleted, len(self.steps))]
 
     def _move(self, wanted: float) -> None:
         """Take the robot for moving, until it is quiet for `wanted` s."""
@@ -898,7 +639,7 @@ class HeadingTracker:
             self._hesitates = _RECOGNIZED
         self._move(WINDOW)
 
-    def _notice(self, lag: float, before: _Snapshot | None = None) -> None:
+    def _notice(self, lag: float, before: Snapshot | None = None) -> None:
         """Take the robot for moving since `lag` s before the last block, or some snapshot."""
         self._advance()
         scattered, before = before is not None, before or self._before(lag) or self._snapshots[0]
@@ -913,12 +654,12 @@ class HeadingTracker:
         self._move(max(lag, WINDOW))
         self._advance()
 
-    def _doubtful(self, before: _Snapshot, turn: Turn) -> _Doubt | None:
+    def _doubtful(self, before: Snapshot, turn: Turn) -> DoubtfulTurn | None:
         """Return what was noticed, where it is so slow that the bias may have moved."""
         longest = replace(self._nothing, duration=LAGS[-1])
         least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
         rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
-        return (_Doubt(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
+        return (DoubtfulTurn(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
                 else None)
 
     def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
@@ -974,10 +715,10 @@ class HeadingTracker:
         ratio = 1.0 + scatter / variance
         odds = before.odds + 0.5 * (squared * (1.0 - 1.0 / ratio) - math.log(ratio))
         turn.wander = self._ways.chance(odds) * scatter
-        squares, squared = before.squares + squared, min(squared, _SCATTER_MOST)
+        squares, squared = before.squares + squared, min(squared, SCATTER_MOST)
         self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._rested += turn
-        self._snapshots.append(_Snapshot(
+        self._snapshots.append(Snapshot(
             self._drift, self._rested, self.deleted - self._corrected(self._part),
             len(self.steps), squares, before.means + 1,
             before.excess + weight * (squared - 1.0) * variance / white, before.weight + weight,
@@ -1077,105 +818,3 @@ class HeadingTracker:
                  if self._seeks else [])
         return min(((self._sigmas[lag] + _POWER) * math.sqrt(self._drift.expected(turn)[1]) / lag
                     for lag, turn in turns), default=math.nan)
-
-
-@dataclass(frozen=True)
-class Track:
-    """
-    A heading over a log.
-
-    Attributes
-    ----------
-    heading, variance, rate, rate_variance : rad, rad², rad/s and (rad/s)², shape (n,)
-    resting : shape (n,)
-    deleted : heading that was taken for bias or noise at rest, or by the threshold filter, rad
-    intervals : of the samples, and how many are lost
-
-    """
-
-    heading: Array
-    variance: Array
-    rate: Array
-    rate_variance: Array
-    resting: Mask
-    deleted: float
-    intervals: Intervals
-
-
-def track(time: Array, rate: Array, sensitivity: Array, noise: Noise, covariance: Array,
-          settings: Settings, wheels: Sequence[bool | None] | None = None, hindsight: bool = False,
-          age: float | None = 0.0, still: Array | None = None) -> Track:
-    """
-    Return the heading over a whole log.
-
-    Parameters
-    ----------
-    time, rate : s and rad/s, compensated, shape (n,)
-    sensitivity : of the rates to the values of the calibration, shape (m, n), as in `compensation`
-    noise, covariance, settings, age : as in `HeadingTracker`
-    wheels : whether wheels or commands move the robot, n of them, or None
-    still : as in `HeadingTracker.add`
-    hindsight : let all that came later count too
-
-    Raises
-    ------
-    OverflowError : hindsight is wanted, and a heading or its variance is no finite number
-
-    """
-    tracker = HeadingTracker(noise, covariance, settings, age, hindsight)
-    found = tracker.follow(time, rate, np.ascontiguousarray(sensitivity.T), wheels, still)
-    heading, variance, shown, rate_variance, resting = found.T
-    live = Track(heading, variance, shown, rate_variance, resting > 0.5, tracker.deleted,
-                 tracker.intervals)
-    if not hindsight:
-        return live
-    if not np.isfinite(found).all():
-        raise OverflowError('the variance of the heading is beyond all numbers')
-    later, with_hindsight, rested = in_hindsight(tracker, time, rate)
-    return replace(live, heading=later, variance=with_hindsight, resting=rested)
-
-
-def _without_spikes(time: Array, rate: Array) -> Array:
-    """Return rates with what the tracker holds for no motion interpolated, shape (n,)."""
-    jumps = np.abs(np.diff(rate)) > _JUMP + _ACCELERATION * np.diff(time)
-    back = np.abs(rate[2:] - rate[:-2]) <= _JUMP + _ACCELERATION * (time[2:] - time[:-2])
-    spikes = np.flatnonzero(jumps[:-1] & back) + 1
-    if not len(spikes):
-        return rate
-    kept = np.delete(np.arange(len(rate)), spikes)
-    return np.interp(time, time[kept], rate[kept])
-
-
-def in_hindsight(tracker: HeadingTracker, time: Array, rate: Array) -> tuple[Array, Array, Mask]:
-    """
-    Return heading, rad, its variance, rad², and rest, shape (n,) each, with all that came later.
-
-    The heading is what the rates came to, with the correction interpolated between the steps.
-
-    Parameters
-    ----------
-    tracker : that kept its steps, and was given the samples
-    time, rate : of the samples, s and rad/s, shape (n,)
-
-    """
-    last, steps, states = tracker.finish(), tracker.steps, list[Drift]()
-    end, later = len(steps), None
-    # a calibration that was used later knows the heading alone of what was before
-    for first, before in [*tracker.renewed[::-1], (0, None)]:
-        part = steps[first:end]
-        states = smoothed(
-            [*(step.before for step in part), last if later is None else later],
-            [step.turn for step in part], [step.resting for step in part]) + states[1:]
-        if before is not None:
-            here, end = states[0], first
-            later = last = before.known_to_head(
-                float(here.mean[HEADING]), float(here.covariance[HEADING, HEADING]))
-    ends = np.array([time[0], *(step.end for step in steps)])
-    heading, variance = np.array([(state.mean[HEADING], state.covariance[HEADING, HEADING])
-                                  for state in states]).T
-    turned = integrate(time, _without_spikes(time, rate))
-    rested = np.array([step.resting for step in steps] or [False])
-    resting = rested[np.clip(np.searchsorted(ends, time, side='left') - 1, 0, len(rested) - 1)]
-    moved = turned + np.interp(time, ends, heading - np.interp(ends, time, turned))
-    return (np.where(resting, np.interp(time, ends, heading), moved),
-            np.interp(time, ends, variance), resting)
