@@ -93,6 +93,18 @@ def test_a_stamp_that_stands_is_not_integrated(tmp_path):
     assert rig.feed([0.5])[0].heading == pytest.approx(heading + 0.5 * INTERVAL, abs=1e-6)
 
 
+def test_what_turns_while_the_stamps_stand_is_in_the_variance(tmp_path):
+    rig = Rig(tmp_path, model=CERTAIN)
+    before = rig.feed(np.full(100, 0.01))[-1]
+    for _ in range(300):
+        rig.skip(-INTERVAL, steady=0.0)
+        assert rig.feed([0.5]) == [None]
+    after = rig.feed([0.01])[0]
+    assert after.heading == pytest.approx(before.heading, abs=1e-3)
+    assert math.sqrt(after.heading_variance) == pytest.approx(0.5 * 300 * INTERVAL, rel=0.02)
+    assert 'stood still for 3.0 s' in rig.journal.event
+
+
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e155, -500.0, 101.0])
 def test_an_impossible_rate_is_refused_and_leaves_a_gap(tmp_path, value):
     rig = Rig(tmp_path, model='')

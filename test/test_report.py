@@ -351,7 +351,7 @@ def test_a_chance_is_said_in_words(probability, words):
 
 
 @pytest.mark.parametrize('interval, words',
-                         [((0.01, 0.02), 'reduces'), ((-0.01, 0.02), 'within the scatter'),
+                         [((0.01, 0.02), 'reduces'), ((-0.01, 0.02), 'includes zero'),
                           ((-0.02, -0.01), 'increases'), (None, 'no interval')])
 def test_a_gain_is_called_what_it_is(interval, words):
     whole = extended()

@@ -156,8 +156,8 @@ def change(errors: Change, unit: str, what: str) -> str:
         return f'reduces {what} from {before} to {after} rms'
     if errors.worse:
         return f'increases {what} from {before} to {after} rms'
-    return (f'changes {what} from {before} to {after} rms, which is within the scatter between '
-            'the parts')
+    return (f'changes {what} from {before} to {after} rms; the 95 % interval of the reduction '
+            'includes zero')
 
 
 # one by one

@@ -208,6 +208,8 @@ class Pipeline:
         # sample arrived, s, and the longest interval since a silence, ns.
         self._same_name, self._arrived, self._longest = False, clock.steady(), 0
         self._good = 0.0, 0.0
+        # When samples with a repeated stamp began, s, and the fastest rate among them, rad/s.
+        self._standing: tuple[float, float] | None = None
         self._recent, self._beginnings = deque[tuple[float, float]](), 0
 
     # Time
@@ -314,8 +316,12 @@ class Pipeline:
         time = self._time_of_sample(stamp)
         if time == self._last:
             counts['repeated_stamps'] += 1
+            first, fastest = self._standing or (now, 0.0)
+            self._standing = first, max(fastest, abs(output))
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
+        if self._standing is not None:
+            self._doubt_standing(now)
         gap = not 0.0 < time - self._last <= self.values.maximum_gap
         if not gap:
             self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
@@ -324,6 +330,16 @@ class Pipeline:
         self._last = time
         journal.channels = set() if specific_force is None else {'specific_force'}
         return self._use(stamp, time, gap, output, specific_force, now, receivers)
+
+    def _doubt_standing(self, now: float) -> None:
+        """Add to the variance what the gyro may have turned while its stamps stood still."""
+        (first, fastest), self._standing = self._standing or (now, 0.0), None
+        if now - first > BLIND:
+            turned = min(fastest * (now - first), math.tau)
+            tracker = self.estimator.tracker
+            self.estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
+            self.journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
+                                  'came; what turned meanwhile is not in the heading')
 
     def _see_jump(self, now: float) -> None:
         """Take the second jump back of the stamps within 1 s for those of several publishers."""
