@@ -46,6 +46,9 @@ _STOOD = 1.5
 #: spline errs by 0.13, 0.036 and 0.01 of what its slope changes by there. Beside a shorter gap it
 #: changes by little.
 _BESIDE = 4
+#: Part of the white noise of a sample from which on a bend of the rate is a corner: a thousand of
+#: them, all of one sign, come to 3 sigma. The part of the samples that corners are, at most.
+_BENT, _FEW_CORNERS = 0.1, 0.2
 #: Points of the grid for each sample, and points of a log that is too short to matter: most of a
 #: log must not be made up.
 _EACH, _SHORT = 5, 10_000
@@ -175,6 +178,8 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     shown = evened(replace(prepared(log)[0], time=time))
     reference, smooth = _reference(shown, time, update is not None, step)
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
+    if log.reference_rate is None:
+        kept &= ~_corners(reference, log.output, kept, step / float(np.median(np.diff(time))))
     _refuse_few(kept)
     place, interval = numbered(time, kept)
     _refuse_gaps(log.time[kept], place)
@@ -372,6 +377,22 @@ def _rates(time: Array, heading: Array, step: float) -> tuple[Array, Array]:
             | maximum_filter1d(binary_opening(lost, np.ones(_BESIDE)), 2 * _BESIDE + 1))
     raw = np.where(near, np.nan, rate)
     return raw, _without_rounding(rate, step, float(np.median(np.diff(time)))) if step else rate
+
+
+def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
+    """
+    Return where the rate of a heading bends too sharply to be known from samples, shape (n,).
+
+    A spline through the heading and the integral of the output by trapezoids differ by a twelfth
+    of the second difference of the rate. Where a motion begins or ends, that passes for a dead
+    zone or for a slip. A reference that bends everywhere is noise, and is left to its treatment;
+    steps of a heading bend its rate by twice `rounding`, step over interval, or less.
+
+    """
+    bend = np.abs(np.diff(rate, 2, prepend=rate[:1], append=rate[-1:])) / 12.0
+    least = _BENT * white_deviation((output - rate)[kept]) + rounding / 6.0
+    sharp = maximum_filter1d(bend > least, 5)
+    return sharp if sharp[kept].mean() < _FEW_CORNERS else np.zeros_like(sharp)
 
 
 def _without_rounding(rate: Array, step: float, interval: float) -> Array:
