@@ -187,6 +187,13 @@ def roughened(rough, generator):
     return replace(log, output=log.output + more, reference_rate=seen)
 
 
+@pytest.mark.parametrize('place', [0, 1, 2, -2, -1])
+def test_an_outlier_at_an_end_of_the_log_is_found(place, generator):
+    log = swing(generator)
+    log.output[place] += 90.0
+    assert not inspect(log).trusted[place] and 'outliers' in found(log)
+
+
 def test_a_wild_reference_is_not_blamed_on_the_gyro(generator):
     log = swing(generator)
     log.reference_rate[generator.choice(np.arange(20, 5980), 8, replace=False)] += 30.0 * SIGMA

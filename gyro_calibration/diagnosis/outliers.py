@@ -96,7 +96,12 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
 
 def _neighbours(values: Array | Mask, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
-    # Turned over about the first and last sample, a slope goes on as it is.
+    # Turned over about the first and last sample, a slope goes on as it is. These two are what
+    # the samples beside them say, as one that is an outlier would agree with itself.
+    if len(values) > _SIDE + 1 and values.dtype != bool:
+        ends = [np.median([part[0], 2.0 * part[1] - part[2], 2.0 * part[2] - part[4]])
+                for part in (values, values[::-1])]
+        values = np.concatenate([ends[:1], values[1:-1], ends[1:]])
     window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'),
                                  2 * side + 1)
     return np.delete(window, side, axis=1)
