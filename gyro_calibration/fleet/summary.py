@@ -280,11 +280,11 @@ def _lacking(found: TypeFound) -> Iterator[str]:
 
 
 def diagnosed(found: TypeFound) -> Iterator[tuple[str, str]]:
-    """Give each effect that diagnoses established, and whose it is."""
+    """Give each established effect that is not among the pooled values, and whose it is."""
     seen: dict[str, list[Record]] = {}
     for each in found.records:
         for finding in (each['diagnosis'] or {}).get('findings', ()):
-            if finding['status'] == 'established':
+            if finding['status'] == 'established' and finding['effect'] not in found.values:
                 seen.setdefault(finding['effect'], []).append(each)
     for effect, logs in seen.items():
         units, drives = ({str(each[key]) for each in logs} for key in ('unit', 'drive'))
