@@ -150,7 +150,7 @@ def test_a_model_that_is_right_is_left_as_it_is_to_the_letter():
     model = replace(MODEL, noise=Noise(1.5e-4, 1e-6, 1e-8))
     found = diagnosed(drive(), model)
     assert (found.verdict == 'adequate' and found.model is model
-            and 'left as it is' in headline(found)[1])
+            and 'the model is unchanged' in headline(found)[1])
 
 
 def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
@@ -160,7 +160,7 @@ def test_what_is_wrong_with_the_record_alone_leaves_the_model_as_it_is():
         'time', 'output', 'temperature', 'reference_rate', 'reference_heading')})
     found = diagnosed(fewer, MODEL)
     assert (names(found) == ['dropped_samples'] and found.model is MODEL
-            and 'left as it is' in headline(found)[1])
+            and 'the model is unchanged' in headline(found)[1])
 
 
 def test_noise_that_a_short_log_cannot_show_stays_in_the_model():
@@ -212,7 +212,7 @@ def test_a_table_that_the_model_explains_leaves_it_as_it_is_to_the_letter(run, t
     write_model(tmp_path / 'model.yaml', behind)
     code, text, errors = run('diagnose', tmp_path / 'table.csv', '--model',
                              tmp_path / 'model.yaml', '--out', tmp_path / 'found')
-    assert code == 0 and 'left as it is' in ' '.join(text.split()), errors
+    assert code == 0 and 'the model is unchanged' in ' '.join(text.split()), errors
     assert (tmp_path / 'found/model.yaml').read_text() == (tmp_path / 'model.yaml').read_text()
 
 

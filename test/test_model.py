@@ -103,7 +103,8 @@ BAD = {
     'effects as a list': ('effects: [bias]', 'effects is'),
     'effect as number': ('effects: {bias: 0.01}', 'effects.bias is 0.01'),
     'unknown effect': ('effects: {magic: {magic: 1.0}}',
-                       'an effect that this version knows: bias'),
+                       'an effect that this version knows, or one of your own '
+                       '(--catalogue): bias'),
     'no value': ('effects: {bias: {}}', 'effects.bias.bias is None; wanted a finite number'),
     'unknown value': ('effects: {bias: {bias: 1.0, bais: 2.0}}',
                       'effects.bias.bais is 2.0; wanted one of bias'),

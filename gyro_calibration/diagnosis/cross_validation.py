@@ -132,11 +132,11 @@ def shares(logs: Sequence[tuple[Mapping[str, Array], Array]],
     own : mean square that is of the reference, rad²
 
     """
-    over: dict[str, list[Array]] = {}
+    over: dict[str, list[Array]] = {name: [] for parts, _ in logs for name in parts}
     for parts, time in logs:
         window = min(WINDOW, WITHIN * float(time[-1] - time[0]))
-        for name, part in parts.items():
-            over.setdefault(name, []).append(over_windows(part, time, window))
+        for name, of_all in over.items():  # a cause may be in one of the logs
+            of_all.append(over_windows(parts.get(name, 0.0 * parts['left']), time, window))
     found = {name: np.concatenate(each) for name, each in over.items()}
     total = sum(found.values(), np.zeros(len(found['left'])))
     square = float(np.mean(total ** 2)) if len(total) else 0.0
