@@ -18,6 +18,9 @@ from datetime import date
 import math
 from typing import Any
 
+from gyro_calibration.diagnosis.findings import Estimate
+from gyro_calibration.diagnosis.units import amount, quantity
+from gyro_calibration.diagnosis.words import listed, spoken
 from gyro_calibration.files import plain
 from gyro_calibration.fleet.outliers import Change, changes, Outlier, outliers
 from gyro_calibration.fleet.pooling import (
@@ -231,7 +234,7 @@ def sentences(found: TypeFound) -> Iterator[str]:
     for each in found.values.values():
         yield from _blame(found, each)
     yield from _lacking(found)
-    yield from (f'{name}: {text}' for name, text in diagnosed(found))
+    yield from (f'{spoken(name)}: {text}' for name, text in diagnosed(found))
 
 
 def _blame(found: TypeFound, each: Found) -> Iterator[str]:
@@ -240,23 +243,24 @@ def _blame(found: TypeFound, each: Found) -> Iterator[str]:
         shares = {name: each.components[name] for name in (UNITS, DRIVES, POWER_ONS)
                   if name in each.components}
         owner = max(shares, key=lambda name: shares[name].estimate, default='')
-        said = {UNITS: "is the unit's: most of it differs between units and repeats",
-                DRIVES: "is the reference's or the vehicle's: most of it is common to the units "
-                'of a drive, and differs between drives',
-                POWER_ONS: 'differs most from one power-on to the next'}
+        whose = {UNITS: "is the unit's: most of it differs between units and repeats",
+                 DRIVES: "is the reference's or the vehicle's: most of it is common to the units "
+                 'of a drive, and differs between drives',
+                 POWER_ONS: 'differs most from one power-on to the next'}
         if owner and shares[owner].low > 0.0:
-            yield f'{each.name} {said[owner]}'
+            yield f'{spoken(each.name)} {whose[owner]}'
     for outlier in each.outlying_units:
-        yield (f'{each.name}: unit {plain(found.units[outlier.number])} stands out of its type '
-               f'by {outlier.excess:.3g} {each.unit} (chance {outlier.chance:.1g})')
+        yield (f'{spoken(each.name)}: unit {plain(found.units[outlier.number])} differs from its '
+               f'type by {amount(outlier.excess, each.unit, each.name)} '
+               f'(probability {outlier.chance:.1g})')
     for outlier in each.outlying_drives:
-        yield (f'{each.name}: all units of drive {plain(found.drives[outlier.number])} are off '
-               f'by {outlier.excess:.3g} {each.unit}, so its reference is '
-               f'(chance {outlier.chance:.1g})')
+        yield (f'{spoken(each.name)}: all units of drive {plain(found.drives[outlier.number])} '
+               f'are off by {amount(outlier.excess, each.unit, each.name)}, so its reference is '
+               f'(probability {outlier.chance:.1g})')
     for change in each.changed:
-        yield (f'{each.name}: unit {plain(found.units[change.unit])} is another one from '
-               f'{found.dates[change.since]} on, by {change.size:.3g} {each.unit} '
-               f'(chance {change.chance:.1g})')
+        yield (f'{spoken(each.name)}: unit {plain(found.units[change.unit])} changed by '
+               f'{amount(change.size, each.unit, each.name)} on {found.dates[change.since]} '
+               f'(probability {change.chance:.1g})')
 
 
 def lacking(found: TypeFound) -> list[Found]:
@@ -270,13 +274,16 @@ def _lacking(found: TypeFound) -> Iterator[str]:
     repeating = lacking(found)
     if repeating:
         first, *others = repeating
-        also = f'; {", ".join(each.name for each in others)} would look alike' if others else ''
-        yield (f'{first.name}: it repeats in all units, so the model of the type lacks it: '
-               f'{first.mean.value[0]:.3g} ({first.mean.low[0]:.3g} to '
-               f'{first.mean.high[0]:.3g}) {first.unit}{also}')
+        also = (f'; {listed([spoken(each.name) for each in others], "or")} would look alike'
+                if others else '')
+        size = quantity(Estimate(float(first.mean.value[0]),
+                                 (float(first.mean.low[0]), float(first.mean.high[0])),
+                                 first.unit), first.name)
+        yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
+               f'it: {size}{also}')
     elif slow:
-        yield (f'{", ".join(each.name for each in slow)}: none repeats, so what single logs show '
-               'of them is the wander of the bias')
+        yield (f'{listed([spoken(each.name) for each in slow])}: none repeats, so what single '
+               'logs show of them is the wander of the bias')
 
 
 def diagnosed(found: TypeFound) -> Iterator[tuple[str, str]]:
