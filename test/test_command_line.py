@@ -29,7 +29,7 @@ import pytest
 from tqdm import tqdm
 
 TURN = 2.0 * math.pi
-VERBS = [module.__name__.rpartition('.')[2].replace('_', '-') for module in verbs.VERBS]
+VERBS = [verb.replace('_', '-') for verb in verbs.VERBS]
 GYRO = 'effects: {bias: {bias: 0.002}, scale_factor_error: {scale_factor_error: -0.1}}'
 NOISY_GYRO = GYRO + '\nnoise: {angle_random_walk: 7.3e-4}'
 

@@ -16,22 +16,6 @@ to an `Answer`. Units that people use are converted here.
 
 """
 
-from gyro_calibration.cli import (
-    allan,
-    compensate,
-    demo,
-    diagnose,
-    emulate,
-    export,
-    fit,
-    fleet,
-    plan,
-    record,
-    reproduce,
-    self_calibrate,
-    simulate,
-    turn,
-)
-
-VERBS = (fit, compensate, self_calibrate, plan, allan, turn, diagnose, fleet, simulate, export,
-         emulate, record, reproduce, demo)
+#: Their files, in the order of the help. Only that of the verb that was called is imported.
+VERBS = ('fit', 'compensate', 'self_calibrate', 'plan', 'allan', 'turn', 'diagnose', 'fleet',
+         'simulate', 'export', 'emulate', 'record', 'reproduce', 'demo')

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib import import_module
 import json
 import math
 import os
@@ -38,7 +39,8 @@ DONE, NO_ANSWER, WRONG_USE = 0, 1, 2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb, print its answer, and return 0 (done), 1 (no answer) or 2 (wrong use)."""
-    given = _parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    given = _parser(words[0] if words else '').parse_args(words)
     try:
         _refuse_empty(given)
         for path in given.catalogue:
@@ -101,13 +103,15 @@ class _Parser(argparse.ArgumentParser):
         super()._print_message(plain(message, kept='\n'), file)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(called: str = '') -> argparse.ArgumentParser:
+    """Return the parser of the verb that is called, or of all where that is none."""
     parser = _Parser(prog='gyro_calibration',
                      description='Calibrate a gyro, so that a robot knows its heading.')
     parser.add_argument('--version', action='version', version=__version__)
     verbs = parser.add_subparsers(required=True, metavar='VERB')
-    for verb in VERBS:
-        of_verb = verb.add(verbs)
+    name = str(called).replace('-', '_')
+    for verb in [name] if name in VERBS else VERBS:
+        of_verb = import_module(f'gyro_calibration.cli.{verb}').add(verbs)
         of_verb.add_argument('--json', action='store_true',
                              help='print one JSON object and nothing else')
         of_verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',

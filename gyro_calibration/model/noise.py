@@ -17,7 +17,7 @@ import math
 
 from gyro_calibration.logs.log import Array, Number
 import numpy as np
-from scipy.signal import oaconvolve
+from scipy.fft import irfft, next_fast_len, rfft
 
 #: Floor of the Allan deviation over the bias instability B: sqrt(2 ln 2 / pi).
 ALLAN_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
@@ -131,7 +131,13 @@ def simulate_noise(noise: Noise, count: int, interval: float,
     white = generator.standard_normal(count) * noise.angle_random_walk / math.sqrt(interval)
     innovations = generator.standard_normal(count) * noise.bias_instability
     response = np.cumprod(np.concatenate([[1.0], 1.0 - 0.5 / np.arange(1.0, count)]))
-    flicker = oaconvolve(innovations, response)[:count] if noise.bias_instability else innovations
+    flicker = _convolved(innovations, response) if noise.bias_instability else innovations
     walk = (np.cumsum(generator.standard_normal(count))
             * noise.rate_random_walk * math.sqrt(interval))
     return white + flicker + walk
+
+
+def _convolved(values: Array, response: Array) -> Array:
+    """Return values through a causal response of the same length, shape (n,)."""
+    length = next_fast_len(2 * len(values), real=True)
+    return np.asarray(irfft(rfft(values, length) * rfft(response, length), length)[:len(values)])
