@@ -386,11 +386,11 @@ def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
     A spline through the heading and the integral of the output by trapezoids differ by a twelfth
     of the second difference of the rate. Where a motion begins or ends, that passes for a dead
     zone or for a slip. A reference that bends everywhere is noise, and is left to its treatment;
-    steps of a heading bend its rate by twice `rounding`, step over interval, or less.
+    steps of a heading alone do not bend its rate by six times `rounding`, step over interval.
 
     """
     bend = np.abs(np.diff(rate, 2, prepend=rate[:1], append=rate[-1:])) / 12.0
-    least = _BENT * white_deviation((output - rate)[kept]) + rounding / 6.0
+    least = _BENT * white_deviation((output - rate)[kept]) + 0.5 * rounding
     sharp = maximum_filter1d(bend > least, 5)
     return sharp if sharp[kept].mean() < _FEW_CORNERS else np.zeros_like(sharp)
 
