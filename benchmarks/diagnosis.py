@@ -237,7 +237,7 @@ def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
     begin, found, problem = time.process_time(), None, ''
     try:
         found = diagnosis_of([hidden], generator, with_model or case.against_a_model
-                             or case.noise == 'floor')
+                             or case.noise == 'floor' or None)
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin

@@ -390,9 +390,10 @@ def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
 
     """
     bend = np.abs(np.diff(rate, 2, prepend=rate[:1], append=rate[-1:])) / 12.0
-    least = _BENT * white_deviation((output - rate)[kept]) + 0.5 * rounding
-    sharp = maximum_filter1d(bend > least, 5)
-    return sharp if sharp[kept].mean() < _FEW_CORNERS else np.zeros_like(sharp)
+    white = white_deviation((output - rate)[kept])
+    sharp = maximum_filter1d(bend > _BENT * white + 0.5 * rounding, 5)
+    rounded = rounding ** 2 / 12.0 > 0.5 * white ** 2  # most of what looks white is of the steps
+    return np.zeros_like(sharp) if rounded or sharp[kept].mean() > _FEW_CORNERS else sharp
 
 
 def _without_rounding(rate: Array, step: float, interval: float) -> Array:
