@@ -36,7 +36,7 @@ from gyro_calibration.diagnosis.expected_output import (
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.diagnosis.input_validation import evened, prepared
-from gyro_calibration.diagnosis.outliers import Outliers, outlying_samples
+from gyro_calibration.diagnosis.outliers import Outliers, outlying_samples, SIDE
 from gyro_calibration.diagnosis.quantization import Codes, codes_of, dead_band, Limit, limit_of
 from gyro_calibration.diagnosis.repeated_samples import repeated_samples, RepeatedSamples
 from gyro_calibration.diagnosis.unit_confusion import FACTORS, is_far, unit_of_scale
@@ -45,6 +45,7 @@ from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
+from scipy.ndimage import binary_dilation
 
 #: Chance of a false alarm of each check.
 LEVEL = 2e-4
@@ -258,9 +259,9 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
         limit, at_limit, good = None, np.zeros_like(at_limit), known
         stuck = repeated_samples(seen, codes, band, good, LEVEL)
     good = good if stuck is None else good & ~stuck.repeats
-    # Single samples that get out of a dead band are not wild.
-    wild = outlying_samples(seen, good if band is None else good & ~band.holds(seen.output),
-                            0.5 * codes.step, LEVEL)
+    # Samples beside those that a dead band holds are the tail of the noise that gets out of it.
+    wild = outlying_samples(seen, good if band is None else good & ~binary_dilation(
+        band.holds(seen.output), iterations=SIDE), 0.5 * codes.step, LEVEL)
     good = good if wild is None else good & ~wild.samples
     free = np.ones(len(output), dtype=bool)
     if limit is not None and seen.expected is not None:

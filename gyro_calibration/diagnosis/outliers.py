@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Outliers samples: single ones far from their neighbours, and not because the gyro moves."""
+"""Outliers: single samples far from their neighbours, and not because the gyro moves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from scipy.ndimage import maximum_filter1d
 #: chance.
 _WILD = 6.0
 #: Samples on each side that one is compared with.
-_SIDE = 3
+SIDE = 3
 #: Samples by which a reference may tell of a jolt sooner or later.
 _SOON = 10
 #: Samples in which the scatter is taken to be the same.
@@ -83,7 +83,7 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     if expected is not None:
         beside = _far(output - expected, moved, good, floor)
         far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
-    judged = good & (np.count_nonzero(_neighbours(~good, _SIDE), axis=1) < _SIDE)
+    judged = good & (np.count_nonzero(_neighbours(~good, SIDE), axis=1) < SIDE)
     wild = _single((far > limit) & judged)
     count, near = (int(np.count_nonzero(wild)),
                    int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
@@ -98,7 +98,7 @@ def _neighbours(values: Array | Mask, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
     # Turned over about the first and last sample, a slope goes on as it is. These two are what
     # the samples beside them say, as one that is an outlier would agree with itself.
-    if len(values) > _SIDE + 1 and values.dtype != bool:
+    if len(values) > SIDE + 1 and values.dtype != bool:
         ends = [np.median([part[0], 2.0 * part[1] - part[2], 2.0 * part[2] - part[4]])
                 for part in (values, values[::-1])]
         values = np.concatenate([ends[:1], values[1:-1], ends[1:]])
@@ -114,13 +114,13 @@ def _known(seen: Compared) -> Array | None:
 
 def _moved(expected: Array) -> Array:
     """Return how much the output is expected to change about each sample, shape (n,)."""
-    window = sliding_window_view(np.pad(expected, 2 * _SIDE, mode='edge'), 4 * _SIDE + 1)
+    window = sliding_window_view(np.pad(expected, 2 * SIDE, mode='edge'), 4 * SIDE + 1)
     return np.ptp(window, axis=1)
 
 
 def _off(values: Array) -> Array:
     """Return how far each sample is from the median of its neighbours."""
-    return np.abs(values - np.median(_neighbours(values, _SIDE), axis=1))
+    return np.abs(values - np.median(_neighbours(values, SIDE), axis=1))
 
 
 def _explained(output: Array, expected: Array) -> Mask:
@@ -131,7 +131,7 @@ def _explained(output: Array, expected: Array) -> Mask:
 
 def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
     """Return distances from neighbours, in standard deviations about here and in such motion."""
-    near = _neighbours(values, _SIDE)
+    near = _neighbours(values, SIDE)
     off = np.abs(values - np.median(near, axis=1))
     # A step, a corner or a steep slope leaves the median, but not what its neighbours span.
     outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
