@@ -106,7 +106,7 @@ def test_the_manifest_names_exactly_what_is_imported():
 def test_pytest_takes_a_launch_test_that_has_no_fixtures(pytestconfig):
     """As launch_testing makes it, where a ROS 2 is installed."""
     class LaunchTestItem:
-        location = 'test/test_launch.py', 0, ''
+        location = 'test/ros/test_launch.py', 0, ''
         markers = ()
 
         def add_marker(self, name):

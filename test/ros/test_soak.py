@@ -18,7 +18,7 @@ import sys
 
 import pytest
 
-SOAK = Path(__file__).parents[1] / 'benchmarks' / 'soak.py'
+SOAK = Path(__file__).parents[2] / 'benchmarks' / 'soak.py'
 
 
 def soaked(*words):

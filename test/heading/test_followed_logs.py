@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 from rig import BEGIN, Rig
 
-ORACLE = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'heading_oracle.py'))
+ORACLE = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'heading_oracle.py'))
 NOW, INTERVAL = 1.7e9, 0.01
 NOISE = Noise(0.6 * DEGREE / 60.0, 20.0 * DEGREE / 3600.0)
 CALIBRATED = SelfCalibration(0.0, 0.01, ((1e-6, 0.0), (0.0, 1e-8)))

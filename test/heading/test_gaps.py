@@ -237,7 +237,7 @@ def test_compensating_a_log_says_what_is_lost_and_allows_for_it(option, run, tmp
 
 def test_lost_samples_and_bursts_leave_the_heading_of_a_drive_as_it_is(monkeypatch):
     """A short run of `benchmarks/faulty_heading.py`, which tells by how much of 30 minutes."""
-    folder = Path(__file__).parents[1] / 'benchmarks'
+    folder = Path(__file__).parents[2] / 'benchmarks'
     monkeypatch.syspath_prepend(folder)
     one = runpy.run_path(str(folder / 'faulty_heading.py'))['one']
     faults = 'clean', '1 % lost, bursts', '1 % lost, usual interval for each'

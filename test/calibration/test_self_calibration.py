@@ -213,7 +213,7 @@ def test_a_fast_gyro_tells_the_scale_of_a_lagging_robot_no_worse():
             and np.sum(np.abs(sizes) < 1.96) >= 15), np.round(sizes, 1)
 
 
-HONEST_RUNS = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'honest_runs.py'))
+HONEST_RUNS = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'honest_runs.py'))
 
 
 @pytest.mark.parametrize('kind', ['ramps softer than commanded', 'second order',

@@ -175,7 +175,7 @@ def listeners(impatient):
     processes = []
 
     def start(count):
-        command = [sys.executable, Path(__file__).parent / 'listeners.py', str(count)]
+        command = [sys.executable, Path(__file__).parents[1] / 'listeners.py', str(count)]
         processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True,
                                           env=impatient))
         # rclpy prints there, too, that it is started again

@@ -720,7 +720,7 @@ def test_every_value_has_a_key_in_snake_case_that_the_documents_name(tmp_path, r
     rig.calibrate(REST)
     rig.feed(noisy(60.0), SLOW)
     _, _, values = reported(rig)
-    page = (Path(__file__).parents[1] / 'docs/reference/on_a_robot.md').read_text()
+    page = (Path(__file__).parents[2] / 'docs/reference/on_a_robot.md').read_text()
     assert [key for key in values if not re.fullmatch('[a-z0-9_]+', key)] == []
     assert [key for key in values if f'`{key}`' not in page] == []
 

@@ -42,7 +42,7 @@ from gyro_calibration.model.presets import XV3500
 import numpy as np
 import pytest
 
-FOOLED = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'fooled.py'))
+FOOLED = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'fooled.py'))
 WAYS = FOOLED['WAYS']
 GOOD = [name for name, (_, _, word) in WAYS.items() if not word]
 BAD = [name for name in WAYS if name not in GOOD]

@@ -20,7 +20,7 @@ from gyro_calibration.model.model_file import read_model
 import numpy as np
 import pytest
 
-RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
+RECOVERY = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'recovery.py'))
 Table, SINE = RECOVERY['Table'], RECOVERY['SINE']
 
 

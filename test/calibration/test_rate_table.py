@@ -48,7 +48,7 @@ import pytest
 from scipy.stats import binom, chi2
 from scipy.stats import t as student
 
-RECOVERY = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'recovery.py'))
+RECOVERY = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'recovery.py'))
 Table, LINEAR, CUBIC, SINE, run = (RECOVERY[name]
                                    for name in ('Table', 'LINEAR', 'CUBIC', 'SINE', 'run'))
 #: A test of an estimator fails by chance as rarely as this.
@@ -340,7 +340,7 @@ def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the
 
 def test_intervals_of_a_polynomial_and_of_its_rates_hold_the_truth():
     intervals = runpy.run_path(
-        str(Path(__file__).parents[1] / 'benchmarks' / 'polynomial_intervals.py'))
+        str(Path(__file__).parents[2] / 'benchmarks' / 'polynomial_intervals.py'))
     held = []
     for seed in range(10):
         table, output = intervals['table'](np.random.default_rng(seed))

@@ -20,7 +20,7 @@ import pytest
 
 # No import of ROS 2 and no skip at module level: launch_testing imports each test module while it
 # collects, and a skip there would skip every file of this folder.
-LAUNCH = Path(__file__).parents[1] / 'launch'
+LAUNCH = Path(__file__).parents[2] / 'launch'
 DOMAIN = random.SystemRandom().randint(1, 101)
 MISSING = [name for name in ('rclpy', 'launch_ros', 'launch_testing') if find_spec(name) is None]
 needs_launch = unittest.skipIf(MISSING, f'{" and ".join(MISSING)} not installed')

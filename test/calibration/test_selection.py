@@ -34,7 +34,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
+BENCHMARKS = Path(__file__).parents[2] / 'benchmarks'
 RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
                         for name in ('recovery', 'rate_table'))
 Table, TRUTH, LINEAR, CUBIC, SINE = (RECOVERY[name]

@@ -146,7 +146,7 @@ def test_the_residual_heading_is_what_the_calibration_leaves():
 
 
 def benchmark(name):
-    return runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / f'{name}.py'))
+    return runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / f'{name}.py'))
 
 
 @pytest.mark.parametrize('runs', [15, pytest.param(40, marks=pytest.mark.evidence)])

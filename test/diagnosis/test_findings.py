@@ -26,7 +26,7 @@ from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.units import amount, quantity
 import pytest
 
-TEXT = (Path(__file__).parents[1] / 'docs/findings.md').read_text()
+TEXT = (Path(__file__).parents[2] / 'docs/findings.md').read_text()
 COMMANDS = re.findall(r'^ +gyro_calibration (.+)$', TEXT, re.MULTILINE)
 NUMBER = re.compile(r'−?\d+(?:\.\d+)?(?:e[+-]\d+)?')
 

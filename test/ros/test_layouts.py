@@ -24,7 +24,7 @@ try:
 except ImportError:
     pytest.skip('ROS 2 messages are not installed', allow_module_level=True)
 
-CONFIG = Path(__file__).parents[1] / 'config'
+CONFIG = Path(__file__).parents[2] / 'config'
 FOXGLOVE = json.loads((CONFIG / 'foxglove.json').read_text())
 PLOTJUGGLER = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
 SCRIPT = FOXGLOVE['userNodes']['heading_band']['sourceCode']

@@ -100,7 +100,7 @@ def test_the_xv3500_walks_2_5_degrees_in_an_hour_and_11_where_hong_and_park_say_
 
 
 def test_the_configuration_of_the_xv3500_holds_its_figures():
-    model = read_model(Path(__file__).parents[1] / 'config/xv3500.yaml')
+    model = read_model(Path(__file__).parents[2] / 'config/xv3500.yaml')
     assert vars(model.noise) == pytest.approx(vars(XV3500.noise), rel=1e-4)
     assert model.output(0.5, 25.0) == pytest.approx(XV3500.model.output(0.5, 25.0), rel=1e-6)
 

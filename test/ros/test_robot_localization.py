@@ -22,7 +22,7 @@ import pytest
 from rig import INTERVAL, rested, Robot
 import yaml
 
-CONFIG = Path(__file__).parents[1] / 'config' / 'robot_localization.yaml'
+CONFIG = Path(__file__).parents[2] / 'config' / 'robot_localization.yaml'
 STATE = ['x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpitch', 'vyaw',
          'ax', 'ay', 'az']
 #: Names in the documentation of its state estimation nodes (for a sensor, what follows its name).

@@ -40,7 +40,7 @@ from hidden.size import Metric
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).parent / 'hidden'
+FOLDER = Path(__file__).parents[1] / 'hidden'
 COARSE = {'duration': 300.0, 'sample_rate': 20.0}
 ON_THE_SUM = [name for name, form in ALL.items() if form.stage == 'sum']
 

@@ -37,7 +37,7 @@ import pytest
 from scipy.stats import binom
 from scipy.stats import t as student
 
-BENCHMARKS = Path(__file__).parents[1] / 'benchmarks'
+BENCHMARKS = Path(__file__).parents[2] / 'benchmarks'
 RECOVERY, RATE_TABLE = (runpy.run_path(str(BENCHMARKS / f'{name}.py'))
                         for name in ('recovery', 'rate_table'))
 Table, TRUTH, LINEAR, SCATTERS = (RECOVERY[name]

@@ -18,7 +18,7 @@ from gyro_calibration.logs.log import DEGREE, read_log
 import numpy as np
 import pytest
 
-CAMPAIGNS = runpy.run_path(str(Path(__file__).parents[1] / 'benchmarks' / 'campaigns.py'))
+CAMPAIGNS = runpy.run_path(str(Path(__file__).parents[2] / 'benchmarks' / 'campaigns.py'))
 judge, simulated, least_squares_error = (
     CAMPAIGNS[name] for name in ('judge', 'simulated', 'least_squares_error'))
 
