@@ -19,7 +19,7 @@ import math
 from gyro_calibration.diagnosis.candidates import Candidate
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Unexplained
-from gyro_calibration.diagnosis.fitted_values import FittedValues, joined, Value
+from gyro_calibration.diagnosis.fitted_values import FittedValues, happens_once, joined, Value
 from gyro_calibration.diagnosis.generic_terms import along, is_named
 from gyro_calibration.diagnosis.regression_problem import fitted, Named
 from gyro_calibration.diagnosis.search import evidence_of, MOST_SLIPS, price_of_freedom, Search
@@ -38,6 +38,7 @@ _DEVIATIONS = 1.96
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
 
 
+_ONCE = 'look for what caused it; it is of this log alone, and in no model for others'
 _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
     'reference': 'mend or replace the reference, or see that it does not enter a calibration',
@@ -74,7 +75,8 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
                    _detectable(search, found.named[place], half), (*confounders, *unit),
                    separate_by or (cause.separate_by if confounders or unit else ''),
                    _evidence(size, half, candidate.run, len(found.replays)), cause.along,
-                   probability=probability, where=_where(found, candidate))
+                   probability=probability, where=_where(found, candidate),
+                   remedy=_ONCE if happens_once(found.named[place]) else '')
 
 
 def _where(found: FittedValues, candidate: Candidate) -> tuple[float, float] | None:

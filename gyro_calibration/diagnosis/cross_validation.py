@@ -64,7 +64,7 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
     rest = relaid(search, [_without(each, out) for each, out in zip(replays, held)], causes, _RATE)
     named = searched(rest)
     straight, plain, extended = (
-        FittedValues(fitted(rest.problem, some), rest.problem.replays)
+        FittedValues(fitted(rest.problem, some), rest.problem.replays, lasting=True)
         for some in ((), [each for each in named if each.candidate.cause == 'time_offset'], named))
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}

@@ -18,7 +18,7 @@ from dataclasses import replace
 from gyro_calibration.calibration.self_calibration import Limits
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Finding
-from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.fitted_values import FittedValues, happens_once
 from gyro_calibration.diagnosis.noise_parameters import NAMES
 from gyro_calibration.diagnosis.regression_problem import Named, seen
 from gyro_calibration.logs.log import Array
@@ -60,7 +60,8 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
     given, names = (model or GyroModel(),
                     {name for each in findings for name in (each.effect, *each.ambiguous_with)})
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
-              or any(each.candidate.cause in CATALOGUE for each in found.named))
+              or any(each.candidate.cause in CATALOGUE and found.explaining(place)
+                     for place, each in enumerate(found.named)))
     new = _with_exact(extended(given, found, bias_deviation) if fitted else given,
                       _of_the_output(quality))
     figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
@@ -136,10 +137,10 @@ def calibrated(model: GyroModel) -> GyroModel:
 
 
 def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
-    """Return the gyro's causes that its model cannot hold, as a file names each effect once."""
+    """Return the gyro's lasting causes that do not merge with its model's, for one of each."""
     terms, out = model.terms, []
     for place, known in enumerate(found.named):
-        if known.candidate.cause in CATALOGUE:
+        if known.candidate.cause in CATALOGUE and not happens_once(known):
             more = _with(terms, _term(found, place))
             out += [known] if more is None else []
             terms = more or terms
@@ -189,7 +190,7 @@ def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Arr
     terms = [Term(BIAS, (_bias(found, scale),)), Term(SCALE_FACTOR_ERROR, (scale,))]
     ranks: list[int | None] = [None, None if doubtful else found.place(-1, 0)]
     for place, known in enumerate(found.named):
-        if known.candidate.cause in CATALOGUE:
+        if known.candidate.cause in CATALOGUE and found.explaining(place):
             terms.append(_term(found, place))
             shapes = len(known.candidate.shapes)
             ranks += [found.place(place, -1 - number if number < shapes else number - shapes)

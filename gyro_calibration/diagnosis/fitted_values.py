@@ -27,6 +27,7 @@ from gyro_calibration.diagnosis.regression_problem import (
 )
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.logs.log import Array
+from gyro_calibration.model.effects import CATALOGUE
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -48,16 +49,23 @@ class FittedValues:
     ----------
     fitted : the causes in the field
     replays : the logs as they were laid out
+    lasting : whether effects of the gyro that happen once are fitted, but explain nothing, as in a
+        model for other logs
 
     """
 
     fitted: Fitted
     replays: tuple[Replay, ...]
+    lasting: bool = False
 
     @property
     def named(self) -> tuple[Named, ...]:
         """Return the causes."""
         return self.fitted.named
+
+    def explaining(self, cause: int) -> bool:
+        """Tell whether a cause, by its place, is in what is explained."""
+        return not (self.lasting and happens_once(self.named[cause]))
 
     @cached_property
     def _estimates(self) -> tuple[dict[tuple[int, int], int], Array, Array]:
@@ -125,7 +133,8 @@ class FittedValues:
         found['scale_factor_error'] = self.scale_factor_error.value * new.channels.rate
         for place, known in enumerate(self.named):
             candidate = known.candidate
-            if is_of_the_rate(candidate.cause) or candidate.run not in (None, run):
+            if (is_of_the_rate(candidate.cause) or candidate.run not in (None, run)
+                    or not self.explaining(place)):
                 continue
             values = ([candidate.amplitude] if candidate.amplitude is not None
                       else [one.value for one in self.coefficients(place)])
@@ -178,12 +187,17 @@ class FittedValues:
         """Return by what one more of a cause's value, or of the scale, lowers the mean bias."""
         if cause < 0:
             parts = [seen(each, self.named).channels.rate for each in self.replays]
-        elif number >= 0:
+        elif number >= 0 and self.explaining(cause):
             parts = [self.named[cause].candidate.columns(seen(each, self.named))[number]
                      for each in self.replays]
         else:
             return 0.0
         return float(np.mean([part[each.kept].mean() for part, each in zip(parts, self.replays)]))
+
+
+def happens_once(known: Named) -> bool:
+    """Tell whether a cause is an effect of the gyro in one of the logs: a step or a tone."""
+    return known.candidate.run is not None and known.candidate.cause in CATALOGUE
 
 
 def joined(parts: Sequence[Array]) -> Array:

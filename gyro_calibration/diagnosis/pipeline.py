@@ -39,7 +39,7 @@ from gyro_calibration.diagnosis.extended_model import (
     with_findings,
 )
 from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gain, Gate
-from gyro_calibration.diagnosis.fitted_values import FittedValues
+from gyro_calibration.diagnosis.fitted_values import FittedValues, happens_once
 from gyro_calibration.diagnosis.gates import gates, mismatch
 from gyro_calibration.diagnosis.generic_terms import along, is_named
 from gyro_calibration.diagnosis.input_validation import model_gate, refuse, rests
@@ -167,8 +167,9 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     changed = [] if model is None else _of_model(found, model, noise, rate)
     causes = {each.candidate.cause for known, members in zip(named, sets) if known not in out
               for each, _ in members}
+    lasting = any(known not in out and not happens_once(known) for known in named)
     won = (gain(search, causes, model is not None)
-           if (causes or changed) and not doubts_scale(found) else None)
+           if (lasting or changed) and not doubts_scale(found) else None)
     offered = won is None or not won.worse
     on_progress('report')
     findings = []
@@ -189,9 +190,9 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     if model is not None:
         findings += _of_noise(figures, model, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
-    # the causes that the model can hold, fitted without the others
-    inside = (FittedValues(fitted(search.problem, [each for each in named if each not in out]),
-                           found.replays) if out else found)
+    # the causes that the model can hold, without those that would be a second of a kind
+    inside = FittedValues(fitted(search.problem, [each for each in named if each not in out])
+                          if out else found.fitted, found.replays, lasting=True)
     plain, deviation = (FittedValues(fitted(search.problem, []), found.replays),
                         _bias_deviation(inside, noise))
     before = model or noted(replace(extended(GyroModel(), plain, deviation), noise=noise),
@@ -438,6 +439,9 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
                   else '')
         yield (f'A further {name.replace("_", " ")} is not in the extended model, because that '
                f'has one already and the two do not make one{remedy}.')
+    for name in dict.fromkeys(each.candidate.cause for each in found.named if happens_once(each)):
+        yield (f'The {name.replace("_", " ")} happens once: it is not in the extended model, '
+               'whose bias is the mean over the logs.')
     if won is not None and won.worse:
         yield ('On the parts held out, the extended model was worse than the one before; it is '
                'not offered.')

@@ -140,8 +140,28 @@ def test_a_second_tone_is_not_said_to_be_in_the_model():
     found = diagnosed(log, model)
     assert names(found) == ['interference_tone'] and not is_inside(found.findings[0], found)
     assert found.model.terms == model.terms and 'It is in the extended model' not in report(found)
-    assert any('interference tone is not in the extended model' in remark
-               and 'diagnose again' in remark for remark in found.remarks)
+    assert any('interference tone happens once: it is not in the extended model' in remark
+               for remark in found.remarks)
+
+
+@pytest.mark.parametrize('own', [(), (term('bias_step', 10.0, 2e-4),)], ids=['none', 'one'])
+@pytest.mark.parametrize('once', [term('bias_step', 130.0, 3e-3),
+                                  term('interference_tone', 1.7, 1e-3, 0.0)],
+                         ids=lambda each: each.effect.name)
+def test_what_happens_once_is_named_and_only_what_lasts_is_in_the_model(once, own):
+    model = replace(MODEL, terms=(*LINEAR, *own), covariance=None)
+    log = drive(*own, once, term('cubic_nonlinearity', 0.01))
+    found = diagnosed(log, model)
+    assert sorted(names(found)) == sorted([once.effect.name, 'cubic_nonlinearity'])
+    assert ([each.effect.name for each in found.model.terms]
+            == [*(each.effect.name for each in model.terms), 'cubic_nonlinearity'])
+    assert found.model.terms[2:-1] == own
+    assert value(found.model, 'cubic_nonlinearity') == pytest.approx(0.01, rel=0.1)
+    # the bias of the model is the mean over the log
+    mean = np.mean(once.values[1] * (TIME > 130.0)) if once.effect.name == 'bias_step' else 0.0
+    assert value(found.model, 'bias') == pytest.approx(2e-3 + mean, abs=5e-5)
+    (finding,) = (each for each in found.findings if each.effect == once.effect.name)
+    assert 'of this log alone' in finding.remedy and not is_inside(finding, found)
 
 
 # a model that is right

