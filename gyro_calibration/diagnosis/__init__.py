@@ -18,7 +18,7 @@ reference belong together), `input_validation` (which logs are refused), `data_q
 record), `reference` (its kind), `spectrum` (of the noise), `replay` (of a log), `candidates`
 (columns of causes), `generic_terms` (of what has no name), `noise_likelihood` (with a cause, under
 every noise), `regression_problem` (logs as a regression), `search` (for causes), `units` (of
-people), `candidate_experiments` (that distinguish causes), `fitted_values` (of what was found),
+people), `experiments` (that distinguish causes), `fitted_values` (of what was found),
 `noise_parameters`, `extended_model`, `cross_validation` (on what was held out), `curves` (for
 people to see), `build_findings`; where the reference limits what is known, `spans` (of heading, as
 a regression), `confirmation` (of causes), `noisy_reference` (the diagnosis of such a log);

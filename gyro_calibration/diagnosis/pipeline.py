@@ -18,7 +18,6 @@ from dataclasses import replace
 import math
 
 from gyro_calibration.diagnosis.build_findings import named_finding, unexplained, with_remedies
-from gyro_calibration.diagnosis.candidate_experiments import distinguishing
 from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
 from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
 from gyro_calibration.diagnosis.cross_validation import gain, shares
@@ -30,6 +29,7 @@ from gyro_calibration.diagnosis.curves import (
     what_is_left,
 )
 from gyro_calibration.diagnosis.data_quality import DataQuality, decided, inspect
+from gyro_calibration.diagnosis.experiments import experiment
 from gyro_calibration.diagnosis.extended_model import (
     calibrated,
     doubts_scale,
@@ -176,11 +176,10 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     for place, (known, members) in enumerate(zip(named, sets)):
         chance = search.chance.p_value(known.candidate.cause,
                                        evidence_of(search, (*named, *unnamed), place))
-        others = [each for each, _ in members if each.candidate.cause != known.candidate.cause]
-        findings.append(named_finding(
-            search, found, place, chance, members,
-            distinguishing(search.problem, named, known, others, generator).sentence
-            if others else ''))
+        cause = known.candidate.cause
+        findings.append(named_finding(search, found, place, chance, members, experiment(
+            cause, [(each.candidate.cause, lack) for each, lack in members
+                    if each.candidate.cause != cause], found.replays)))
     best: dict[str, Finding] = {}  # of the records, by the log that shows it best
     for each in (each for clean in quality for each in clean.findings):
         if each.effect not in best or each.p_value < best[each.effect].p_value:

@@ -1,0 +1,73 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""Experiments that distinguish causes: the table of pairs, with the numbers of the log."""
+
+import re
+import zlib
+
+from diagnosed import diagnosis_of, log_of
+from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.experiments import experiment
+from gyro_calibration.diagnosis.replay import replay
+from gyro_calibration.logs.log import DEGREE
+from hidden import hide
+from hidden.twins import twin, TWINS
+import numpy as np
+import pytest
+
+#: What physics wants for each pair of twins, in their order.
+WANTED = dict(zip(TWINS, [
+    'heat and cool', 'heat and cool', 'rest for', 'whole turns', 'at eight speeds', 'motor',
+    'axis up, level, down', 'beyond', 'quick reversals', 'corners', 'corners', 'again', 'again',
+    'step the supply', 'axis up', 'whole turns']))
+
+
+@pytest.fixture(name='laid', scope='module')
+def _laid():
+    log = log_of(hide(['bias'], 1.0, np.random.default_rng(3), sample_rate=20.0,
+                      conditions={'top_rate': 2.0})[0])
+    return replay(log, np.ones(len(log), bool), np.random.default_rng(1))
+
+
+@pytest.mark.parametrize('pair', TWINS, ids='-'.join)
+def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair, laid):
+    for one, other in (pair, pair[::-1]):
+        words = experiment(one, [(other, 2.0)], [laid])
+        assert WANTED[pair] in words and f'{other.replace("_", " ")} by 2.0 sigma' in words
+
+
+def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
+    def numbers(one, other):
+        return [float(each) for each in re.findall(
+            r'-?\d+\.?\d*', experiment(one, [(other, 0.0)], [laid]).partition(' (')[0])]
+    top = float(np.abs(laid.channels.rate).max()) / DEGREE
+    assert numbers('sine_response', 'saturation') == pytest.approx([3.0 * top, top], rel=0.01)
+    low, high, again = numbers('bias_temperature', 'rate_ramp')
+    degc = laid.channels.temperature
+    assert low <= degc.min() and high == again >= degc.max() and high - low >= 20.0
+    assert numbers('warm_up', 'rate_ramp')[0] * 60.0 >= 4.0 * laid.duration
+
+
+def test_a_set_of_three_names_each_experiment_once(laid):
+    words = experiment('cubic_nonlinearity', [('sine_response', 0.0), ('saturation', 0.5)], [laid])
+    assert words.count('turn both ways') == 1
+    assert 'sine response by 0.0, saturation by 1.0' in words
+    assert not experiment('outliers', [('dropped_samples', 0.0)], [laid])
+
+
+def test_a_set_that_is_found_has_its_experiment():
+    pair = ('bias_temperature', 'warm_up')
+    generator = np.random.default_rng(zlib.crc32(b'a set'))
+    found = diagnosis_of([twin(pair, pair[0], generator, sample_rate=10.0)], generator)
+    (finding,) = found.findings
+    assert {finding.effect, *finding.ambiguous_with} >= set(pair)
+    assert 'heat and cool it twice' in finding.separate_by and 'sigma' in finding.separate_by
+    assert all(CAUSES[name].separate_by for name in finding.ambiguous_with)
