@@ -29,11 +29,11 @@ from gyro_calibration.cli.verb import (
     verb,
     whole,
 )
+from gyro_calibration.diagnosis.data_quality import KINDS
 from gyro_calibration.diagnosis.extended_model import calibrated
 from gyro_calibration.diagnosis.findings import Diagnosis
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
-from gyro_calibration.diagnosis.reference import KINDS
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.words import lines, offered
 from gyro_calibration.files import write_atomically

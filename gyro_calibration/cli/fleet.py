@@ -26,7 +26,7 @@ from typing import Any
 from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli.verb import Answer, bar, origin_of, positive, UsageError, verb, whole
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.units import amount, quantity
+from gyro_calibration.diagnosis.words import amount, quantity
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.prior import models

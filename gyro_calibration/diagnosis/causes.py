@@ -18,10 +18,12 @@ what would tell the two apart.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
+from gyro_calibration.diagnosis.findings import Finding
 from gyro_calibration.model.effects import CATALOGUE, Effect
+from gyro_calibration.model.gyro_model import GyroModel
 
 #: Either of these serves as a reference.
 REFERENCES = ('reference_rate', 'reference_heading')
@@ -185,3 +187,19 @@ def add_causes(effects: Iterable[Effect]) -> None:
     for effect in effects:
         CAUSES[effect.name] = _of_an_effect(
             effect.name, _Likeness(effect.along, separate_by=effect.shown_by))
+
+
+_REMEDIES = {
+    'gyro': 'add it to the model of the gyro',
+    'reference': 'mend or replace the reference, or see that it does not enter a calibration',
+    'record': 'mend the recording',
+    'noise': 'take the figures of the extended model'}
+
+
+def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
+                  model: GyroModel) -> list[Finding]:
+    """Return findings with their share of the heading error, and what to do about them."""
+    inside = {term.effect.name for term in model.terms}
+    return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
+        '' if CAUSES[each.effect].of == 'gyro' and each.effect not in inside
+        else _REMEDIES[CAUSES[each.effect].of])) for each in findings]

@@ -8,18 +8,62 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Charts as SVG in a page, with the table of their values that the script of the page shows."""
+"""
+Charts as SVG in a page, with the table of their values that the script of the page shows.
+
+All text in an element is escaped, so that no text can become an element.
+
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 import math
 
-from gyro_calibration.diagnosis.markup import element, joined, Markup
-from gyro_calibration.diagnosis.units import number, raised
+from gyro_calibration.diagnosis.words import clean, number, raised
 from gyro_calibration.logs.log import Array, Mask
 import numpy as np
+
+_EMPTY = {'path', 'line', 'circle', 'rect', 'meta', 'br'}
+
+
+class Markup(str):
+    """Text that is HTML already."""
+
+
+def element(name: str, *children: str | None, **attributes: str | float | None) -> Markup:
+    """
+    Return an element.
+
+    Parameters
+    ----------
+    name : of its tag
+    children : elements, or texts, which are escaped; None is left out
+    attributes : with _ for -, and one at the end to avoid a word of Python; None is left out
+
+    """
+    given = {key.rstrip('_').replace('_', '-'): _text(value) for key, value in attributes.items()
+             if value is not None}
+    named = ''.join(f' {key}="{_escaped(value)}"' for key, value in given.items())
+    inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children
+                     if child is not None)
+    return Markup(f'<{name}{named}/>' if name in _EMPTY else f'<{name}{named}>{inside}</{name}>')
+
+
+def joined(*parts: str) -> Markup:
+    """Return parts one after the other, texts escaped."""
+    return Markup(''.join(part if isinstance(part, Markup) else _escaped(part) for part in parts))
+
+
+def _text(value: str | float) -> str:
+    return value if isinstance(value, str) else f'{value:.2f}'.rstrip('0').rstrip('.')
+
+
+def _escaped(text: str) -> str:
+    return escape('\n'.join(clean(line) for line in text.split('\n')))
+
 
 #: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0

@@ -26,8 +26,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.diagnosis.build_findings import LEAST_CHANCE
 from gyro_calibration.diagnosis.candidates import added_effects, LEAST_CHANGE
+from gyro_calibration.diagnosis.findings import LEAST_PROBABILITY
 from gyro_calibration.diagnosis.spans import (
     Column,
     FEWEST_STRETCHES,
@@ -166,12 +166,12 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Seq
     surely, predicted, chosen = max(found) if done.spans.fine else min(found)
     weights = {name: float(np.exp(max(min(chances[other][1] - gain, 0.0), -50.0)))
                for name, other in best_of.items()}
-    probability = {name: max(weight / sum(weights.values()), LEAST_CHANCE)
+    probability = {name: max(weight / sum(weights.values()), LEAST_PROBABILITY)
                    for name, weight in sorted(weights.items(), key=lambda each: -each[1])
                    if name in alike}
     established = (p_value < level and surely > _SURELY and chosen == 1.0 and not column.once
                    and stretches >= FEWEST_STRETCHES)
-    return Confirmed(column, max(p_value, LEAST_CHANCE), predicted, chosen, established,
+    return Confirmed(column, max(p_value, LEAST_PROBABILITY), predicted, chosen, established,
                      probability)
 
 

@@ -16,8 +16,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 from gyro_calibration.diagnosis.findings import Change, Gain, HeadingCurve
-from gyro_calibration.diagnosis.fitted_values import FittedValues
-from gyro_calibration.diagnosis.regression_problem import fitted
+from gyro_calibration.diagnosis.regression import fitted, FittedValues
 from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import relaid, Search, searched
 from gyro_calibration.logs.log import Array, Mask

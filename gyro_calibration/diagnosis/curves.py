@@ -16,10 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
-from gyro_calibration.diagnosis.fitted_values import FittedValues, joined
-from gyro_calibration.diagnosis.regression_problem import Fitted
-from gyro_calibration.diagnosis.replay import Replay, white_deviation
-from gyro_calibration.diagnosis.spectrum import transform
+from gyro_calibration.diagnosis.regression import Fitted, FittedValues
+from gyro_calibration.diagnosis.replay import Replay, transform, white_deviation
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -54,7 +52,7 @@ def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
     replays = after.replays
     simulated = [each.added + error - rest
                  for each, error, rest in zip(replays, beside_model(replays), before)]
-    values = [joined([part[each.kept] for part, each in zip(parts, replays)])
+    values = [np.concatenate([part[each.kept] for part, each in zip(parts, replays)])
               for parts in (before, what_is_left(after), simulated)]
     found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after)
              for name, unit, of in _variables(replays)]
@@ -84,7 +82,7 @@ def _variables(replays: Sequence[Replay]) -> Iterator[tuple[str, str, Callable[[
 def _curve(name: str, unit: str, parts: Sequence[Array], values: Sequence[Array],
            after: FittedValues) -> Curve:
     """Bin evenly between the quantiles that hold nearly all, without bins of few samples."""
-    at = joined(parts)
+    at = np.concatenate(parts)
     low, high = np.quantile(at, [0.001, 0.999])
     if not high > low:
         return Curve(name, unit, *(np.empty(0) for _ in range(5)))

@@ -20,8 +20,9 @@ what is to be explained.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
 
 from gyro_calibration.calibration.dwells import Dwells, take
 from gyro_calibration.calibration.rate_table import (
@@ -30,10 +31,25 @@ from gyro_calibration.calibration.rate_table import (
     columns_of,
     fit_effects,
 )
-from gyro_calibration.calibration.scatter import Scatter, Uncertainty, Whitener
-from gyro_calibration.calibration.selection import decided, supported_effects, TECHNOLOGIES
+from gyro_calibration.calibration.scatter import (
+    parts_of,
+    Scatter,
+    SMALLEST_TEMPERATURE_SPREAD,
+    Uncertainty,
+    Whitener,
+)
+from gyro_calibration.calibration.selection import (
+    decided,
+    DISTINGUISHED,
+    separation,
+    supported_effects,
+    swapped_effects,
+    TECHNOLOGIES,
+)
+from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.extended_model import origins_before, wider
-from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.diagnosis.findings import Unexplained
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -41,13 +57,16 @@ from gyro_calibration.model.effects import (
     Channels,
     CUBIC_NONLINEARITY,
     Effect,
+    SATURATION,
     SCALE_FACTOR_ERROR,
     SINE_RESPONSE,
     STEADY,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.linalg import block_diag
+from scipy.stats import f as fisher
 
 #: Fitted in any case.
 NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
@@ -369,3 +388,278 @@ def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
         return fit_effects(fit.dwells, effects, fit.scatter)
     except DataRefused:
         return None
+
+
+#: So many columns a curve has at most.
+_MOST_COLUMNS = 9
+#: Fewer dwells than this for each column do not tell a curve from chance.
+_DWELLS_A_COLUMN = 4
+#: What of a curve the model explains already to this part of its length is not tried again.
+_NEW = 1e-3
+RATE, TEMPERATURE, PRODUCT, ORDER, SWEEP = (
+    'rate', 'temperature', 'rate_times_temperature', 'order_of_dwells', 'sweep')
+SINGLE_RATES = 'single_rates'
+#: A rate that is repeated in so many sweeps may show an error of its own.
+_REPEATED = 4
+
+
+@dataclass(frozen=True)
+class Left:
+    """
+    Structure without a name.
+
+    Attributes
+    ----------
+    found : where it lies, the clearest first
+    misfit : by what each lowers the sum of the whitened squared residuals
+
+    """
+
+    found: tuple[Unexplained, ...]
+    misfit: Mapping[str, float]
+
+
+def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
+    """
+    Look for structure in what a fit leaves.
+
+    Parameters
+    ----------
+    fit : of dwells
+    level : the chance to find any where there is none
+    doubt : what deviations of the model's values add to each dwell, rad/s, shape (n, m): that is
+        no structure
+
+    """
+    used = take(fit.dwells, fit.scatter.kept)
+    probes = {name: columns for name, columns in _probes(used).items() if columns.shape[1]}
+    known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
+    found, gains, tried = [], {}, len(probes)
+    while probes:
+        judged = [_judged(name, fit, known, columns, error, doubt)
+                  for name, columns in probes.items()]
+        best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
+        chance = min(1.0, tried * best.p_value)
+        if chance >= level:
+            break
+        found.append(replace(best, p_value=chance))
+        gains[best.along] = gain
+        known = np.column_stack([known, probes.pop(best.along)])
+    return Left(tuple(found), gains)
+
+
+def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
+            doubt: Array) -> tuple[Unexplained, float]:
+    """Return what a curve explains beside what is known, its chance, and the misfit it saves."""
+    used = take(fit.dwells, fit.scatter.kept)
+    whitener = Whitener(used, fit.scatter)
+    base = _orthonormal(whitener.whiten(known))
+    white = whitener.whiten(error)
+    white = white - base @ (base.T @ white)
+    new = _beside(base, whitener.whiten(columns))
+    count, freedom = new.shape[1], len(used) - base.shape[1] - new.shape[1]
+    if not count or freedom < 3:
+        return Unexplained(name, 0.0, 1.0), 0.0
+    gain, total = float(np.sum((new.T @ white) ** 2)), float(white @ white)
+    share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
+    # Columns in their own unit, for the covariance of the dwells may be another one.
+    plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
+    chance = _chance_of_curve(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error),
+                              new.T @ whitener.whiten(doubt))
+    return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
+
+
+def _chance_of_curve(uncertainty: Uncertainty, doubt: Array) -> float:
+    """Return how likely the last values are all doubt, by an F test averaged over the scatter."""
+    count = len(doubt)
+    values, covariances = (uncertainty.offsets[:, -count:],
+                           uncertainty.covariances[:, -count:, -count:] + doubt @ doubt.T)
+    squares = np.einsum('ki,ki->k', values,
+                        np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
+    return float(uncertainty.weights @ fisher.sf(squares / count, count, uncertainty.freedom))
+
+
+def _orthonormal(columns: Array) -> Array:
+    left, sizes, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
+    return left[:, sizes > 1e-6 * sizes[0]]
+
+
+def _beside(base: Array, columns: Array) -> Array:
+    """Return orthonormal columns for what is new in some beside others."""
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    left, sizes, _ = np.linalg.svd(columns - base @ (base.T @ columns), full_matrices=False)
+    return left[:, sizes > _NEW]
+
+
+# the curves
+
+def _probes(dwells: Dwells) -> Mapping[str, Array]:
+    """Return the columns of each curve, shape (n, m)."""
+    sweeps = len(np.unique(parts_of(dwells)))
+    # What differs between sweeps alone has no more evidence than there are sweeps.
+    slow = min(_MOST_COLUMNS, sweeps // 3)
+    probes = {RATE: _spline(dwells.rate, min(_MOST_COLUMNS, len(dwells) // _DWELLS_A_COLUMN)),
+              SINGLE_RATES: _by_rate(dwells),
+              ORDER: _spline(np.arange(len(dwells)).astype(float), slow),
+              SWEEP: _by_sweep(dwells)}
+    if (dwells.temperature is not None
+            and np.ptp(dwells.temperature) >= SMALLEST_TEMPERATURE_SPREAD):
+        probes[TEMPERATURE] = _spline(dwells.temperature, slow)
+        rate, temperature = _scaled(dwells.rate), _scaled(dwells.temperature)
+        probes[PRODUCT] = np.column_stack([rate ** i * temperature ** j
+                                           for i in (1, 2, 3) for j in range(1, min(slow, 2) + 1)]
+                                          or [np.zeros((len(dwells), 0))])
+    return probes
+
+
+def _scaled(values: Array) -> Array:
+    """Return values from -1 to 1."""
+    low, high = float(values.min()), float(values.max())
+    return (2.0 * values - low - high) / max(high - low, 1e-300)
+
+
+def _spline(values: Array, most: int) -> Array:
+    """Return a cubic spline over values, or fewer powers where they are few, shape (n, m)."""
+    count = min(most, len(np.unique(np.round(_scaled(values), 3))) - 1)
+    if count < 4:
+        return _scaled(values)[:, None] ** np.arange(1, max(count, 0) + 1)
+    inner = np.quantile(values, np.linspace(0.0, 1.0, count - 1))
+    knots = np.concatenate([[inner[0]] * 3, np.unique(inner), [inner[-1]] * 3])
+    return BSpline.design_matrix(values, knots, 3).toarray()
+
+
+def _by_rate(dwells: Dwells) -> Array:
+    """Return a column for each rate that several sweeps repeat, shape (n, rates)."""
+    _, number = np.unique(np.round(_scaled(dwells.rate), 4), return_inverse=True)
+    columns = (number[:, None] == np.arange(number.max() + 1)).astype(float)
+    parts = parts_of(dwells)
+    repeated = np.array([len(np.unique(parts[column > 0.0])) >= _REPEATED for column in columns.T])
+    return (columns[:, repeated] if np.count_nonzero(repeated) * _DWELLS_A_COLUMN <= len(dwells)
+            else columns[:, :0])
+
+
+def _by_sweep(dwells: Dwells) -> Array:
+    """Return a parabola over rate per sweep, which no bias or scale makes, shape (n, sweeps)."""
+    parts = parts_of(dwells)
+    if len(dwells) < 8 * (parts.max() + 1):
+        return np.zeros((len(dwells), 0))
+    return (parts[:, None] == np.arange(parts.max() + 1)) * (_scaled(dwells.rate) ** 2)[:, None]
+
+
+#: Of bias and scale factor, what dwells in one pose on one table never rule out.
+_ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scale'}
+#: Further dwells are aimed at this, for two fits vary by one standard deviation.
+_AIM = DISTINGUISHED + 1.0
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """
+    Causes that may stand in the place of one.
+
+    Attributes
+    ----------
+    names : of them, the likeliest first
+    separate_by : the experiment that would part them; '' where there is nothing to part
+
+    """
+
+    names: tuple[str, ...] = ()
+    separate_by: str = ''
+
+
+def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
+    """Return what dwells cannot rule out in place of one effect of a fit."""
+    if effect in _ALWAYS:
+        return Alternatives((_ALWAYS[effect],), CAUSES[effect.name].separate_by)
+    steady = [(sigmas, other) for other in _others(fit, effect)
+              if (sigmas := sigmas_of(fit, other)) < DISTINGUISHED]
+    found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
+    found += [(sigmas, name) for name, columns in _beyond(fit, effect)
+              if (sigmas := _sigmas(fit, effect, columns)) < DISTINGUISHED]
+    if not found:
+        return Alternatives()
+    said = [_experiment(fit, steady[0][1])] if steady else []
+    said += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
+    return Alternatives(tuple(name for _, name in sorted(found)), '; '.join(said))
+
+
+def sigmas_of(fit: Calibration, other: Calibration) -> float:
+    """Return by how many sigma a fit is better than another one of the same dwells."""
+    return math.sqrt(max(other.misfit - fit.misfit, 0.0))
+
+
+def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:
+    """Give fits with another steady effect in place of one."""
+    if effect is BIAS_TEMPERATURE and BIAS_TEMPERATURE_QUADRATIC in fit.effects:
+        return  # the curve would be without its slope
+    for other in STEADY.values():
+        swapped = (None if other in fit.effects
+                   else tried(fit, swapped_effects(fit.effects, effect, other)))
+        if swapped is not None:
+            yield swapped
+
+
+def _beyond(fit: Calibration, effect: Effect) -> Iterator[tuple[str, list[Array]]]:
+    """Give causes that are no effects of rate or temperature, with columns tried one by one."""
+    rate, order = fit.dwells.rate, np.arange(len(fit.dwells)) / len(fit.dwells)
+    if effect in (BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC):
+        yield 'rate_ramp', [order]
+        yield 'warm_up', [np.exp(-order / time_constant)
+                          for time_constant in (0.05, 0.1, 0.2, 0.5)]
+    if effect in (CUBIC_NONLINEARITY, SINE_RESPONSE):
+        limits = np.abs(rate).max() * np.linspace(0.5, 0.98, 25)
+        assert SATURATION.distortion is not None
+        yield 'saturation', [SATURATION.distortion(rate, order, limit) - rate
+                             for limit in limits.tolist()]
+
+
+def _sigmas(fit: Calibration, effect: Effect, columns: list[Array]) -> float:
+    """Return by how many sigma an effect is better than the best column with a free factor."""
+    used = take(fit.dwells, fit.scatter.kept)
+    term = next(each for each in fit.terms if each.effect is effect)
+    whitener = Whitener(used, fit.scatter)
+    # the residual with what the effect explains
+    error = whitener.whiten((fit.residual
+                             + term.error(channels_of(fit.dwells)))[fit.scatter.kept])
+    known = whitener.whiten(columns_of(used, [each for each in fit.terms if each is not term]))
+    misfits = []
+    for column in columns:
+        both = np.column_stack([known, whitener.whiten(column[fit.scatter.kept])])
+        lengths = np.linalg.norm(both, axis=0)
+        both = both / np.where(lengths > 0.0, lengths, 1.0)
+        left = error - both @ np.linalg.lstsq(both, error, rcond=None)[0]
+        misfits.append(float(np.sum(left ** 2)))
+    return math.sqrt(max(min(misfits) - fit.misfit, 0.0))
+
+
+# what would distinguish them
+
+def _sweeps(fit: Calibration) -> Iterator[tuple[str, Array, float]]:
+    """Give sweeps that may be added, the easiest first: in words, rates, and temperature."""
+    fastest = float(np.abs(fit.dwells.rate).max())
+    middle = fit.model.reference_temperature
+    slow = fastest * np.array([0.0, 0.02, 0.05, 0.1, 0.2])
+    yield ('two dwells each way at 2, 5, 10 and 20 % of the fastest rate, and rests',
+           np.tile([*slow, *-slow], 2), middle)
+    for rate in (fastest * np.arange(1.0, 3.0, 0.05)).tolist():
+        yield (f'two dwells each way at {rate / DEGREE:.0f} deg/s',
+               np.array([rate, rate, -rate, -rate]), middle)
+    if fit.dwells.temperature is not None:
+        low, high = float(fit.dwells.temperature.min()), float(fit.dwells.temperature.max())
+        rates = np.repeat(fastest * np.linspace(-1.0, 1.0, 9), 2)
+        for beyond in (0.0, 5.0, 10.0, 20.0, 30.0):
+            for temperature in (high + beyond, low - beyond):
+                yield f'a sweep of 18 dwells at {temperature:.0f} degC', rates, temperature
+
+
+def _experiment(fit: Calibration, other: Calibration) -> str:
+    """Return the easiest sweep that would part two fits, or the best one, in words."""
+    tried_sweeps = []
+    for words, rates, temperature in _sweeps(fit):
+        tried_sweeps.append((separation(fit, other, rates, temperature), words))
+        if tried_sweeps[-1][0] >= _AIM:
+            break
+    sigmas, words = max(tried_sweeps)
+    return (f'add {words}: that parts them by {sigmas:.1f} standard deviations'
+            + ('' if sigmas >= _AIM else ', and repeat it'))

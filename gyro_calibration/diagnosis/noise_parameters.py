@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from gyro_calibration.diagnosis.regression_problem import Fitted
-from gyro_calibration.diagnosis.spectrum import angles, differentiated
+from gyro_calibration.diagnosis.regression import Fitted
+from gyro_calibration.diagnosis.replay import angles, differentiated
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.noise import Noise
 import numpy as np

@@ -17,8 +17,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 import math
 
-from gyro_calibration.diagnosis.build_findings import LEAST_CHANCE, with_remedies
-from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.causes import CAUSES, with_remedies
 from gyro_calibration.diagnosis.confirmation import candidates, Confirmed, search
 from gyro_calibration.diagnosis.cross_validation import (
     change_over,
@@ -36,6 +35,7 @@ from gyro_calibration.diagnosis.findings import (
     Estimate,
     Finding,
     Gain,
+    LEAST_PROBABILITY,
     Reference,
     Trace,
 )
@@ -185,7 +185,7 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
                     sentence = 'Gyro and reference are not of the same time.'
         yield Finding(
             name, sentence, {name: Estimate.about(value, half, next(iter(cause.units.values())))},
-            max(chance, LEAST_CHANCE), SEEN * deviation, ambiguous_with=tuple(confounders),
+            max(chance, LEAST_PROBABILITY), SEEN * deviation, ambiguous_with=tuple(confounders),
             separate_by=cause.separate_by if confounders else '',
             evidence=f'it rests on {effective:.0f} stretches', along=cause.along, remedy=remedy)
 

@@ -17,9 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.diagnosis.build_findings import named_finding, unexplained, with_remedies
-from gyro_calibration.diagnosis.candidates import constant, fitted_shapes
-from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
+from gyro_calibration.diagnosis.candidates import along, constant, fitted_shapes, is_named
+from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES, with_remedies
 from gyro_calibration.diagnosis.cross_validation import gain, shares
 from gyro_calibration.diagnosis.curves import (
     beside_model,
@@ -28,7 +27,14 @@ from gyro_calibration.diagnosis.curves import (
     noise_curve,
     what_is_left,
 )
-from gyro_calibration.diagnosis.data_quality import DataQuality, decided, inspect
+from gyro_calibration.diagnosis.data_quality import (
+    DataQuality,
+    decided,
+    inspect,
+    limits,
+    reference_of,
+)
+from gyro_calibration.diagnosis.expected_output import unit_of_offset
 from gyro_calibration.diagnosis.experiments import experiment
 from gyro_calibration.diagnosis.extended_model import (
     calibrated,
@@ -38,29 +44,42 @@ from gyro_calibration.diagnosis.extended_model import (
     noted,
     with_findings,
 )
-from gyro_calibration.diagnosis.findings import Diagnosis, Estimate, Finding, Gain, Gate
-from gyro_calibration.diagnosis.fitted_values import FittedValues, happens_once
-from gyro_calibration.diagnosis.gates import gates, mismatch
-from gyro_calibration.diagnosis.generic_terms import along, is_named
-from gyro_calibration.diagnosis.input_validation import model_gate, refuse, rests
+from gyro_calibration.diagnosis.findings import (
+    Diagnosis,
+    Estimate,
+    Finding,
+    Gain,
+    Gate,
+    LEAST_PROBABILITY,
+    Unexplained,
+)
+from gyro_calibration.diagnosis.gates import gates, mismatch, model_gate, refuse, rests
 from gyro_calibration.diagnosis.noise_parameters import NAMES, noise_parameters, NoiseParameters
 from gyro_calibration.diagnosis.noisy_reference import diagnose_beside
-from gyro_calibration.diagnosis.reference import limits, reference_of
-from gyro_calibration.diagnosis.regression_problem import filtered, fitted, Named
+from gyro_calibration.diagnosis.regression import (
+    filtered,
+    fitted,
+    FittedValues,
+    happens_once,
+    Named,
+    Value,
+)
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.search import (
     alternatives,
     begin,
     evidence_of,
     MOST_OF,
+    MOST_SLIPS,
     polished,
+    price_of_freedom,
     pruned,
     Search,
     searched,
 )
-from gyro_calibration.diagnosis.units import amount
+from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.logs.log import Log
-from gyro_calibration.model.effects import QUANTIZATION
+from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -75,6 +94,11 @@ _LARGEST = 0.5
 _REPEATS = 1e-3
 #: Causes named from a temperature must repeat.
 _MUST_REPEAT = frozenset({'temperature', 'temperature_rate'})
+#: Power with which an effect of the minimum detectable size is found; half an interval of 95 %.
+_POWER, _DEVIATIONS = 0.95, 1.96
+#: Names of what has no other.
+_SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
+_ONCE = 'look for what caused it; it is of this log alone, and in no model for others'
 #: What is said of a channel that is constant, and the variable that is constant with it.
 _HARDLY = {'temperature': 'the temperature hardly changes',
            'supply': 'the supply voltage does not change',
@@ -444,3 +468,113 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
     if won is not None and won.worse:
         yield ('On the parts held out, the extended model was worse than the one before; it is '
                'not offered.')
+
+
+# findings
+
+def named_finding(search: Search, found: FittedValues, place: int, p_value: float,
+                  members: Members, separate_by: str) -> Finding:
+    """Return what is known of a named cause, and of those that may be in its place."""
+    known = found.named[place]
+    candidate, name, cause = known.candidate, known.candidate.cause, CAUSES[known.candidate.cause]
+    parameters = _parameters(found, place)
+    lacks = {name: 0.0, **{each.candidate.cause: lack for each, lack in reversed(members)}}
+    weights = {other: math.exp(-max(lack, 0.0)) for other, lack in lacks.items()}
+    probability = {other: max(weight / sum(weights.values()), LEAST_PROBABILITY)
+                   for other, weight in sorted(weights.items(), key=lambda each: -each[1])}
+    confounders = [each.candidate.cause for each, _ in members if each.candidate.cause != name]
+    size = next(iter(parameters.values()))
+    deviation = (size.interval[1] - size.interval[0]) / (2.0 * _DEVIATIONS)
+    if name == 'time_offset' and unit_of_offset(size.estimate, deviation,
+                                                found.replays[0].interval):
+        confounders.append('unit_error')
+    # half the square of a size in standard deviations is its evidence
+    needed = search.chance.threshold(name, search.rate) + price_of_freedom(known)
+    smallest = math.sqrt(2.0 * max(needed, 0.0)) + float(norm.isf(1.0 - _POWER))
+    log = ('' if candidate.run is None or len(found.replays) == 1
+           else f'in log {candidate.run + 1}, ')
+    where = None
+    if name == 'bias_step':
+        where = candidate.shapes[0], float(found.replays[candidate.run or 0].channels.time[-1])
+    elif name == 'reference_slip':
+        where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
+    return Finding(
+        name, cause.sentence, parameters, p_value,
+        smallest * deviation if deviation > 0.0 else None, tuple(dict.fromkeys(confounders)),
+        separate_by or (cause.separate_by if confounders else ''),
+        f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0 else '',
+        cause.along, probability=probability, where=where,
+        remedy=_ONCE if happens_once(known) else '')
+
+
+def _parameters(found: FittedValues, place: int) -> dict[str, Estimate]:
+    """Return the parameters of a cause, the one that is named like it first."""
+    candidate = found.named[place].candidate
+    coefficients, shapes = found.coefficients(place), found.shapes(place)
+    name, effect = candidate.cause, CATALOGUE.get(candidate.cause)
+    names = (_SHAPES.get(name, ()) if effect is None
+             else tuple(parameter.name for parameter in effect.shapes + effect.coefficients))
+    unit = (effect.coefficients[0].unit if effect is not None and effect.coefficients
+            else CAUSES[name].units.get(name, '1'))
+    parameters = {}
+    own = () if effect is None else effect.coefficients
+    if len(own) > 1 and [each.name for each in own] != ['sine', 'cosine']:
+        parameters = {each.name: _estimate(value, each.unit)
+                      for each, value in zip(own, coefficients)}
+    elif len(coefficients) == 2 and name != 'reference_slip':
+        parameters = _as_phase(found, place, name, coefficients, unit)
+    elif coefficients:
+        parameters = {name: _estimate(coefficients[0], unit)}
+    for number, value in shapes.items():
+        parameters[names[number] if parameters else name] = _estimate(
+            value, 's' if effect is None else effect.parameters[number].unit)
+    if name == 'reference_slip':
+        parameters.update({names[1 + number]: Estimate(at, (at, at), 's')
+                           for number, at in enumerate(candidate.shapes[1:])})
+    return parameters
+
+
+def _estimate(value: Value, unit: str) -> Estimate:
+    return Estimate.about(value.value, _DEVIATIONS * value.deviation, unit)
+
+
+def _as_phase(found: FittedValues, place: int, name: str, coefficients: Sequence[Value],
+              unit: str) -> dict[str, Estimate]:
+    """Return amplitude and phase of ``sine sin + cosine cos``, with intervals by covariance."""
+    sine, cosine = (value.value for value in coefficients)
+    amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    ranks = [rank for rank in (found.place(place, number) for number in range(2))
+             if rank is not None]
+    covariance = found.covariance[np.ix_(ranks, ranks)]
+    turn = np.array([[np.cos(phase), np.sin(phase)], [-np.sin(phase), np.cos(phase)]])
+    deviation = np.sqrt(np.diag(turn @ covariance @ turn.T))
+    return {name: _estimate(Value(amplitude, float(deviation[0])), unit),
+            'phase': _estimate(Value(phase, float(deviation[1]) / amplitude), 'rad')}
+
+
+def unexplained(search: Search, found: FittedValues,
+                unnamed: Sequence[Named]) -> list[Unexplained]:
+    """Return the structures without a name, with the part that each explains of what is left."""
+    everything = (*found.named, *unnamed)
+    variables: dict[str, list[int]] = {}
+    for place, known in enumerate(unnamed):
+        name = (CAUSES[known.candidate.cause].along if is_named(known.candidate)
+                else along(known.candidate))
+        variables.setdefault(name, []).append(len(found.named) + place)
+    least, most = _variance(search, found, everything), _variance(search, found, found.named)
+    told = []
+    for name, places in variables.items():
+        without = _variance(search, found, [known for place, known in enumerate(everything)
+                                            if place not in places])
+        chance = min(search.chance.p_value(everything[place].candidate.cause,
+                                           evidence_of(search, everything, place))
+                     for place in places)
+        told.append(Unexplained(name, max(without - least, 0.0) / most, chance))
+    return told
+
+
+def _variance(search: Search, found: FittedValues, named: Sequence[Named]) -> float:
+    """Return the variance of what some causes leave, on the points that are searched."""
+    left = FittedValues(fitted(search.problem, named), found.replays)
+    return float(np.var(np.concatenate([each.on_grid(rest - bias) for each, rest, bias
+                                        in zip(found.replays, left.residuals, left.biases)])))

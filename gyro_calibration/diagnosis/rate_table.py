@@ -35,28 +35,30 @@ from gyro_calibration.calibration.scatter import (
     Whitener,
 )
 from gyro_calibration.calibration.selection import supported_effects, swapped_effects
-from gyro_calibration.diagnosis.build_findings import with_remedies
-from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.causes import CAUSES, with_remedies
 from gyro_calibration.diagnosis.cross_validation import change_over, WINDOW
 from gyro_calibration.diagnosis.data_quality import decided, inspect
-from gyro_calibration.diagnosis.dwell_confounders import alternatives
 from gyro_calibration.diagnosis.dwell_fit import (
+    alternatives,
     assembled,
     change_of,
     doubt,
+    Left,
     model_before,
     name_causes,
     Named,
     NUISANCES,
+    RATE,
     seen,
     simulated,
+    SINGLE_RATES,
     tried,
+    what_is_left,
 )
-from gyro_calibration.diagnosis.dwell_structure import Left, RATE, SINGLE_RATES, what_is_left
 from gyro_calibration.diagnosis.extended_model import notes_of
 from gyro_calibration.diagnosis.findings import Curve, Diagnosis, Estimate, Finding, Gain
-from gyro_calibration.diagnosis.input_validation import refuse
-from gyro_calibration.diagnosis.units import amount
+from gyro_calibration.diagnosis.gates import refuse
+from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
 from gyro_calibration.model.effects import (
     CUBIC_NONLINEARITY,

@@ -18,7 +18,7 @@ from pathlib import Path
 from string import Template
 
 import gyro_calibration
-from gyro_calibration.diagnosis.charts import Chart, draw, Line
+from gyro_calibration.diagnosis.charts import Chart, draw, element, joined, Line, Markup
 from gyro_calibration.diagnosis.findings import (
     Change,
     Curve,
@@ -30,24 +30,27 @@ from gyro_calibration.diagnosis.findings import (
     NoiseCurve,
     Trace,
 )
-from gyro_calibration.diagnosis.markup import element, joined, Markup
-from gyro_calibration.diagnosis.units import amount, for_people, number, quantity, span
 from gyro_calibration.diagnosis.words import (
     alternatives,
+    amount,
     certainty,
     change,
     clean,
+    for_people,
     heading_shares,
     headline,
     hidden,
     listed,
     noise_figures,
+    number,
     offered,
+    quantity,
     remedy,
     sentence,
     shown_by,
     sizes,
     smallest,
+    span,
     spoken,
     unknown,
 )

@@ -33,11 +33,12 @@ from gyro_calibration.diagnosis.candidates import (
     effect,
     FASTEST_LAG,
     fitted_shapes,
+    generic_terms,
+    is_named,
     pulse,
     spacing_of_steps,
     with_shape,
 )
-from gyro_calibration.diagnosis.generic_terms import generic_terms, is_named
 from gyro_calibration.diagnosis.noise_likelihood import (
     drawn,
     evidence,
@@ -48,7 +49,7 @@ from gyro_calibration.diagnosis.noise_likelihood import (
     sample,
     sums,
 )
-from gyro_calibration.diagnosis.regression_problem import (
+from gyro_calibration.diagnosis.regression import (
     Fitted,
     fitted,
     is_of_the_rate,
@@ -59,8 +60,7 @@ from gyro_calibration.diagnosis.regression_problem import (
     with_columns,
     with_one_more,
 )
-from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.diagnosis.spectrum import inverse, transform
+from gyro_calibration.diagnosis.replay import inverse, Replay, transform
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 from scipy.optimize import minimize_scalar

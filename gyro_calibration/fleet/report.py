@@ -15,12 +15,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from gyro_calibration.diagnosis.charts import Chart, draw, Line
+from gyro_calibration.diagnosis.charts import Chart, draw, element, joined, Line, Markup
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.markup import element, joined, Markup
 from gyro_calibration.diagnosis.report import page
-from gyro_calibration.diagnosis.units import amount, for_people, quantity
-from gyro_calibration.diagnosis.words import sentence, spoken
+from gyro_calibration.diagnosis.words import amount, for_people, quantity, sentence, spoken
 from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
 from gyro_calibration.fleet.summary import Found, sentences, TypeFound
 from gyro_calibration.logs.log import Array

@@ -19,8 +19,7 @@ import math
 from typing import Any
 
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.units import amount, quantity
-from gyro_calibration.diagnosis.words import listed, spoken
+from gyro_calibration.diagnosis.words import amount, listed, quantity, spoken
 from gyro_calibration.files import plain
 from gyro_calibration.fleet.outliers import Change, changes, Outlier, outliers
 from gyro_calibration.fleet.pooling import (

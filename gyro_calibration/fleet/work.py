@@ -26,7 +26,7 @@ from gyro_calibration.calibration.dwells import dwells
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.input_validation import rests
+from gyro_calibration.diagnosis.gates import rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report

@@ -11,8 +11,7 @@
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
 from gyro_calibration.diagnosis.curves import curves, what_is_left
-from gyro_calibration.diagnosis.fitted_values import FittedValues
-from gyro_calibration.diagnosis.regression_problem import fitted, regression_problem
+from gyro_calibration.diagnosis.regression import fitted, FittedValues, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.noise import Noise, simulate_noise

@@ -16,12 +16,15 @@ import os
 import re
 
 from gyro_calibration.diagnosis.data_quality import encoder_step, inspect, LEVEL, update_interval
-from gyro_calibration.diagnosis.expected_output import compare
-from gyro_calibration.diagnosis.input_validation import refuse, rests
+from gyro_calibration.diagnosis.expected_output import (
+    compare,
+    FACTORS,
+    unit_of_offset,
+    unit_of_scale,
+)
+from gyro_calibration.diagnosis.gates import refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.quantization import codes_of
-from gyro_calibration.diagnosis.repeated_samples import repeated_samples
-from gyro_calibration.diagnosis.unit_confusion import FACTORS, unit_of_offset, unit_of_scale
+from gyro_calibration.diagnosis.samples import codes_of, repeated_samples
 from gyro_calibration.logs.log import COLUMNS, DataRefused, DEGREE, Log, read_log
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR

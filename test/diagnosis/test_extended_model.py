@@ -15,9 +15,8 @@ from dataclasses import replace
 from diagnosed import log_of
 from gyro_calibration.diagnosis.candidates import effect
 from gyro_calibration.diagnosis.extended_model import calibrated, extended, left_out
-from gyro_calibration.diagnosis.fitted_values import FittedValues
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression_problem import fitted, Named, regression_problem
+from gyro_calibration.diagnosis.regression import fitted, FittedValues, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.words import headline, is_inside

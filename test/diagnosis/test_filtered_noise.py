@@ -15,7 +15,7 @@ from dataclasses import replace
 from diagnosed import described as told
 from diagnosed import log_of, model_of
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression_problem import filtered, fitted, regression_problem
+from gyro_calibration.diagnosis.regression import filtered, fitted, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import QUANTIZATION

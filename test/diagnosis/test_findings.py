@@ -23,7 +23,7 @@ import re
 import shlex
 
 from gyro_calibration.diagnosis.findings import Estimate
-from gyro_calibration.diagnosis.units import amount, quantity
+from gyro_calibration.diagnosis.words import amount, quantity
 import pytest
 
 TEXT = (Path(__file__).parents[2] / 'docs/findings.md').read_text()

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.diagnosis.data_quality import inspect
-from gyro_calibration.diagnosis.input_validation import MOST_ROWS, prepared, refuse, rests
+from gyro_calibration.diagnosis.gates import MOST_ROWS, prepared, refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log

@@ -13,8 +13,8 @@
 from dataclasses import replace
 
 from diagnosed import judged, log_of
+from gyro_calibration.diagnosis.data_quality import limits, reference_of
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.reference import limits, reference_of
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DEGREE, Log

@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from gyro_calibration.diagnosis.input_validation import refuse
+from gyro_calibration.diagnosis.gates import refuse
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import Log

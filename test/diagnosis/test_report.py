@@ -34,8 +34,7 @@ from gyro_calibration.diagnosis.findings import (
     Unexplained,
 )
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.diagnosis.units import chance, for_people, quantity
-from gyro_calibration.diagnosis.words import headline, lines
+from gyro_calibration.diagnosis.words import chance, for_people, headline, lines, quantity
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.gyro_model import GyroModel, Term

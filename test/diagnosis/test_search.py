@@ -20,11 +20,12 @@ from gyro_calibration.diagnosis.candidates import (
     columns_of,
     effect,
     fitted_shapes,
+    generic_terms,
+    is_named,
     with_shape,
 )
-from gyro_calibration.diagnosis.generic_terms import generic_terms, is_named
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.regression_problem import fitted, Named, regression_problem
+from gyro_calibration.diagnosis.regression import fitted, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin, evidence_of, searched
 from gyro_calibration.logs.log import Log

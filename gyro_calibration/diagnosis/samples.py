@@ -1,0 +1,687 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+What is wrong with single samples of an output.
+
+Codes: the values of a digital output, their step, the dead band about zero, and the limit.
+Repeated samples: the last value once more, beyond the repeats that coarse codes explain. Outliers:
+samples far from their neighbours, and not because the gyro moves.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+
+from gyro_calibration.diagnosis.expected_output import bridged, Compared
+from gyro_calibration.logs.log import Array, Mask
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.ndimage import maximum_filter1d
+from scipy.special import ndtr
+
+#: Values closer than this, relative to the largest, are one: a change of units rounds them.
+_SAME = 1e-12
+#: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
+_ALIGNED = 0.7
+#: Quantiles of the gaps between codes where the step is looked for: where codes are left out, only
+#: few gaps are as small.
+_STARTS = (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)
+#: Codes on each side that a step is found among before it is carried further.
+_SOME = 8
+#: The count of the extreme code is compared with that of so many next to it, or of those within
+#: this part of the white noise.
+_NEIGHBOURS, _WITHIN = 4, 0.05
+#: Codes finer than this part of the white noise hardly ever repeat by chance.
+_FINE = 0.1
+#: A code that is reached in so many separate runs is none that was stuck.
+_SEPARATE = 3
+#: An output below this part of the fastest is that of a rest: no limit is as low, and a dead band
+#: is about a rest.
+_REST = 0.1
+#: Values of as many digits have steps of as many parts of them, up to this factor.
+_DIGIT = 10.0
+#: A dead band keeps other codes away by more than so many steps.
+_AWAY = 1.5
+#: What is expected so many standard deviations beyond a dead band may well be in it.
+_EDGE = 2.0
+
+
+@dataclass(frozen=True)
+class Codes:
+    """
+    The values that occur, in order, and how often: arrays of shape (m,).
+
+    Attributes
+    ----------
+    step : between neighbouring codes; 0 where there is no such step
+    aligned : how well the codes lie on it, 0 to 1
+    deviation : standard deviation of the step
+
+    """
+
+    values: Array
+    counts: Array
+    step: float = 0.0
+    aligned: float = 0.0
+    deviation: float = 0.0
+
+
+def codes_of(values: Array) -> Codes:
+    """Return the codes of values without nan: the coarsest lattice, up to rounding in print."""
+    found, counts = np.unique(values, return_counts=True)
+    apart = np.concatenate([[True], np.diff(found) > _SAME * np.abs(found[[0, -1]]).max()])
+    first = np.flatnonzero(apart)
+    codes = Codes(found[first], np.add.reduceat(counts, first))
+    gaps = np.diff(codes.values)
+    if not gaps.size:
+        return codes
+    for start in sorted({float(gap) for gap in np.quantile(gaps, _STARTS)}, reverse=True):
+        step, aligned, deviation = _lattice(codes, start)
+        if aligned > _ALIGNED:
+            return Codes(codes.values, codes.counts, step, aligned, deviation)
+    return codes
+
+
+def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
+    """Refine a step from near to far codes; return it, the alignment, and its deviation."""
+    gaps = np.diff(codes.values)
+    near = gaps < 8.5 * step
+    step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
+    place, span = _about_the_densest(codes.values)
+    reach, deviation = span / step + 0.5, 0.0
+    while True:
+        within = np.abs(place) < reach * step
+        aligned, offset = _alignment(place[within], codes.counts[within], step)
+        if aligned < _ALIGNED:
+            return step, aligned, deviation
+        number = np.rint((place[within] - offset) / step)
+        if np.ptp(number) > 0.0:
+            step, deviation = _slope(number, place[within])
+        if within.all():
+            return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
+        reach *= 4.0
+
+
+def _about_the_densest(values: Array) -> tuple[Array, float]:
+    """Return how far values are from the densest place, and a first reach that gives the step."""
+    width = min(2 * _SOME, len(values) - 1)
+    span = values[width:] - values[:-width]
+    first = int(np.argmin(span))
+    return values - values[first + width // 2], float(span[first])
+
+
+def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
+    """
+    Return the length of the mean phase of places on a lattice, and the shift of the lattice.
+
+    The place that occurs most is left out: beside a value that comes at every rest, all others
+    would count for nothing.
+
+    """
+    counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
+              if len(counts) > 1 else counts)
+    mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
+    return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
+
+
+def _slope(number: Array, place: Array) -> tuple[float, float]:
+    """Return the slope of places over whole numbers, without outliers, and its deviation."""
+    slope, off, spread = _line(number, place)
+    good = np.abs(off) <= 0.3 * abs(slope)
+    if np.ptp(number[good]) > 0.0:
+        slope, off, spread = _line(number[good], place[good])
+    return slope, float(np.std(off) / spread)
+
+
+def _line(number: Array, place: Array) -> tuple[float, Array, float]:
+    """Return a slope, the residuals of places, and the root of the sum of squares of numbers."""
+    centred, apart = number - number.mean(), place - place.mean()
+    squares = float(centred @ centred)
+    slope = float(centred @ apart) / squares
+    return slope, apart - slope * centred, float(np.sqrt(squares))
+
+
+def steps_about(codes: Codes, output: Array) -> Array:
+    """
+    Return the most that codes about each value may be apart, shape (n,).
+
+    Steps grow with the values in floats of 32 bits, and in what is printed with so many digits; or
+    they are too fine to be seen. They are no larger than the smallest gap between values as large
+    or larger, and than is usual for the digits of the finest.
+
+    """
+    steps = np.full(len(output), max(codes.step, float(np.diff(codes.values).min())
+                                     if len(codes.values) > 1 else 1.0))
+    sides = {sign: np.sort(sign * codes.values[sign * codes.values >= 0.0])
+             for sign in (1.0, -1.0)}
+    finest = min(float((np.diff(sizes) / sizes[1:]).min(initial=np.inf))
+                 for sizes in sides.values())
+    for sign, sizes in sides.items():
+        if len(sizes) > 1:
+            side = sign * output >= 0.0
+            closest = np.minimum.accumulate(np.diff(sizes)[::-1])[::-1]
+            place = np.minimum(np.searchsorted(sizes, sign * output[side]), len(closest) - 1)
+            steps[side] = np.maximum(
+                steps[side], np.minimum(closest[place], _DIGIT * finest * np.abs(output[side])))
+    return steps
+
+
+@dataclass(frozen=True)
+class DeadBand:
+    """
+    A value that comes again and again, while those near it never do.
+
+    Attributes
+    ----------
+    value : rad/s
+    half : how far others keep away from it, rad/s
+
+    """
+
+    value: float
+    half: float
+
+    def holds(self, output: Array) -> Mask:
+        """Mark the samples in it."""
+        return np.abs(output - self.value) < 0.5 * self.half
+
+    def chances(self, seen: Compared) -> Array:
+        """Return the chance of each sample to be in it, by its expected output, or by a rest."""
+        rest = (np.full(len(seen.output), np.median(seen.output)) if seen.expected is None
+                else seen.expected)
+        off, doubt = np.nan_to_num(rest - self.value), max(doubt_of(seen), 1e-9 * self.half)
+        reach = self.half + _EDGE * doubt
+        return ndtr((reach - off) / doubt) - ndtr((-reach - off) / doubt)
+
+
+def dead_band(codes: Codes, output: Array) -> DeadBand | None:
+    """Return the dead band of an output, or None where it shows none."""
+    counts = np.where(np.abs(codes.values) < _slow(output), codes.counts, 0)
+    place = int(np.argmax(counts))
+    away = np.abs(np.delete(codes.values, place) - codes.values[place])
+    band = DeadBand(float(codes.values[place]), float(away.min(initial=np.inf)))
+    runs = np.count_nonzero(np.diff(band.holds(output), prepend=False, append=False)) // 2
+    return band if counts[place] > 1 and runs > 1 and band.half > _AWAY * codes.step else None
+
+
+def _slow(output: Array) -> float:
+    """Return below which size an output is that of a rest; a wild one is not the fastest."""
+    return _REST * float(np.quantile(np.abs(output), 0.99))
+
+
+def doubt_of(seen: Compared) -> float:
+    """Return the deviation of samples from the expected output, rad/s: noise and nonlinearity."""
+    return seen.white if seen.expected is None else max(seen.white, seen.scatter)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """
+    Codes that the output cannot go beyond.
+
+    Attributes
+    ----------
+    low, high : the limit on each side, infinite where there is none
+    p_value : the chance that an output without one repeats its extreme codes as often
+
+    """
+
+    low: float
+    high: float
+    p_value: float
+
+    @property
+    def size(self) -> float:
+        """Return the limit as a rate without sign."""
+        return min(-self.low, self.high)
+
+    def reached(self, output: Array) -> Mask:
+        """Mark the samples at the limit."""
+        slack = 1e-9 * self.size
+        return (output >= self.high - slack) | (output <= self.low + slack)
+
+
+def limit_of(codes: Codes, seen: Compared, level: float) -> Limit | None:
+    """
+    Return the limit of an output, or None where it shows none.
+
+    An extreme code is one if it is beyond what comes at rests; if it stands more often than its
+    neighbours further in, where an output that is free to go beyond has fewer; and if the output
+    would have gone beyond by what is expected of it, which a coarse code at a constant rate would
+    not.
+
+    Parameters
+    ----------
+    codes : of the output
+    seen : output and expectation
+    level : chance of a false alarm on one side
+
+    """
+    chances = {}
+    for sign in (1.0, -1.0):
+        values, counts = ((codes.values, codes.counts) if sign > 0.0
+                          else (-codes.values[::-1], codes.counts[::-1]))
+        chance = _chance(values, counts, float(steps_about(codes, sign * values[-1:])[0]),
+                         seen.white)
+        if (chance < level and values[-1] > _slow(seen.output)
+                and _held_back(seen, sign, values[-1], codes.step)):
+            chances[sign] = (sign * values[-1], chance)
+    if not chances:
+        return None
+    return Limit(chances.get(-1.0, (-np.inf, 1.0))[0], chances.get(1.0, (np.inf, 1.0))[0],
+                 min(chance for _, chance in chances.values()))
+
+
+def _chance(values: Array, counts: Array, step: float, white: float) -> float:
+    """Return the chance of as many samples at the last code, if the density falls towards it."""
+    reach = max(_NEIGHBOURS * step, _WITHIN * white)
+    neighbours = min(reach / step, 1e6)
+    before = int(counts[:-1][values[:-1] > values[-1] - reach - 0.5 * step].sum())
+    return float(stats.binom.sf(counts[-1] - 2, counts[-1] - 1 + before, 1.0 / (neighbours + 1.0)))
+
+
+def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
+    """Tell whether samples at the largest value in one sense would have gone beyond it."""
+    at = sign * seen.output >= top - 1e-9 * abs(top)
+    runs = int(np.count_nonzero(np.diff(at.astype(np.int8), prepend=0) > 0))
+    fine = step < _FINE * seen.white
+    beyond = (np.array([]) if seen.expected is None
+              else sign * seen.expected[at & np.isfinite(seen.expected)] - top)
+    if not beyond.size:
+        return fine and runs >= _SEPARATE
+    middle = float(np.median(beyond))
+    # The expected output errs by bias wander and nonlinearity, which these samples share.
+    doubt = doubt_of(seen)
+    return (middle > 0.5 * step + 2.0 * doubt
+            or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt)))
+
+
+#: Motions that are told apart, by the change that is expected from one sample to the next.
+_CLASSES = 8
+#: From this share of repeats on, single ones of so coarse an output mean nothing; runs may.
+_COARSE = 0.3
+#: Single repeats are believed to be stuck where honest ones are as rare as this.
+_RARE = 0.02
+#: Excess of repeats over the honest ones, as a part of these, below which their number is not
+#: known well enough.
+_EXCESS = 0.5
+#: A run is like others up to so many times the longest of them.
+_ALIKE = 2.0
+#: A code that is narrower than this part of the noise is a point.
+_NARROW = 1e-5
+
+
+@dataclass(frozen=True)
+class RepeatedSamples:
+    """
+    Samples that repeat the one before.
+
+    Attributes
+    ----------
+    repeats : those that are not honest, shape (n,)
+    honest : how many repeats the codes and the noise explain
+    p_value : the chance of as many, or of runs as long
+
+    """
+
+    repeats: Mask
+    honest: float
+    p_value: float
+
+    @property
+    def runs(self) -> int:
+        """Return how often it stuck."""
+        return len(_lengths(self.repeats))
+
+    def has_one_more(self, at_limit: Mask) -> bool:
+        """Tell whether samples at a limit are one run like the others: an extreme value stuck."""
+        lengths = _lengths(at_limit)
+        return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * _lengths(self.repeats).max()
+
+
+@dataclass(frozen=True)
+class _Honest:
+    """
+    What codes and noise explain of each change, arrays of shape (n - 1,).
+
+    Attributes
+    ----------
+    chance : of it to be none
+    again : the most that this is within a run of repeats
+    width : of the code that it begins in, rad/s
+
+    """
+
+    chance: Array
+    again: Array
+    width: Array
+
+
+def _lengths(marked: Mask) -> NDArray[np.int_]:
+    """Return the lengths of the runs of marked samples."""
+    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
+    return edges[1::2] - edges[::2]
+
+
+def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
+                     level: float) -> RepeatedSamples | None:
+    """
+    Find samples that are stuck, or return None.
+
+    Parameters
+    ----------
+    seen : output and expectation
+    codes : of the output
+    band : of rates that the output has one value for, if it has one
+    good : samples to look at; those at a limit repeat honestly
+    level : chance of a false alarm
+
+    """
+    looked, change = good[1:] & good[:-1], np.diff(seen.output)
+    same, expected = (change == 0.0) & looked, _expected_change(seen.expected, len(change))
+    if not same.any():
+        return None
+    honest = _in_the_band(
+        _honest(change, expected, steps_about(codes, seen.output[:-1]), looked), band, seen)
+    repeats, p_value = np.zeros(len(good), dtype=bool), 1.0
+    rare = (honest.chance < _COARSE) & looked
+    excess, believed = int(np.count_nonzero(same & rare)), float(honest.chance[rare].sum())
+    by_number = (float(stats.poisson.sf(excess - 1, believed))
+                 if excess > believed * (1.0 + _EXCESS) else 1.0)
+    if by_number < level:
+        repeats[1:], p_value = same & (honest.chance < _RARE), by_number
+    for start, stop, unlikely in _runs(same, honest, expected, doubt_of(seen)):
+        if unlikely * len(good) < level:
+            repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
+    return (RepeatedSamples(repeats, float(honest.chance[looked].sum()), p_value)
+            if repeats.any() else None)
+
+
+def _expected_change(expected: Array | None, count: int) -> Array:
+    return np.zeros(count) if expected is None else np.nan_to_num(np.diff(expected))
+
+
+def _honest(change: Array, expected: Array, step: Array, looked: Mask) -> _Honest:
+    """
+    Return what codes and noise explain of each change.
+
+    The chance is the part of a code that the sample before leaves for this one, averaged over the
+    noise, among changes that are expected alike. The longer a run is, the likelier its code is the
+    one in whose middle the expectation lies; so within it that code counts.
+
+    """
+    chances, again = np.ones((2, len(change)))
+    edges = np.quantile(np.abs(expected), np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1])
+    classes = np.searchsorted(edges, np.abs(expected), side='left')
+    for each in np.unique(classes):
+        members = np.flatnonzero((classes == each) & looked)
+        if len(members):
+            due, steps = expected[members], step[members]
+            deviation = _deviation_of_changes(change[members] - due, change[members] == 0.0,
+                                              float(np.median(steps)))
+            chances[members] = np.maximum(_same_code(due, deviation, steps),
+                                          _share_of_neighbours(change[members], steps))
+            again[members] = np.maximum(_middle_code(due, deviation, steps), chances[members])
+    return _Honest(chances, again, step)
+
+
+def _in_the_band(honest: _Honest, band: DeadBand | None, seen: Compared) -> _Honest:
+    """Return the same, where a sample in a dead band repeats while the next is due in it."""
+    if band is None:
+        return honest
+    within, chances = band.holds(seen.output[:-1]), band.chances(seen)[1:]
+    chance, again = (np.where(within, np.maximum(each, chances), each)
+                     for each in (honest.chance, honest.again))
+    return _Honest(chance, again, np.where(within, 2.0 * band.half, honest.width))
+
+
+def _share_of_neighbours(change: Array, step: Array) -> float:
+    """Return an upper bound of the share of changes by one code or two, each way."""
+    size = np.abs(change)
+    count = np.count_nonzero((size > 0.5 * step) & (size < 2.5 * step))
+    return float((count + 2.0 * np.sqrt(count)) / 4.0 / len(change))
+
+
+def _deviation_of_changes(change: Array, same: Mask, step: float) -> float:
+    """Return the standard deviation of changes by noise; zeros count as those due."""
+    moved = np.abs(change[~same])
+    if len(moved) < 2:
+        return 0.0
+    moved = np.minimum(moved, 4.0 * np.median(moved))
+    square = float(np.mean(moved ** 2))
+    variance = square
+    for _ in range(20):
+        variance = square * (1.0 - float(_same_code(np.zeros(1), np.sqrt(variance),
+                                                    np.array([step]))[0]))
+    return float(np.sqrt(variance))
+
+
+def _same_code(expected: Array, deviation: float, step: Array) -> Array:
+    """Return the mean of max(0, 1 - |D| / step) for normal D: the chance of the same code."""
+    scale = np.maximum(deviation, 1e-9 * step)
+    low, middle, high = ((edge - expected) / scale for edge in (-step, 0.0, step))
+    above, below = ndtr(high) - ndtr(middle), ndtr(middle) - ndtr(low)
+    sizes = (expected * (above - below)
+             + scale * (2.0 * _density(middle) - _density(high) - _density(low)))
+    # Differences of nearly nothing are rounding.
+    return np.where(step < _NARROW * scale, step / scale * _density(middle),
+                    np.clip(above + below - sizes / step, 0.0, 1.0))
+
+
+def _middle_code(expected: Array, deviation: float, step: Array) -> Array:
+    """Return the chance of the code in the middle between two expectations, for each sample."""
+    scale = np.maximum(deviation / math.sqrt(2.0), 1e-9 * step)
+    return ndtr(0.5 * (step - expected) / scale) - ndtr(-0.5 * (step + expected) / scale)
+
+
+def _density(values: Array) -> Array:
+    return np.exp(-0.5 * values ** 2) / math.sqrt(2.0 * math.pi)
+
+
+def _runs(same: Mask, honest: _Honest, expected: Array,
+          doubt: float) -> Iterator[tuple[int, int, float]]:
+    """Give where runs of at least two repeats begin and end, and how unlikely each is."""
+    edges: NDArray[np.intp] = np.flatnonzero(
+        np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+    starts, stops = edges[::2], edges[1::2]
+    product, due = (np.concatenate([[0.0], np.cumsum(each)])
+                    for each in (np.log(np.maximum(honest.again, 1e-12)), expected))
+    for start, stop in zip(starts[stops - starts >= 2].tolist(),
+                           stops[stops - starts >= 2].tolist()):
+        if honest.chance[start:stop].max() < _COARSE:
+            yield start, stop, float(np.exp(max(product[stop] - product[start], -700.0)))
+        else:
+            # Repeats of a coarse code depend on each other: stuck only if it should have left.
+            left = abs(due[stop] - due[start]) - honest.width[start]
+            yield start, stop, (float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * doubt)))
+                                if left > 0.0 else 1.0)
+
+
+#: An outlier is beyond so many standard deviations, or more where so many samples reach that by
+#: chance.
+_WILD = 6.0
+#: Samples on each side that one is compared with.
+SIDE = 3
+#: Samples by which a reference may tell of a jolt sooner or later.
+_SOON = 10
+#: Samples in which the scatter is taken to be the same.
+_BLOCK = 256
+#: Kinds of motion that are told apart, by how much the expectation changes about a sample.
+_KINDS = 16
+#: Shares of the farthest samples at which the scatter is measured, for the tail of rough motion.
+_TAILS = (0.05, 0.01)
+#: So many side by side are no single samples any more.
+_LONGEST = 2
+#: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on it.
+_DUE_TO_MOTION = 0.85
+#: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
+_FEW, _BY_CHANCE = 3, 1e-3
+#: From here to wild there must be half as many samples as wild ones at most, in standard
+#: deviations: else they are a tail of the noise.
+_NEAR = 4.5
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """
+    Samples that are wild.
+
+    Attributes
+    ----------
+    samples : shape (n,)
+    largest : in standard deviations
+    p_value : the chance of as many among Gaussian ones
+
+    """
+
+    samples: Mask
+    largest: float
+    p_value: float
+
+
+def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> Outliers | None:
+    """
+    Find wild samples, or return None.
+
+    Parameters
+    ----------
+    seen : output and expectation
+    good : samples that count; beside three and more of six that do not, as after a stuck run, one
+        is not judged
+    floor : the scatter is at least this, rad/s: half a code
+    level : chance of a false alarm
+
+    """
+    output, expected = bridged(np.where(good, seen.output, np.nan)), _known(seen)
+    limit = max(_WILD, float(stats.norm.isf(0.25 * level / len(output))))
+    moved = np.zeros(len(output)) if expected is None else _moved(expected)
+    far = _far(output, moved, good, floor)
+    if expected is not None:
+        beside = _far(output - expected, moved, good, floor)
+        far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
+    judged = good & (np.count_nonzero(_neighbours(~good, SIDE), axis=1) < SIDE)
+    wild = _single((far > limit) & judged)
+    count, near = (int(np.count_nonzero(wild)),
+                   int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
+    if (not count or near > 0.5 * count + stats.poisson.isf(
+            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _due_to_motion(wild, moved, seen)):
+        return None
+    p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
+    return Outliers(wild, float(far[wild].max()), p_value) if p_value < level else None
+
+
+def _neighbours(values: Array | Mask, side: int) -> Array:
+    """Return the samples before and after each one, shape (n, 2 side)."""
+    # Turned over about the first and last sample, a slope goes on as it is. These two are what
+    # the samples beside them say, as one that is an outlier would agree with itself.
+    if len(values) > SIDE + 1 and values.dtype != bool:
+        ends = [np.median([part[0], 2.0 * part[1] - part[2], 2.0 * part[2] - part[4]])
+                for part in (values, values[::-1])]
+        values = np.concatenate([ends[:1], values[1:-1], ends[1:]])
+    window = sliding_window_view(np.pad(values, side, mode='reflect', reflect_type='odd'),
+                                 2 * side + 1)
+    return np.delete(window, side, axis=1)
+
+
+def _known(seen: Compared) -> Array | None:
+    return (None if seen.expected is None or not np.isfinite(seen.expected).any()
+            else bridged(seen.expected))
+
+
+def _moved(expected: Array) -> Array:
+    """Return how much the output is expected to change about each sample, shape (n,)."""
+    window = sliding_window_view(np.pad(expected, 2 * SIDE, mode='edge'), 4 * SIDE + 1)
+    return np.ptp(window, axis=1)
+
+
+def _off(values: Array) -> Array:
+    """Return how far each sample is from the median of its neighbours."""
+    return np.abs(values - np.median(_neighbours(values, SIDE), axis=1))
+
+
+def _explained(output: Array, expected: Array) -> Mask:
+    """Mark samples near which the reference jumps half as much: a jolt, or it is wild itself."""
+    jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
+    return jumps > 0.5 * np.minimum(_off(output), _off(output - expected))
+
+
+def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
+    """Return distances from neighbours, in standard deviations about here and in such motion."""
+    near = _neighbours(values, SIDE)
+    off = np.abs(values - np.median(near, axis=1))
+    # A step, a corner or a steep slope leaves the median, but not what its neighbours span.
+    outside = np.maximum(values - near.max(axis=1), near.min(axis=1) - values)
+    scale = np.maximum(np.maximum(_about_here(off, good), _in_such_motion(off, moved, good)),
+                       max(floor, 1e-300))
+    return np.where(outside > 0.5 * off, off / scale, 0.0)
+
+
+def _about_here(off: Array, good: Mask) -> Array:
+    """Return the robust standard deviation in blocks, the largest of those next to a sample."""
+    blocks = max(1, len(off) // _BLOCK)
+    scales = np.array([_robust(part[kept]) for part, kept in zip(np.array_split(off, blocks),
+                                                                 np.array_split(good, blocks))])
+    edged = np.pad(scales, 1, mode='edge')
+    scales = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
+    return np.repeat(scales, [len(part) for part in np.array_split(off, blocks)])
+
+
+def _robust(off: Array) -> float:
+    return float(np.quantile(off, 0.6827)) if off.size else 0.0
+
+
+def _in_such_motion(off: Array, moved: Array, good: Mask) -> Array:
+    """Return the standard deviation among samples of like motion, by far ones too if enough."""
+    edges = (np.unique(np.quantile(moved[good], np.linspace(0.0, 1.0, _KINDS + 1)[1:-1]))
+             if good.any() else np.array([]))
+    kinds = np.searchsorted(edges, moved, side='left')
+    scales = np.zeros(len(edges) + 1)
+    for kind in range(len(scales)):
+        members = off[(kinds == kind) & good]
+        if members.size:
+            tails = [np.quantile(members, 1.0 - share) / stats.norm.isf(0.5 * share)
+                     for share in _TAILS if share * members.size > 5]
+            scales[kind] = max([_robust(members), *tails])
+    return scales[kinds]
+
+
+def _single(wild: Mask) -> Mask:
+    """Leave out those with more wild ones at their side than single samples have."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wild.astype(np.int8), [0]])))
+    single = np.zeros(len(wild), dtype=bool)
+    for start, stop in zip(edges[::2], edges[1::2]):
+        single[start:stop] = stop - start <= _LONGEST
+    return single
+
+
+def _due_to_motion(wild: Mask, moved: Array, seen: Compared) -> bool:
+    """Tell whether wild samples stand where motion changes most, or at certain rates."""
+    if np.count_nonzero(wild) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
+        return False
+    ranks = _ranks(moved[wild], moved)
+    by_chance = 0.5 + stats.norm.isf(_BY_CHANCE) / np.sqrt(12.0 * len(ranks))
+    if ranks.mean() > max(_DUE_TO_MOTION, by_chance):
+        return True
+    turning = (moved > 3.0 * seen.white) & np.isfinite(seen.expected)
+    if np.count_nonzero(wild & turning) < _FEW:
+        return False
+    speeds = np.abs(seen.expected)
+    return bool(stats.kstest(_ranks(speeds[wild & turning], speeds[turning]),
+                             'uniform').pvalue < _BY_CHANCE)
+
+
+def _ranks(values: Array, among: Array) -> Array:
+    return np.searchsorted(np.sort(among), values) / len(among)
