@@ -17,8 +17,9 @@ from collections.abc import Callable, Iterator, Sequence
 from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.regression import Fitted, FittedValues
-from gyro_calibration.diagnosis.replay import Replay, transform, white_deviation
+from gyro_calibration.diagnosis.replay import Replay, transform
 from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +114,7 @@ def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
             BINS, each.points).astype(float)
         within = np.maximum(held.sum(axis=1) - (held ** 2).sum(axis=1) / each.every, 0.0)
         total += (transform(held) ** 2 @ variance
-                  + white_deviation(residual[each.kept]) ** 2 * within)
+                  + white_noise(residual[each.kept]) ** 2 * within)
     return total
 
 

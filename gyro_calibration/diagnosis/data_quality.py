@@ -14,7 +14,8 @@ DataQuality: what is wrong with a record before any gyro is blamed.
 It is reported, and what it touches is not used; nothing of it is fitted.
 
 A log without any of it brings a finding here in at most one case of a thousand: each of the five
-that chance could make (lost, stuck and wild samples, a limit on two sides) has a level of 2e-4.
+that chance could make (lost and repeated samples, outliers, a limit on two sides) has a level of
+2e-4.
 Steps of codes and units need no chance, but a size that matters.
 
 """
@@ -39,7 +40,6 @@ from gyro_calibration.diagnosis.expected_output import (
     reference_rate,
     scale_of,
     unit_of_scale,
-    white_noise,
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Reference
 from gyro_calibration.diagnosis.gates import evened, prepared
@@ -56,6 +56,7 @@ from gyro_calibration.diagnosis.samples import (
     SIDE,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
+from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
@@ -117,16 +118,28 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     output, rate = output_of(log), reference_rate(evened(log))
     known = np.isfinite(output)
     line = None if rate is None else line_between(log.time, rate, output)
-    unit = ([] if rate is None or line is None
-            else list(_unit(line, 1.0 if model is None else scale_of(model, rate))))
-    factor = 1.0 / FACTORS[unit[0][0]] if unit else 1.0
-    found = DataQuality(tuple(finding for _, finding in unit), said, known, factor)
+    factor, units = 1.0, []
+    if rate is not None and line is not None:
+        # a factor beside the scale that a model has
+        own = 1.0 if model is None else scale_of(model, rate)
+        ratio, deviation = line.factor / own, line.deviation / abs(own)
+        name = unit_of_scale(ratio, deviation)
+        if name is not None:
+            factor = 1.0 / FACTORS[name]
+            units = [finding(
+                'unit_error', ratio, (ratio - 1.96 * deviation, ratio + 1.96 * deviation),
+                float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
+                f'the output is {ratio:.5g} +- {deviation:.2g} times what the reference says, and '
+                f'{name} is {FACTORS[name]:.5g}',
+                () if is_far(ratio) else ('scale_factor_error',))]
+    found = DataQuality(tuple(units), said, known, factor)
     if log.time is None:
         return found
     found = _of_stamps(found, log, known)
     found = _of_reference(found, log)
-    return _of_samples(found, output * factor, rate,
-                       None if line is None else _mended(line, factor), model, known, log)
+    line = None if line is None else Line(line.factor * factor, line.offset * factor,
+                                          line.deviation * abs(factor))
+    return _of_samples(found, output * factor, rate, line, model, known, log)
 
 
 def decided(clean: DataQuality) -> DataQuality:
@@ -145,10 +158,6 @@ def decided(clean: DataQuality) -> DataQuality:
                    remarks=(*clean.remarks, said))
 
 
-def _mended(line: Line, factor: float) -> Line:
-    return Line(line.factor * factor, line.offset * factor, line.deviation * abs(factor))
-
-
 def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str,
             confounders: tuple[str, ...] = ()) -> Finding:
     """Return a finding of a cause with one parameter."""
@@ -164,21 +173,6 @@ def _counted(name: str, count: int, p_value: float, evidence: str) -> Finding:
     return finding(name, float(count), (float(count), float(count)), p_value, evidence)
 
 
-def _unit(line: Line, own: float) -> Iterator[tuple[str, Finding]]:
-    """Give the confusion of units, if the factor is one beside the scale that a model has."""
-    factor, deviation = line.factor / own, line.deviation / abs(own)
-    name = unit_of_scale(factor, deviation)
-    if name is None:
-        return
-    confounders = () if is_far(factor) else ('scale_factor_error',)
-    chance = float(2.0 * stats.norm.sf(abs(factor - 1.0) / max(deviation, 1e-300)))
-    said = (f'the output is {factor:.5g} +- {deviation:.2g} times what the reference says, and '
-            f'{name} is {FACTORS[name]:.5g}')
-    yield name, finding('unit_error', factor,
-                        (factor - 1.96 * deviation, factor + 1.96 * deviation),
-                        chance, said, confounders)
-
-
 def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     """Look at the clock: lost samples are a finding; jitter, bursts and pace are remarks."""
     assert log.time is not None
@@ -189,36 +183,32 @@ def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     except DataRefused as refused:
         return replace(found, remarks=(*found.remarks, *remarks,
                                        f'Lost samples cannot be counted: {refused}.'))
-    said = (*found.remarks, *remarks, *stamps.said_of_bursts, *_said_of_pace(stamps))
-    return replace(found, findings=(*found.findings, *_dropped(stamps)), remarks=said)
-
-
-def _dropped(stamps: Stamps) -> Iterator[Finding]:
+    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.said_of_bursts,
+                                    *_remarks_of_pace(stamps)))
     lost, steps = stamps.lost, np.diff(stamps.time)
     if not lost.any():
-        return
-    jitter = 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) + 1e-9 * stamps.interval
+        return found
+    jitter = robust_deviation(steps - np.median(steps)) + 1e-9 * stamps.interval
     late = (lost.max() - 0.5) * stamps.interval / jitter
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
-    if chance < LEVEL:
-        yield _counted('dropped_samples', int(lost.sum()), chance,
-                       stamps.said_of_lost[0].rstrip('.'))
+    return found if chance >= LEVEL else replace(found, findings=(*found.findings, _counted(
+        'dropped_samples', int(lost.sum()), chance, stamps.said_of_lost[0].rstrip('.'))))
 
 
-def _said_of_pace(stamps: Stamps) -> Iterator[str]:
+def _remarks_of_pace(stamps: Stamps) -> Iterator[str]:
     """Say if the interval differs between the ends of the log beyond what jitter makes of it."""
     number = np.arange(len(stamps.time)) + np.concatenate([[0], np.cumsum(stamps.lost)])
     third = len(number) // 3
     if third < 30:
         return
-    paces, doubts = [], []
+    paces, deviations = [], []
     for part in (slice(0, third), slice(-third, None)):
         line = np.polyfit(number[part], stamps.time[part] - stamps.time[part][0], 1)
         off = np.std(stamps.time[part] - stamps.time[part][0] - np.polyval(line, number[part]))
         paces.append(line[0])
-        doubts.append(off / np.ptp(number[part]))
+        deviations.append(off / np.ptp(number[part]))
     change = paces[1] / paces[0] - 1.0
-    if abs(change) > max(1e-5, 6.0 * np.hypot(*doubts) / stamps.interval):
+    if abs(change) > max(1e-5, 6.0 * np.hypot(*deviations) / stamps.interval):
         yield (f'The interval of the samples changes by {1e6 * change:+.0f} ppm from the first to '
                'the last third of the log.')
 
@@ -264,7 +254,7 @@ def update_interval(time: Array, values: Array, step: float) -> float | None:
 
 def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Line | None,
                 model: GyroModel | None, known: Mask, log: Log) -> DataQuality:
-    """Look at the samples of the gyro: their codes, their limit, stuck and wild ones."""
+    """Look at the samples of the gyro: codes, limit, repeats and outliers."""
     codes, seen = codes_of(output[known]), compare(output, rate, line)
     limit = limit_of(codes, seen, LEVEL)
     at_limit = np.zeros(len(output), dtype=bool) if limit is None else limit.reached(seen.output)
@@ -275,17 +265,16 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
         stuck = repeated_samples(seen, codes, band, good, LEVEL)
     good = good if stuck is None else good & ~stuck.repeats
     # Samples beside those that a dead band holds are the tail of the noise that gets out of it.
-    wild = outlying_samples(seen, good if band is None else good & ~binary_dilation(
+    outlying = outlying_samples(seen, good if band is None else good & ~binary_dilation(
         band.holds(seen.output), iterations=SIDE), 0.5 * codes.step, LEVEL)
-    good = good if wild is None else good & ~wild.samples
+    good = good if outlying is None else good & ~outlying.samples
     free = np.ones(len(output), dtype=bool)
     if limit is not None and seen.expected is not None:
         # what no limit cuts, by what is expected, for the noise of the samples would bias it
         near = _NEAR_LIMIT * max(seen.white, seen.scatter)
         free = ~((seen.expected > limit.high - near) | (seen.expected < limit.low + near))
     findings = (*found.findings, *_of_codes(codes, seen, limit, at_limit, model),
-                *_of_single_samples(stuck, wild, log),
-                *_rounded(found.heading_step, log, seen.white))
+                *_of_single_samples(stuck, outlying, log, found.heading_step, seen.white))
     matters = codes.step >= STEP * seen.white
     return replace(found, findings=findings, trusted=good & free,
                    limit=None if limit is None else limit.size,
@@ -318,37 +307,33 @@ def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
                       f'have the extreme code {" or ".join(sides)}')
 
 
-def _of_single_samples(stuck: RepeatedSamples | None, wild: Outliers | None,
-                       log: Log) -> Iterator[Finding]:
-    """Give repeated samples and outliers, with their number and the stamp of the first."""
+def _of_single_samples(stuck: RepeatedSamples | None, outlying: Outliers | None, log: Log,
+                       step: float, white: float) -> Iterator[Finding]:
+    """Give repeated samples and outliers, and the step of the reference if it adds variance."""
     assert log.time is not None
     if stuck is not None:
         count = int(np.count_nonzero(stuck.repeats))
         first = log.time[int(np.argmax(stuck.repeats))]
         yield _counted('stuck_samples', count, stuck.p_value,
                        f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
-                       f'{first:.3f} s; codes and noise explain {stuck.honest:.2g} repeats in the '
-                       'whole log')
-    if wild is not None:
-        count = int(np.count_nonzero(wild.samples))
-        first = log.time[int(np.argmax(wild.samples))]
-        yield _counted('outliers', count, wild.p_value,
-                       f'{count} single samples are up to {wild.largest:.0f} standard deviations '
-                       f'off their neighbours, the first at {first:.3f} s')
-
-
-def _rounded(step: float, log: Log, white: float) -> Iterator[Finding]:
-    """Give the step of the reference heading as a finding, if it adds to the variance left."""
-    assert log.time is not None
+                       f'{first:.3f} s; codes and noise explain {stuck.explained:.2g} repeats in '
+                       'the whole log')
+    if outlying is not None:
+        count = int(np.count_nonzero(outlying.samples))
+        first = log.time[int(np.argmax(outlying.samples))]
+        yield _counted('outliers', count, outlying.p_value,
+                       f'{count} single samples are up to {outlying.largest:.0f} standard '
+                       f'deviations off their neighbours, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
-    share = step ** 2 / 6.0 / (interval * white) ** 2 if white else np.inf * step
-    if step and share > REFERENCE_STEP:
+    if step and (not white or step ** 2 / 6.0 / (interval * white) ** 2 > REFERENCE_STEP):
         yield finding('reference_quantization', step, (step, step), 0.0,
                       f'the reference heading comes in steps of {step / DEGREE:.4g} deg: its rate '
                       'over one sample is uncertain by '
                       f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
                       f'{white / DEGREE:.3g} deg/s of noise')
 
+
+# the kind of the reference
 
 KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro', 'rest')
 #: Kinds that tell a heading, with errors that are not those of a rate.
@@ -372,18 +357,20 @@ _SEEN, _QUIETEST, _BLOCK = 3.0, 0.3, 25
 _STRAIGHT = 0.1
 
 
-def reference_of(log: Log, told: str | None = None) -> Reference:
-    """Return the kind of the reference of a log: as told, or as the log shows it."""
-    if told is not None:
-        return Reference(told, 'as told')
+def reference_of(log: Log, given: str | None = None) -> Reference:
+    """Return the kind of the reference of a log: as given, or as the log shows it."""
+    if given is not None:
+        return Reference(given, 'as given')
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
         return Reference('rate_command', 'the log has a reference rate')
     heading = log.reference_heading
     if heading is None or not np.isfinite(heading).any():
         return Reference('rest', 'the log has no reference')
-    if where_lost(np.isfinite(heading)).any() and _error_ratio(log) > (
-        _LARGER_OF_FIXES if _between_fixes(heading) else _LARGER
-    ):
+    # a heading between slower fixes lies on straight lines
+    usual, large = (np.nanquantile(np.abs(np.diff(heading, 2)), [0.9, 0.99])
+                    if np.isfinite(np.diff(heading, 2)).any() else (0.0, 0.0))
+    larger = _LARGER_OF_FIXES if usual < _STRAIGHT * large else _LARGER
+    if where_lost(np.isfinite(heading)).any() and _error_ratio(log) > larger:
         return Reference(
             'course',
             'the heading is lost at times, as a course is at low speed, and '
@@ -394,27 +381,21 @@ def reference_of(log: Log, told: str | None = None) -> Reference:
     return Reference('motion_capture', 'the heading has no steps')
 
 
-def _between_fixes(heading: Array) -> bool:
-    """Tell whether a heading lies on straight lines between fixes that come more slowly."""
-    change = np.abs(np.diff(heading, 2))
-    change = change[np.isfinite(change)]
-    if not len(change):
-        return False
-    usual, large = np.quantile(change, [0.9, 0.99])
-    return bool(usual < _STRAIGHT * large)
-
-
 def limits(log: Log, reference: Reference) -> bool:
     """Tell whether the errors of a reference, not those of the gyro, limit what a log shows."""
     if log.time is None or reference.kind == 'rest':
         return False
     if reference.kind == 'rate_command' or log.reference_heading is None:
         return log.reference_rate is not None and rate_noise_share(log) > _NOISY
-    if reference.kind == 'course' or reference.known == 'as told':
+    if reference.kind == 'course' or reference.known == 'as given':
         return True
     if reference.kind == 'encoder' and encoder_step(log.reference_heading) < _FINE:
         return False
-    return _heading_noise(log) > _BLURRED
+    # the white noise of the heading over what the gyro walks in a second
+    assert log.output is not None
+    gyro = white_noise(log.output) * math.sqrt(float(np.median(np.diff(log.time))))
+    left = log.reference_heading - integral_of(log.time, bridged(log.output))
+    return gyro > 0.0 and white_noise(left) > _BLURRED * gyro
 
 
 def rate_noise_share(log: Log) -> float:
@@ -451,15 +432,6 @@ def rate_noise_share(log: Log) -> float:
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
 
 
-def _heading_noise(log: Log) -> float:
-    """Return the white noise of a reference heading over what the gyro wanders in a second."""
-    assert log.time is not None and log.output is not None and log.reference_heading is not None
-    interval = float(np.median(np.diff(log.time)))
-    gyro = white_noise(log.output) * math.sqrt(interval)
-    left = log.reference_heading - integral_of(log.time, bridged(log.output))
-    return white_noise(left) / gyro if gyro > 0.0 else 0.0
-
-
 def _error_ratio(log: Log) -> float:
     """Return how much a reference heading errs over a span, in units of the noise of the gyro."""
     assert log.time is not None and log.output is not None and log.reference_heading is not None
@@ -470,5 +442,5 @@ def _error_ratio(log: Log) -> float:
     walk = white_noise(log.output) * math.sqrt(interval)
     if not np.isfinite(change).any() or not walk > 0.0:
         return 0.0
-    size = 1.4826 * float(np.nanmedian(np.abs(change)))
+    size = robust_deviation(change[np.isfinite(change)])
     return size / (walk * math.sqrt(2.0 * _SPAN))

@@ -21,7 +21,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.logs.log import Array, Log, Mask
+from gyro_calibration.logs.log import Array, Log
+from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 from scipy import stats
@@ -62,7 +63,14 @@ def unit_of_scale(factor: float, deviation: float) -> str | None:
     deviation : its standard deviation
 
     """
-    close = [name for name, value in FACTORS.items() if _is(factor, deviation, value)]
+    close = []
+    for name, value in FACTORS.items():
+        # far from 1 there is nothing else that it could be
+        least, known = (_CLOSE, _KNOWN) if is_far(value) else (1e-4, _WELL_KNOWN)
+        if (abs(factor - value) < max(2.0 * deviation, least * abs(value))
+                and abs(factor / value - 1.0) < _CLOSE
+                and deviation < known * min(abs(value - 1.0), abs(value))):
+            close.append(name)
     if close:
         return min(close, key=lambda name: abs(factor - FACTORS[name]))
     far = [name for name, value in _CONFUSED.items() if _ratio(factor, value) < _OF_A_GYRO]
@@ -72,14 +80,6 @@ def unit_of_scale(factor: float, deviation: float) -> str | None:
 def is_far(factor: float) -> bool:
     """Tell whether no gyro of the right unit has such a factor."""
     return _ratio(factor, 1.0) > 1.4
-
-
-def _is(factor: float, deviation: float, value: float) -> bool:
-    least = _CLOSE if is_far(value) else 1e-4  # far from 1 there is nothing else that it could be
-    near = (abs(factor - value) < max(2.0 * deviation, least * abs(value))
-            and abs(factor / value - 1.0) < _CLOSE)
-    return near and deviation < (_KNOWN if is_far(value) else _WELL_KNOWN) * min(
-        abs(value - 1.0), abs(value))
 
 
 def _ratio(factor: float, value: float) -> float:
@@ -169,15 +169,6 @@ def integral_of(time: Array, rate: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
 
 
-def white_noise(values: Array) -> float:
-    """Return the standard deviation of the white part of a signal, by third differences."""
-    off = np.abs(np.diff(values, 3))
-    off = off[np.isfinite(off)]
-    # Not by the median: an output of few codes has differences of zero mostly.
-    return (float(np.quantile(off, 0.9)) / (stats.norm.isf(0.05) * math.sqrt(20.0))
-            if off.size else math.inf)
-
-
 def reference_rate(log: Log) -> Array | None:
     """Return the rate by the reference, rad/s, nan where it was lost; None without reference."""
     if log.reference_rate is not None and np.isfinite(log.reference_rate).any():
@@ -201,7 +192,13 @@ def line_between(time: Array | None, rate: Array, output: Array) -> Line | None:
         return None
     rate, output = rate[known], output[known]
     if time is not None:
-        rate, output = _block_means(time[known], rate, output)
+        whole, stamps = (rate, output), time[known]
+        for length in _BLOCKS:
+            number = np.floor((stamps - stamps[0]) / length)
+            block = np.cumsum(np.diff(number, prepend=number[0]) > 0.0)
+            rate, output = (np.bincount(block, each) / np.bincount(block) for each in whole)
+            if np.std(rate) > 0.8 * np.std(whole[0]):
+                break
     return _line(rate, output) if len(rate) >= 8 else None
 
 
@@ -216,42 +213,24 @@ def scale_of(model: GyroModel, rate: Array) -> float:
     return (forth - back) / (2.0 * speed)
 
 
-def _block_means(time: Array, rate: Array, output: Array) -> tuple[Array, Array]:
-    means = rate, output
-    for length in _BLOCKS:
-        number = np.floor((time - time[0]) / length)
-        block = np.cumsum(np.diff(number, prepend=number[0]) > 0.0)
-        count = np.bincount(block)
-        means = np.bincount(block, rate) / count, np.bincount(block, output) / count
-        if np.std(means[0]) > 0.8 * np.std(rate):
-            break
-    return means
-
-
 def _line(rate: Array, output: Array) -> Line | None:
-    good = _within(rate, output)
+    low, high = output.min(), output.max()
+    # away from the ends, where they may be cut; all if nearly all are there
+    good = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
+    if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.3 * np.ptp(rate):
+        good = np.ones(len(rate), dtype=bool)
     for _ in range(_FITS):
         if np.count_nonzero(good) < 8 or not np.ptp(rate[good]) > 0.0:
             return None
         columns = np.column_stack([rate, np.ones(len(rate))])
         solution = np.linalg.lstsq(columns[good], output[good], rcond=None)[0]
         off = output - columns @ solution
-        good = np.abs(off) <= 5.0 * 1.4826 * np.median(np.abs(off)) + 1e-15
-    return Line(float(solution[0]), float(solution[1]), _scatter(columns[good], off[good]))
-
-
-def _within(rate: Array, output: Array) -> Mask:
-    """Mark outputs away from the ends, where they may be cut; all if nearly all are there."""
-    low, high = output.min(), output.max()
-    within = (output > low + _ENDS * (high - low)) & (output < high - _ENDS * (high - low))
-    enough = np.count_nonzero(within) >= 8 and np.ptp(rate[within]) > 0.3 * np.ptp(rate)
-    return within if enough else np.ones(len(rate), dtype=bool)
-
-
-def _scatter(columns: Array, off: Array) -> float:
-    """Return the standard deviation of the slope, by up to 20 parts, for the noise has colour."""
+        good = np.abs(off) <= 5.0 * robust_deviation(off) + 1e-15
+    # the standard deviation by up to 20 parts, for the noise has colour
+    columns, off = columns[good], off[good]
     pieces = np.minimum(np.arange(len(off)) * min(20, len(off) // 2) // len(off), 19)
     scores = np.array([np.bincount(pieces, column * off) for column in columns.T])
     inverse = np.linalg.pinv(columns.T @ columns)
     student = stats.t.ppf(0.975, scores.shape[1] - 1) / stats.norm.ppf(0.975)
-    return float(student * math.sqrt((inverse @ scores @ scores.T @ inverse)[0, 0]))
+    deviation = student * math.sqrt((inverse @ scores @ scores.T @ inverse)[0, 0])
+    return Line(float(solution[0]), float(solution[1]), float(deviation))

@@ -35,11 +35,11 @@ from gyro_calibration.diagnosis.expected_output import (
     reference_rate,
     scale_of,
     unit_of_scale,
-    white_noise,
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
 from gyro_calibration.diagnosis.samples import codes_of
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 

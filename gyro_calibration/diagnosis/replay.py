@@ -28,6 +28,7 @@ import math
 from gyro_calibration.diagnosis.expected_output import integral_of
 from gyro_calibration.diagnosis.gates import evened, FEWEST, prepared
 from gyro_calibration.logs.log import Array, DataRefused, Log, Mask
+from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import Channels
@@ -272,7 +273,7 @@ class Replay:
 
     def noisy(self, values: Array) -> Array:
         """Return the cosine transform of a residual; bridges get the white noise of the rest."""
-        return transform(self.on_grid(values, white_deviation(values[self.kept])))
+        return transform(self.on_grid(values, white_noise(values[self.kept])))
 
     def coefficients(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -287,17 +288,11 @@ class Replay:
         whole = transform(self.filling) * np.sqrt(
             level(angles(len(self.filling)) * self.every, more))
         filling = inverse(whole)
-        return replace(self, levels=self.levels * more, filling=filling / white_deviation(filling))
+        return replace(self, levels=self.levels * more, filling=filling / white_noise(filling))
 
     def with_rate(self, rate: Array) -> Replay:
         """Return it with another rate that the effects look at."""
         return replace(self, channels=replace(self.channels, rate=rate))
-
-
-def white_deviation(residual: Array) -> float:
-    """Return the standard deviation of a residual's white noise, by median second differences."""
-    return (1.4826 * float(np.median(np.abs(np.diff(residual, 2)))) / math.sqrt(6.0)
-            if len(residual) > 2 else 0.0)
 
 
 def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: float | None = None,
@@ -533,7 +528,7 @@ def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
 
     """
     bend = np.abs(np.diff(rate, 2, prepend=rate[:1], append=rate[-1:])) / 12.0
-    white = white_deviation((output - rate)[kept])
+    white = white_noise((output - rate)[kept])
     sharp = maximum_filter1d(bend > _BENT * white + 0.5 * rounding, 5)
     rounded = rounding ** 2 / 12.0 > 0.5 * white ** 2  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded or sharp[kept].mean() > _FEW_CORNERS else sharp

@@ -19,15 +19,14 @@ samples far from their neighbours, and not because the gyro moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
 from gyro_calibration.diagnosis.expected_output import bridged, Compared
 from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.logs.quality import runs
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtr
@@ -36,7 +35,7 @@ from scipy.special import ndtr
 _SAME = 1e-12
 #: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
 _ALIGNED = 0.7
-#: Quantiles of the gaps between codes where the step is looked for: where codes are left out, only
+#: Quantiles of the gaps between codes where the step is known for: where codes are left out, only
 #: few gaps are as small.
 _STARTS = (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)
 #: Codes on each side that a step is found among before it is carried further.
@@ -86,9 +85,8 @@ def codes_of(values: Array) -> Codes:
     first = np.flatnonzero(apart)
     codes = Codes(found[first], np.add.reduceat(counts, first))
     gaps = np.diff(codes.values)
-    if not gaps.size:
-        return codes
-    for start in sorted({float(gap) for gap in np.quantile(gaps, _STARTS)}, reverse=True):
+    starts = set(np.quantile(gaps, _STARTS).tolist()) if gaps.size else ()
+    for start in sorted(starts, reverse=True):
         step, aligned, deviation = _lattice(codes, start)
         if aligned > _ALIGNED:
             return Codes(codes.values, codes.counts, step, aligned, deviation)
@@ -100,7 +98,11 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
     gaps = np.diff(codes.values)
     near = gaps < 8.5 * step
     step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
-    place, span = _about_the_densest(codes.values)
+    # about the densest place
+    width = min(2 * _SOME, len(codes.values) - 1)
+    spans = codes.values[width:] - codes.values[:-width]
+    first = int(np.argmin(spans))
+    place, span = codes.values - codes.values[first + width // 2], float(spans[first])
     reach, deviation = span / step + 0.5, 0.0
     while True:
         within = np.abs(place) < reach * step
@@ -109,18 +111,14 @@ def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
             return step, aligned, deviation
         number = np.rint((place[within] - offset) / step)
         if np.ptp(number) > 0.0:
-            step, deviation = _slope(number, place[within])
+            step, off, spread = _line(number, place[within])
+            good = np.abs(off) <= 0.3 * abs(step)
+            if np.ptp(number[good]) > 0.0:
+                step, off, spread = _line(number[good], place[within][good])
+            deviation = float(np.std(off) / spread)
         if within.all():
             return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
         reach *= 4.0
-
-
-def _about_the_densest(values: Array) -> tuple[Array, float]:
-    """Return how far values are from the densest place, and a first reach that gives the step."""
-    width = min(2 * _SOME, len(values) - 1)
-    span = values[width:] - values[:-width]
-    first = int(np.argmin(span))
-    return values - values[first + width // 2], float(span[first])
 
 
 def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
@@ -135,15 +133,6 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
               if len(counts) > 1 else counts)
     mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
     return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
-
-
-def _slope(number: Array, place: Array) -> tuple[float, float]:
-    """Return the slope of places over whole numbers, without outliers, and its deviation."""
-    slope, off, spread = _line(number, place)
-    good = np.abs(off) <= 0.3 * abs(slope)
-    if np.ptp(number[good]) > 0.0:
-        slope, off, spread = _line(number[good], place[good])
-    return slope, float(np.std(off) / spread)
 
 
 def _line(number: Array, place: Array) -> tuple[float, Array, float]:
@@ -202,9 +191,10 @@ class DeadBand:
         """Return the chance of each sample to be in it, by its expected output, or by a rest."""
         rest = (np.full(len(seen.output), np.median(seen.output)) if seen.expected is None
                 else seen.expected)
-        off, doubt = np.nan_to_num(rest - self.value), max(doubt_of(seen), 1e-9 * self.half)
-        reach = self.half + _EDGE * doubt
-        return ndtr((reach - off) / doubt) - ndtr((-reach - off) / doubt)
+        off = np.nan_to_num(rest - self.value)
+        deviation = max(deviation_of(seen), 1e-9 * self.half)
+        reach = self.half + _EDGE * deviation
+        return ndtr((reach - off) / deviation) - ndtr((-reach - off) / deviation)
 
 
 def dead_band(codes: Codes, output: Array) -> DeadBand | None:
@@ -218,11 +208,11 @@ def dead_band(codes: Codes, output: Array) -> DeadBand | None:
 
 
 def _slow(output: Array) -> float:
-    """Return below which size an output is that of a rest; a wild one is not the fastest."""
+    """Return below which size an output is that of a rest; an outlier is not the fastest."""
     return _REST * float(np.quantile(np.abs(output), 0.99))
 
 
-def doubt_of(seen: Compared) -> float:
+def deviation_of(seen: Compared) -> float:
     """Return the deviation of samples from the expected output, rad/s: noise and nonlinearity."""
     return seen.white if seen.expected is None else max(seen.white, seen.scatter)
 
@@ -304,18 +294,18 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
         return fine and runs >= _SEPARATE
     middle = float(np.median(beyond))
     # The expected output errs by bias wander and nonlinearity, which these samples share.
-    doubt = doubt_of(seen)
-    return (middle > 0.5 * step + 2.0 * doubt
-            or (fine and (runs >= _SEPARATE or middle > -3.0 * doubt)))
+    deviation = deviation_of(seen)
+    return (middle > 0.5 * step + 2.0 * deviation
+            or (fine and (runs >= _SEPARATE or middle > -3.0 * deviation)))
 
 
 #: Motions that are told apart, by the change that is expected from one sample to the next.
 _CLASSES = 8
 #: From this share of repeats on, single ones of so coarse an output mean nothing; runs may.
 _COARSE = 0.3
-#: Single repeats are believed to be stuck where honest ones are as rare as this.
+#: Single repeats are believed to be stuck where explained ones are as rare as this.
 _RARE = 0.02
-#: Excess of repeats over the honest ones, as a part of these, below which their number is not
+#: Excess of repeats over the explained ones, as a part of these, below which their number is not
 #: known well enough.
 _EXCESS = 0.5
 #: A run is like others up to so many times the longest of them.
@@ -331,29 +321,30 @@ class RepeatedSamples:
 
     Attributes
     ----------
-    repeats : those that are not honest, shape (n,)
-    honest : how many repeats the codes and the noise explain
+    repeats : those that are not explained, shape (n,)
+    explained : how many repeats the codes and the noise explain
     p_value : the chance of as many, or of runs as long
 
     """
 
     repeats: Mask
-    honest: float
+    explained: float
     p_value: float
 
     @property
     def runs(self) -> int:
         """Return how often it stuck."""
-        return len(_lengths(self.repeats))
+        return len(runs(self.repeats))
 
     def has_one_more(self, at_limit: Mask) -> bool:
         """Tell whether samples at a limit are one run like the others: an extreme value stuck."""
-        lengths = _lengths(at_limit)
-        return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * _lengths(self.repeats).max()
+        lengths, usual = ([run.stop - run.start for run in runs(each)]
+                          for each in (at_limit, self.repeats))
+        return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * max(usual)
 
 
 @dataclass(frozen=True)
-class _Honest:
+class _Explained:
     """
     What codes and noise explain of each change, arrays of shape (n - 1,).
 
@@ -370,12 +361,6 @@ class _Honest:
     width: Array
 
 
-def _lengths(marked: Mask) -> NDArray[np.int_]:
-    """Return the lengths of the runs of marked samples."""
-    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
-    return edges[1::2] - edges[::2]
-
-
 def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
                      level: float) -> RepeatedSamples | None:
     """
@@ -386,35 +371,46 @@ def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: 
     seen : output and expectation
     codes : of the output
     band : of rates that the output has one value for, if it has one
-    good : samples to look at; those at a limit repeat honestly
+    good : samples to look at; the codes explain repeats at a limit
     level : chance of a false alarm
 
     """
-    looked, change = good[1:] & good[:-1], np.diff(seen.output)
-    same, expected = (change == 0.0) & looked, _expected_change(seen.expected, len(change))
+    known, change = good[1:] & good[:-1], np.diff(seen.output)
+    same = (change == 0.0) & known
+    expected = (np.zeros(len(change)) if seen.expected is None
+                else np.nan_to_num(np.diff(seen.expected)))
     if not same.any():
         return None
-    honest = _in_the_band(
-        _honest(change, expected, steps_about(codes, seen.output[:-1]), looked), band, seen)
+    explained = _explained_repeats(change, expected, steps_about(codes, seen.output[:-1]), known)
+    if band is not None:  # a sample in it repeats while the next is due in it
+        within, chances = band.holds(seen.output[:-1]), band.chances(seen)[1:]
+        chance, again = (np.where(within, np.maximum(each, chances), each)
+                         for each in (explained.chance, explained.again))
+        explained = _Explained(chance, again, np.where(within, 2.0 * band.half, explained.width))
     repeats, p_value = np.zeros(len(good), dtype=bool), 1.0
-    rare = (honest.chance < _COARSE) & looked
-    excess, believed = int(np.count_nonzero(same & rare)), float(honest.chance[rare].sum())
+    rare = (explained.chance < _COARSE) & known
+    excess, believed = int(np.count_nonzero(same & rare)), float(explained.chance[rare].sum())
     by_number = (float(stats.poisson.sf(excess - 1, believed))
                  if excess > believed * (1.0 + _EXCESS) else 1.0)
     if by_number < level:
-        repeats[1:], p_value = same & (honest.chance < _RARE), by_number
-    for start, stop, unlikely in _runs(same, honest, expected, doubt_of(seen)):
+        repeats[1:], p_value = same & (explained.chance < _RARE), by_number
+    product, due = (np.concatenate([[0.0], np.cumsum(each)])
+                    for each in (np.log(np.maximum(explained.again, 1e-12)), expected))
+    for start, stop in ((run.start, run.stop) for run in runs(same) if run.stop - run.start > 1):
+        if explained.chance[start:stop].max() < _COARSE:
+            unlikely = math.exp(max(product[stop] - product[start], -700.0))
+        else:
+            # Repeats of a coarse code depend on each other: stuck only if it should have left.
+            left = abs(due[stop] - due[start]) - explained.width[start]
+            unlikely = (float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * deviation_of(seen))))
+                        if left > 0.0 else 1.0)
         if unlikely * len(good) < level:
             repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
-    return (RepeatedSamples(repeats, float(honest.chance[looked].sum()), p_value)
+    return (RepeatedSamples(repeats, float(explained.chance[known].sum()), p_value)
             if repeats.any() else None)
 
 
-def _expected_change(expected: Array | None, count: int) -> Array:
-    return np.zeros(count) if expected is None else np.nan_to_num(np.diff(expected))
-
-
-def _honest(change: Array, expected: Array, step: Array, looked: Mask) -> _Honest:
+def _explained_repeats(change: Array, expected: Array, step: Array, known: Mask) -> _Explained:
     """
     Return what codes and noise explain of each change.
 
@@ -427,32 +423,21 @@ def _honest(change: Array, expected: Array, step: Array, looked: Mask) -> _Hones
     edges = np.quantile(np.abs(expected), np.linspace(0.0, 1.0, _CLASSES + 1)[1:-1])
     classes = np.searchsorted(edges, np.abs(expected), side='left')
     for each in np.unique(classes):
-        members = np.flatnonzero((classes == each) & looked)
+        members = np.flatnonzero((classes == each) & known)
         if len(members):
             due, steps = expected[members], step[members]
             deviation = _deviation_of_changes(change[members] - due, change[members] == 0.0,
                                               float(np.median(steps)))
+            # no less than an upper bound of the share of changes by one code or two, each way
+            size = np.abs(change[members])
+            count = np.count_nonzero((size > 0.5 * steps) & (size < 2.5 * steps))
             chances[members] = np.maximum(_same_code(due, deviation, steps),
-                                          _share_of_neighbours(change[members], steps))
-            again[members] = np.maximum(_middle_code(due, deviation, steps), chances[members])
-    return _Honest(chances, again, step)
-
-
-def _in_the_band(honest: _Honest, band: DeadBand | None, seen: Compared) -> _Honest:
-    """Return the same, where a sample in a dead band repeats while the next is due in it."""
-    if band is None:
-        return honest
-    within, chances = band.holds(seen.output[:-1]), band.chances(seen)[1:]
-    chance, again = (np.where(within, np.maximum(each, chances), each)
-                     for each in (honest.chance, honest.again))
-    return _Honest(chance, again, np.where(within, 2.0 * band.half, honest.width))
-
-
-def _share_of_neighbours(change: Array, step: Array) -> float:
-    """Return an upper bound of the share of changes by one code or two, each way."""
-    size = np.abs(change)
-    count = np.count_nonzero((size > 0.5 * step) & (size < 2.5 * step))
-    return float((count + 2.0 * np.sqrt(count)) / 4.0 / len(change))
+                                          (count + 2.0 * np.sqrt(count)) / 4.0 / len(size))
+            # that of the code in the middle between two expectations
+            scale = np.maximum(deviation / math.sqrt(2.0), 1e-9 * steps)
+            again[members] = np.maximum(ndtr(0.5 * (steps - due) / scale)
+                                        - ndtr(-0.5 * (steps + due) / scale), chances[members])
+    return _Explained(chances, again, step)
 
 
 def _deviation_of_changes(change: Array, same: Mask, step: float) -> float:
@@ -481,38 +466,13 @@ def _same_code(expected: Array, deviation: float, step: Array) -> Array:
                     np.clip(above + below - sizes / step, 0.0, 1.0))
 
 
-def _middle_code(expected: Array, deviation: float, step: Array) -> Array:
-    """Return the chance of the code in the middle between two expectations, for each sample."""
-    scale = np.maximum(deviation / math.sqrt(2.0), 1e-9 * step)
-    return ndtr(0.5 * (step - expected) / scale) - ndtr(-0.5 * (step + expected) / scale)
-
-
 def _density(values: Array) -> Array:
     return np.exp(-0.5 * values ** 2) / math.sqrt(2.0 * math.pi)
 
 
-def _runs(same: Mask, honest: _Honest, expected: Array,
-          doubt: float) -> Iterator[tuple[int, int, float]]:
-    """Give where runs of at least two repeats begin and end, and how unlikely each is."""
-    edges: NDArray[np.intp] = np.flatnonzero(
-        np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
-    starts, stops = edges[::2], edges[1::2]
-    product, due = (np.concatenate([[0.0], np.cumsum(each)])
-                    for each in (np.log(np.maximum(honest.again, 1e-12)), expected))
-    for start, stop in zip(starts[stops - starts >= 2].tolist(),
-                           stops[stops - starts >= 2].tolist()):
-        if honest.chance[start:stop].max() < _COARSE:
-            yield start, stop, float(np.exp(max(product[stop] - product[start], -700.0)))
-        else:
-            # Repeats of a coarse code depend on each other: stuck only if it should have left.
-            left = abs(due[stop] - due[start]) - honest.width[start]
-            yield start, stop, (float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * doubt)))
-                                if left > 0.0 else 1.0)
-
-
 #: An outlier is beyond so many standard deviations, or more where so many samples reach that by
 #: chance.
-_WILD = 6.0
+_FAR = 6.0
 #: Samples on each side that one is compared with.
 SIDE = 3
 #: Samples by which a reference may tell of a jolt sooner or later.
@@ -525,11 +485,11 @@ _KINDS = 16
 _TAILS = (0.05, 0.01)
 #: So many side by side are no single samples any more.
 _LONGEST = 2
-#: Mean rank among all samples, by the motion about them, from which on wild ones are blamed on it.
+#: Mean rank among all samples, by the motion about them, from which on outliers are due to it.
 _DUE_TO_MOTION = 0.85
-#: Fewer wild samples than this show no habit; one that they would have by such a chance is none.
+#: Fewer outliers than this show no pattern; one that they have by this chance is none.
 _FEW, _BY_CHANCE = 3, 1e-3
-#: From here to wild there must be half as many samples as wild ones at most, in standard
+#: From here to the limit there are half as many samples as outliers at most, in standard
 #: deviations: else they are a tail of the noise.
 _NEAR = 4.5
 
@@ -537,7 +497,7 @@ _NEAR = 4.5
 @dataclass(frozen=True)
 class Outliers:
     """
-    Samples that are wild.
+    Single samples far from their neighbours.
 
     Attributes
     ----------
@@ -554,7 +514,7 @@ class Outliers:
 
 def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> Outliers | None:
     """
-    Find wild samples, or return None.
+    Find outliers, or return None.
 
     Parameters
     ----------
@@ -565,22 +525,29 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     level : chance of a false alarm
 
     """
-    output, expected = bridged(np.where(good, seen.output, np.nan)), _known(seen)
-    limit = max(_WILD, float(stats.norm.isf(0.25 * level / len(output))))
-    moved = np.zeros(len(output)) if expected is None else _moved(expected)
+    output = bridged(np.where(good, seen.output, np.nan))
+    expected = (None if seen.expected is None or not np.isfinite(seen.expected).any()
+                else bridged(seen.expected))
+    limit = max(_FAR, float(stats.norm.isf(0.25 * level / len(output))))
+    # how much the output is expected to change about each sample
+    moved = np.zeros(len(output)) if expected is None else np.ptp(sliding_window_view(
+        np.pad(expected, 2 * SIDE, mode='edge'), 4 * SIDE + 1), axis=1)
     far = _far(output, moved, good, floor)
     if expected is not None:
-        beside = _far(output - expected, moved, good, floor)
-        far = np.where(_explained(output, expected), 0.0, np.maximum(far, beside))
+        far = np.maximum(far, _far(output - expected, moved, good, floor))
+        # near a jump of the reference of half the size: a jolt, or the reference is outlying
+        jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
+        far[jumps > 0.5 * np.minimum(_off(output), _off(output - expected))] = 0.0
     judged = good & (np.count_nonzero(_neighbours(~good, SIDE), axis=1) < SIDE)
-    wild = _single((far > limit) & judged)
-    count, near = (int(np.count_nonzero(wild)),
+    outlying = _single((far > limit) & judged)
+    count, near = (int(np.count_nonzero(outlying)),
                    int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
     if (not count or near > 0.5 * count + stats.poisson.isf(
-            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR)) or _due_to_motion(wild, moved, seen)):
+            0.01, 2.0 * len(output) * stats.norm.sf(_NEAR))
+            or _due_to_motion(outlying, moved, seen)):
         return None
     p_value = float(stats.poisson.sf(count - 1, 4.0 * len(output) * stats.norm.sf(limit)))
-    return Outliers(wild, float(far[wild].max()), p_value) if p_value < level else None
+    return Outliers(outlying, float(far[outlying].max()), p_value) if p_value < level else None
 
 
 def _neighbours(values: Array | Mask, side: int) -> Array:
@@ -596,26 +563,9 @@ def _neighbours(values: Array | Mask, side: int) -> Array:
     return np.delete(window, side, axis=1)
 
 
-def _known(seen: Compared) -> Array | None:
-    return (None if seen.expected is None or not np.isfinite(seen.expected).any()
-            else bridged(seen.expected))
-
-
-def _moved(expected: Array) -> Array:
-    """Return how much the output is expected to change about each sample, shape (n,)."""
-    window = sliding_window_view(np.pad(expected, 2 * SIDE, mode='edge'), 4 * SIDE + 1)
-    return np.ptp(window, axis=1)
-
-
 def _off(values: Array) -> Array:
     """Return how far each sample is from the median of its neighbours."""
     return np.abs(values - np.median(_neighbours(values, SIDE), axis=1))
-
-
-def _explained(output: Array, expected: Array) -> Mask:
-    """Mark samples near which the reference jumps half as much: a jolt, or it is wild itself."""
-    jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
-    return jumps > 0.5 * np.minimum(_off(output), _off(output - expected))
 
 
 def _far(values: Array, moved: Array, good: Mask, floor: float) -> Array:
@@ -658,28 +608,27 @@ def _in_such_motion(off: Array, moved: Array, good: Mask) -> Array:
     return scales[kinds]
 
 
-def _single(wild: Mask) -> Mask:
-    """Leave out those with more wild ones at their side than single samples have."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], wild.astype(np.int8), [0]])))
-    single = np.zeros(len(wild), dtype=bool)
-    for start, stop in zip(edges[::2], edges[1::2]):
-        single[start:stop] = stop - start <= _LONGEST
+def _single(outlying: Mask) -> Mask:
+    """Leave out those with more outlying ones at their side than single samples have."""
+    single = np.zeros(len(outlying), dtype=bool)
+    for run in runs(outlying):
+        single[run] = run.stop - run.start <= _LONGEST
     return single
 
 
-def _due_to_motion(wild: Mask, moved: Array, seen: Compared) -> bool:
-    """Tell whether wild samples stand where motion changes most, or at certain rates."""
-    if np.count_nonzero(wild) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
+def _due_to_motion(outlying: Mask, moved: Array, seen: Compared) -> bool:
+    """Tell whether outlying samples stand where motion changes most, or at certain rates."""
+    if np.count_nonzero(outlying) < _FEW or seen.expected is None or not np.ptp(moved) > 0.0:
         return False
-    ranks = _ranks(moved[wild], moved)
+    ranks = _ranks(moved[outlying], moved)
     by_chance = 0.5 + stats.norm.isf(_BY_CHANCE) / np.sqrt(12.0 * len(ranks))
     if ranks.mean() > max(_DUE_TO_MOTION, by_chance):
         return True
     turning = (moved > 3.0 * seen.white) & np.isfinite(seen.expected)
-    if np.count_nonzero(wild & turning) < _FEW:
+    if np.count_nonzero(outlying & turning) < _FEW:
         return False
     speeds = np.abs(seen.expected)
-    return bool(stats.kstest(_ranks(speeds[wild & turning], speeds[turning]),
+    return bool(stats.kstest(_ranks(speeds[outlying & turning], speeds[turning]),
                              'uniform').pvalue < _BY_CHANCE)
 
 

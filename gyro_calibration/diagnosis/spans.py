@@ -39,8 +39,9 @@ from gyro_calibration.calibration.noise_grid import (
     SharedNoise,
     wander,
 )
-from gyro_calibration.diagnosis.expected_output import bridged, integral_of, white_noise
+from gyro_calibration.diagnosis.expected_output import bridged, integral_of
 from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
