@@ -46,8 +46,9 @@ from scipy.stats import f as fisher
 MOST, FOLDS = 4, 5
 #: A cause is suspected up to so many times the level.
 _SUSPECTED = 5.0
-#: By how many standard deviations a cause must win on stretches that are held out, where a stretch
-#: counts no more than so much log-likelihood: what one stretch shows is not sure.
+#: By how many standard deviations a cause must win on stretches that are held out (one-sided 5 %),
+#: where a stretch counts no more than so much log-likelihood, a ratio of 20: no single stretch
+#: establishes a cause.
 _SURELY, _BOUND = 1.65, 3.0
 #: Causes explain a log as well as the best of them up to this likelihood ratio.
 _LIKELY = 25.0
@@ -157,9 +158,10 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Seq
     gain = chances[strongest][1]
     alike = {name: other for name, other in best_of.items()
              if chances[other][1] > gain - math.log(_LIKELY) or other == strongest}
-    # of those that explain the log as well, the simplest
-    place = min(alike.values(),
-                key=lambda other: (_size(open_ones[other], widths[other]), tried[other]))
+    # of those that explain the log as well, the simplest: with the fewest values and fitted shapes
+    place = min(alike.values(), key=lambda other: (widths[other].shape[1] + sum(
+        each.default is None for each in getattr(CATALOGUE.get(open_ones[other].cause), 'shapes',
+                                                 ())), tried[other]))
     column, p_value, stretches = open_ones[place], min(tried[place], 1.0), chances[place][2]
     found = _cross_fitted(data, columns, places, positive, open_ones, alike)
     # the errors of a course last: there a cause has to predict distant stretches as well
@@ -173,12 +175,6 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Seq
                    and stretches >= FEWEST_STRETCHES)
     return Confirmed(column, max(p_value, LEAST_PROBABILITY), predicted, chosen, established,
                      probability)
-
-
-def _size(column: Column, columns: Array) -> int:
-    """Return how many values a cause has, shapes that are fitted included."""
-    shapes = CATALOGUE[column.cause].shapes if column.cause in CATALOGUE else ()
-    return columns.shape[1] + sum(each.default is None for each in shapes)
 
 
 def _evidences(data: Whitened, columns: Array, places: Sequence[slice], positive: Sequence[bool],

@@ -341,13 +341,15 @@ OF_HEADING = ('encoder', 'motion_capture', 'course', 'odometry', 'gyro')
 #: Span over which the errors of gyro and reference are compared, s, and by what factor those of a
 #: course are larger than the noise of the gyro (measured: 22 to 560; exact references up to 66).
 _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
-#: A reference rate with more noise than this part of that of the gyro, and a heading with more
-#: than this part of what the gyro walks in a second, are not exact.
+#: A reference rate with more noise than this part of that of the gyro is not exact: less adds 1e-4
+#: to the variance, which logs of up to 2e8 samples do not show. Nor is a heading with more noise
+#: than this part of what the gyro walks in a second: less adds an eighth to the variance of that.
 _NOISY, _BLURRED = 0.01, 0.25
 #: The steps of an encoder finer than this, rad, are noise of a known size; the search for exact
 #: references finds more beside them (measured at 0.0055 and 0.09 deg).
 _FINE = 0.05 * DEGREE
-#: Third differences of white noise have a correlation of -0.75 from one to the next.
+#: Third differences have a correlation of -0.75 from one to the next for white noise, of -0.67 for
+#: a random walk, and of -0.5 for its integral; a motion is as smooth as that.
 _WHITE = -0.5
 #: Other noise of a reference rate is seen from so many standard deviations on, in this part of the
 #: log, in blocks of so many samples.

@@ -75,13 +75,18 @@ _OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05}
 _SPOKEN = {'rate_command': 'a reference rate with noise', 'course': 'a course over ground',
            'encoder': 'an encoder', 'odometry': 'odometry', 'motion_capture': 'motion capture',
            'gyro': 'another gyro'}
+_METHOD = ('The heading by {} was compared with the integral of the output over spans of a second '
+           'or more, under noise of gyro and reference that was found together with the causes. A '
+           'cause is established if its evidence holds beyond the scatter between stretches, and '
+           'if choice and fit on some stretches predict the others; else it is suspected. Only '
+           'established causes are in the model. Intervals are of 95 %.')
 #: What is no candidate, because it is looked for in any log.
 _ALWAYS_SEEN = {*PLAIN, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_error',
                 'quantization', 'saturation'}
 
 
-def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
-                    rate: float) -> Diagnosis:
+def diagnose_by_noisy_reference(log: Log, reference: Reference,
+                                model: GyroModel | None, rate: float) -> Diagnosis:
     """
     Say what a simulation gets wrong, by a reference that errs more than the gyro.
 
@@ -141,7 +146,7 @@ def diagnose_beside(log: Log, reference: Reference, model: GyroModel | None,
         None if not changed and model is not None else gain, base, after, _cannot_show(plain),
         [curve], heading_curve(parts, time), None,
         (*record.remarks, *_remarks(reference, plain)), rate, trace=trace,
-        method=_method(reference), reference=replace(reference, noise=noise),
+        method=_METHOD.format(_SPOKEN[reference.kind]), reference=replace(reference, noise=noise),
         heading_shares=of_heading)
 
 
@@ -157,7 +162,12 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
             continue
         value, deviation = float(done.values[place]), math.sqrt(done.covariance[place, place])
         if name == 'bias' and model is not None:
-            deviation = math.sqrt(deviation ** 2 + _wander_of(done, model))
+            # the mean of a log wanders about the bias of a model
+            duration = float(done.spans.time[-1] - done.spans.time[0])
+            deviation = math.sqrt(deviation ** 2 + max(
+                2.0 / math.pi * each.bias_instability ** 2
+                + each.rate_random_walk ** 2 * duration / 3.0
+                for each in (_noise(done), model.noise)))
         if name == 'time_offset' and lag is not None:
             # to first order a lag is a delay
             place_of_lag = done.places(lag).start
@@ -177,8 +187,8 @@ def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
         confounders = [] if name != 'scale_factor_error' else ['reference_scale']
         if name == 'time_offset':
             of_reference = not 0.0 < value < _OF_A_LAG
-            if not (of_reference or lag) and _may_lag(done, value):
-                confounders = ['bandwidth']
+            if not (of_reference or lag):
+                confounders = ['bandwidth'] if _may_lag(done, value) else []
             if own_clock:
                 remedy = 'synchronize the clocks of gyro and reference; the model has none of it'
                 if of_reference:
@@ -199,14 +209,6 @@ def _may_lag(done: SpanFit, delay: float) -> bool:
     inverse = np.linalg.pinv(data.plain.T @ data.plain)
     square = float((inverse @ data.plain.T @ data.observed)[place])
     return abs(square - 0.5 * delay ** 2) < _RULED_OUT * math.sqrt(inverse[place, place])
-
-
-def _wander_of(done: SpanFit, model: GyroModel) -> float:
-    """Return the variance of the mean of a log about the bias of a model, by their wander."""
-    duration = float(done.spans.time[-1] - done.spans.time[0])
-    return max(2.0 / math.pi * each.bias_instability ** 2
-               + each.rate_random_walk ** 2 * duration / 3.0
-               for each in (_noise(done), model.noise))
 
 
 def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
@@ -366,15 +368,6 @@ def _remarks(reference: Reference, plain: SpanFit) -> Iterator[str]:
         yield ('The scale factor error rests on fewer than three stretches that turn, and is left '
                f'at 0 +- {100.0 * plain.spans.treatment.prior[0]:g} %: turn more often, both '
                'ways.')
-
-
-def _method(reference: Reference) -> str:
-    return (f'The heading by {_SPOKEN[reference.kind]} was compared with the integral of the '
-            'output over spans of a second or more, under noise of gyro and reference that was '
-            'found together with the causes. A cause is established if its evidence holds beyond '
-            'the scatter between stretches, and if choice and fit on some stretches predict the '
-            'others; else it is suspected. Only established causes are in the model. Intervals '
-            'are of 95 %.')
 
 
 def _pictures(done: SpanFit, parts: dict[str, Array]) -> tuple[Curve, Trace]:

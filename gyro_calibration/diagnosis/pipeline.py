@@ -55,7 +55,7 @@ from gyro_calibration.diagnosis.findings import (
 )
 from gyro_calibration.diagnosis.gates import gates, mismatch, model_gate, refuse, rests
 from gyro_calibration.diagnosis.noise_parameters import NAMES, noise_parameters, NoiseParameters
-from gyro_calibration.diagnosis.noisy_reference import diagnose_beside
+from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.regression import (
     filtered,
     fitted,
@@ -152,7 +152,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     references = [reference_of(log, kind) for log in logs]
     if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], references[0]):
         on_progress('search')
-        found = diagnose_beside(logs[0], references[0], model, rate)
+        found = diagnose_by_noisy_reference(logs[0], references[0], model, rate)
     else:
         found = _by_exact_reference(logs, generator, model, rate, names, on_progress)
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
@@ -175,7 +175,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     on_progress('search')
     search, everything = _searched(replays, generator, _OF_SEARCH * rate)
     named, unnamed = _withdrawn(search, everything)
-    named, vetoed = _without_contradictions(search, named)
+    named, contradicted = _without_contradictions(search, named)
     on_progress('sets')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
@@ -208,8 +208,8 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     for each in (each for clean in quality for each in clean.findings):
         if each.effect not in best or each.p_value < best[each.effect].p_value:
             best[each.effect] = each
-    said = {name for each in best.values() for name in each.ambiguous_with}
-    findings += [*best.values(), *(each for each in changed if each.effect not in said)]
+    covered = {name for each in best.values() for name in each.ambiguous_with}
+    findings += [*best.values(), *(each for each in changed if each.effect not in covered)]
     if model is not None:
         findings += _of_noise(figures, model, rate, found.replays)
     findings.sort(key=lambda each: each.p_value)
@@ -233,7 +233,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         tuple(unexplained(search, found, unnamed)), noise, simulated, won, before, after,
         _cannot_show(search, logs), curves(left, shown), heading_curve(left, shown),
         noise_curve(found, noise, simulated),
-        tuple(_remarks(quality, names, found, unnamed, vetoed, out, won, model)), rate,
+        tuple(_remarks(quality, names, found, unnamed, contradicted, out, won, model)), rate,
         heading_shares=of_heading)
 
 
@@ -266,8 +266,17 @@ def _withdrawn(search: Search,
         beyond.add('frequency')
     kept = tuple(each for each in everything if is_named(each.candidate)
                  and CAUSES[each.candidate.cause].along not in beyond)
-    kept = tuple(each for each in kept
-                 if _repeats(search, everything, each) and _is_small(search, each))
+    fastest = max(float(np.abs(each.channels.rate).max()) for each in search.problem.replays)
+
+    def is_small(known: Named) -> bool:
+        """Tell whether an effect along the rate is small beside it, as those of a gyro are."""
+        return (CAUSES[known.candidate.cause].along != 'rate'
+                or known.candidate.amplitude is not None
+                or all(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
+                                           1)).max() < _LARGEST * fastest
+                       for each in search.problem.replays))
+
+    kept = tuple(each for each in kept if _repeats(search, everything, each) and is_small(each))
     unnamed = tuple(each for each in everything if each not in kept)
     if not unnamed:
         return kept, ()
@@ -275,23 +284,15 @@ def _withdrawn(search: Search,
                  or CAUSES[each.candidate.cause].along not in
                  {along(other.candidate) for other in unnamed if not is_named(other.candidate)})
     left = pruned(search, polished(search, (*kept, *rest)))
-    return tuple(each for each in left if any(_same(each, one) for one in kept)), rest
-
-
-def _is_small(search: Search, known: Named) -> bool:
-    """Tell whether an effect along the rate is small beside it, as those of a gyro are."""
-    if CAUSES[known.candidate.cause].along != 'rate' or known.candidate.amplitude is not None:
-        return True
-    most = [float(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
-                                      1)).max()) for each in search.problem.replays]
-    return max(most) < _LARGEST * max(float(np.abs(each.channels.rate).max())
-                                      for each in search.problem.replays)
+    return tuple(each for each in left if any(
+        each.candidate.cause == one.candidate.cause and each.candidate.run == one.candidate.run
+        for one in kept)), rest
 
 
 def _without_contradictions(
         search: Search, named: tuple[Named, ...]) -> tuple[tuple[Named, ...], list[str]]:
     """Take out causes whose interval holds 0, whatever their evidence is, and name them."""
-    vetoed: list[str] = []
+    contradicted: list[str] = []
     while named:
         found = FittedValues(fitted(search.problem, named), search.problem.replays)
         sigmas = []
@@ -304,15 +305,10 @@ def _without_contradictions(
         weakest = int(np.argmin(sigmas))
         if sigmas[weakest] >= 1.96:
             break
-        vetoed.append(named[weakest].candidate.cause)
+        contradicted.append(named[weakest].candidate.cause)
         rest = named[:weakest] + named[weakest + 1:]
         named = polished(search, rest) if rest else rest
-    return named, vetoed
-
-
-def _same(one: Named, other: Named) -> bool:
-    return (one.candidate.cause == other.candidate.cause
-            and one.candidate.run == other.candidate.run)
+    return named, contradicted
 
 
 def _repeats(search: Search, everything: tuple[Named, ...], known: Named) -> bool:
@@ -363,11 +359,11 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
     likely = Noise(noise.angle_random_walk,
                    *(max(getattr(each, name) for each in (noise, model.noise))
                      for name in NAMES[1:]))
-    doubts = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
+    deviations = np.hypot([_bias_deviation(found, likely), scale.deviation], own)
     different = []
     for name, value, deviation, confounders in (
-            ('bias', bias, float(doubts[0]), ()),
-            ('scale_factor_error', scale.value, float(doubts[1]), ('reference_scale',))):
+            ('bias', bias, float(deviations[0]), ()),
+            ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',))):
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
         if chance < _OF_BIAS * rate:
             cause = CAUSES[name]
@@ -376,7 +372,7 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
                                                             next(iter(cause.units.values())))},
                 chance, 5.4 * deviation, confounders, cause.separate_by if confounders else '',
                 f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard '
-                'deviations from nothing', cause.along))
+                'deviations from zero', cause.along))
     return different
 
 
@@ -401,11 +397,11 @@ def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
                 continue
             cause, value = CAUSES[name], getattr(figures.noise, name)
             unit = next(iter(cause.units.values()))
-            said = (f'the model says {amount(getattr(expected, name), unit, name)}, the log '
-                    f'{amount(value, unit, name)}')
+            evidence = (f'the model says {amount(getattr(expected, name), unit, name)}, the log '
+                        f'{amount(value, unit, name)}')
             found.append(Finding(name, cause.sentence,
                                  {name: Estimate(value, figures.interval[name], unit)},
-                                 figures.chance[name], None, evidence=said, along=cause.along))
+                                 figures.chance[name], None, evidence=evidence, along=cause.along))
     return found
 
 
@@ -417,26 +413,26 @@ def _cannot_show(search: Search, logs: Sequence[Log]) -> dict[str, str]:
     has |= (of_motion if any(getattr(log, name) is not None for log in logs for name in REFERENCES)
             else frozenset())
     moves = any(np.any(each.reference[each.kept] != 0.0) for each in replays)
-    told = {}
+    reasons = {}
     for name, cause in CAUSES.items():
         missing = sorted(cause.needs - has)
         if missing:
-            told[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
+            reasons[name] = f'the logs have no {" and no ".join(missing)}'.replace('_', ' ')
         elif not moves and cause.needs & of_motion:
-            told[name] = 'the reference shows no motion'
+            reasons[name] = 'the reference shows no motion'
     quiet = {name: _HARDLY[name] for name in constant(replays)}
     quiet |= {other: quiet[name] for name, other in _WITH.items() if name in quiet}
     for name, reason in quiet.items():
-        told.update({cause.name: reason for cause in CAUSES.values()
-                     if cause.along == name and cause.name not in told})
+        reasons.update({cause.name: reason for cause in CAUSES.values()
+                        if cause.along == name and cause.name not in reasons})
     alike = 'in these logs it would look exactly like a bias or a scale factor error'
-    hidden = sorted(search.unidentifiable & (CAUSES.keys() - told.keys()))
-    told.update(dict.fromkeys(hidden, alike))
-    return told
+    hidden = sorted(search.unidentifiable & (CAUSES.keys() - reasons.keys()))
+    reasons.update(dict.fromkeys(hidden, alike))
+    return reasons
 
 
 def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: FittedValues,
-             unnamed: Sequence[Named], vetoed: Sequence[str], out: Sequence[Named],
+             unnamed: Sequence[Named], contradicted: Sequence[str], out: Sequence[Named],
              won: Gain | None, model: GyroModel | None) -> Iterator[str]:
     """Give what a person should know: of the records, of withdrawn names, and of the model."""
     for place, clean in enumerate(quality):
@@ -447,7 +443,7 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
         why = ('it is at many frequencies' if name == 'interference_tone'
                else 'it differs from log to log, or is not alone')
         yield f'What looks like {name.replace("_", " ")} is not named: {why}.'
-    for name in dict.fromkeys(vetoed):
+    for name in dict.fromkeys(contradicted):
         yield (f'What looks like {name.replace("_", " ")} is not named: the interval of its size '
                'holds 0.')
     scale, own = (found.scale_factor_error,
@@ -562,15 +558,15 @@ def unexplained(search: Search, found: FittedValues,
                 else along(known.candidate))
         variables.setdefault(name, []).append(len(found.named) + place)
     least, most = _variance(search, found, everything), _variance(search, found, found.named)
-    told = []
+    structures = []
     for name, places in variables.items():
         without = _variance(search, found, [known for place, known in enumerate(everything)
                                             if place not in places])
         chance = min(search.chance.p_value(everything[place].candidate.cause,
                                            evidence_of(search, everything, place))
                      for place in places)
-        told.append(Unexplained(name, max(without - least, 0.0) / most, chance))
-    return told
+        structures.append(Unexplained(name, max(without - least, 0.0) / most, chance))
+    return structures
 
 
 def _variance(search: Search, found: FittedValues, named: Sequence[Named]) -> float:

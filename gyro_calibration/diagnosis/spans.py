@@ -41,7 +41,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.diagnosis.expected_output import bridged, integral_of
 from gyro_calibration.logs.log import Array, DEGREE, Log
-from gyro_calibration.logs.quality import white_noise
+from gyro_calibration.logs.quality import robust_deviation, white_noise
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE, Channels
 import numpy as np
@@ -54,9 +54,9 @@ PLAIN = ('scale_factor_error', 'bias', 'time_offset')
 #: Evidence of fewer stretches establishes nothing.
 FEWEST_STRETCHES = 3.0
 #: A point counts no less than one that errs by so many times the usual.
-_WILDEST = 10.0
+_FARTHEST = 10.0
 #: What is not fitted keeps its value to this part of the prior.
-_NOT = 1e-6
+_FIXED = 1e-6
 #: Delays of a reference that are tried first, s.
 _DELAYS = np.arange(-1.5, 1.501, 0.05)
 #: Passes in which values, and points that stand out, are found robustly.
@@ -109,12 +109,6 @@ COURSE = Treatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12, (1e-6, 2
 HEADING = Treatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf, 24, (3e-3, 0.5),
                     (1e-4, 0.1), True, 5.0, True, True)
 RATE = replace(HEADING, of_heading=False, averaged=False, cosines=60)
-
-
-def treatment_of(kind: str) -> Treatment:
-    """Return how a kind of reference is compared."""
-    return {'rate_command': RATE, 'encoder': HEADING, 'motion_capture': HEADING,
-            'gyro': HEADING}.get(kind, COURSE)
 
 
 @dataclass(frozen=True)
@@ -295,7 +289,8 @@ class SpanFit:
 def spans_of(log: Log, kind: str = 'course') -> Spans:
     """Lay a log with a reference out in spans."""
     assert log.time is not None and log.output is not None
-    treatment = treatment_of(kind)
+    treatment = {'rate_command': RATE, 'encoder': HEADING, 'motion_capture': HEADING,
+                 'gyro': HEADING}.get(kind, COURSE)
     time, output = log.time - log.time[0], bridged(log.output)
     white = white_noise(log.output)
     reference = log.reference_heading
@@ -362,7 +357,14 @@ def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
     """
     prior = np.array(spans.treatment.prior)
     free = np.concatenate([prior, np.full(all_columns(spans, causes).shape[1] - 3, np.inf)])
-    moved = replace(spans, delay=spans.delay or _first_delay(spans))
+
+    def disagreement(delay: float) -> float:
+        """Return what gyro and reference differ by at a delay, robustly."""
+        moved = replace(spans, delay=delay)
+        left = _robustly(moved.plain()[:, :2], moved.observed, prior[:2])[1]
+        return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
+
+    moved = replace(spans, delay=spans.delay or min(_DELAYS.tolist(), key=disagreement))
     outlying: Array = np.ones(len(spans.time))
     for _ in range(_PASSES):
         values = _robustly(all_columns(moved, causes), moved.observed, free)[0]
@@ -374,7 +376,7 @@ def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
     if done.stretches_of[0] >= FEWEST_STRETCHES:
         return done
     moved = moved.corrected(np.append(0.0, done.fit.values[1:3]))
-    done = _with_deviations(moved, causes, outlying, prior * [_NOT, 1.0, 1.0])
+    done = _with_deviations(moved, causes, outlying, prior * [_FIXED, 1.0, 1.0])
     done.covariance[0, 0] = prior[0] ** 2
     return done
 
@@ -384,24 +386,13 @@ def all_columns(spans: Spans, causes: Sequence[Column]) -> Array:
     return np.column_stack([spans.plain(), *(spans.columns(each) for each in causes)])
 
 
-def _first_delay(spans: Spans) -> float:
-    """Return the delay at which gyro and reference agree best, by the median of what is left."""
-    def cost(delay: float) -> float:
-        moved = replace(spans, delay=delay)
-        left = _robustly(moved.plain()[:, :2], moved.observed,
-                         np.array(spans.treatment.prior[:2]))[1]
-        return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
-
-    return min(_DELAYS.tolist(), key=cost)
-
-
 def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Array]:
     """Return values by weighted least squares, large residuals counting less, and what is left."""
     left: Array = observed
     values: Array = np.zeros(columns.shape[1])
     own = np.diag(np.where(prior < np.inf, 1.0 / prior, 0.0))
     for _ in range(5):
-        size = 1.4826 * float(np.median(np.abs(left))) + 1e-12
+        size = robust_deviation(left) + 1e-12
         weight = 1.0 / np.maximum(np.abs(left) / (2.0 * size), 1.0) / size
         rows = np.vstack([columns * weight[:, None], own])
         values = np.asarray(np.linalg.lstsq(
@@ -417,7 +408,7 @@ def _outlying(left: Array) -> Array:
     # what drifts one way is its own median
     size = 1.4826 * max(float(np.median(off)), float(np.median(np.abs(np.diff(point, 2))))
                         / math.sqrt(6.0)) + 1e-9
-    return np.clip(off / (3.0 * size), 1.0, _WILDEST) ** 2
+    return np.clip(off / (3.0 * size), 1.0, _FARTHEST) ** 2
 
 
 def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
