@@ -33,7 +33,6 @@ from gyro_calibration.calibration.rate_table import (
 )
 from gyro_calibration.calibration.scatter import (
     parts_of,
-    Scatter,
     SMALLEST_TEMPERATURE_SPREAD,
     Uncertainty,
     Whitener,
@@ -246,7 +245,13 @@ def _chance(fit: Calibration, model: GyroModel, effect: Effect,
         return 1.0
     columns = np.column_stack([*columns_of(used, others).T, added]) if others else added[:, None]
     uncertain = Uncertainty.of(used, fit.scatter, columns, fit.residual[fit.scatter.kept])
-    below = float(uncertain.below(-_of_dwells(fit, model, columns))[-1])
+    # the deviation of the last value by dwells over that by dwells and model
+    whitener = Whitener(used, fit.scatter)
+    inverse = np.linalg.pinv(whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
+    by_model = inverse @ whitener.whiten(uncertainty_of(fit, model))
+    by_dwells = float(inverse @ inverse)
+    of_dwells = float(np.sqrt(by_dwells / (by_dwells + by_model @ by_model)))
+    below = float(uncertain.below(-of_dwells)[-1])
     return 2.0 * min(below, 1.0 - below)
 
 
@@ -254,16 +259,7 @@ def _used(fit: Calibration) -> Dwells:
     return take(fit.dwells, fit.scatter.kept)
 
 
-def _of_dwells(fit: Calibration, model: GyroModel, columns: Array) -> float:
-    """Return the deviation of the last value by dwells over that by dwells and model."""
-    whitener = Whitener(_used(fit), fit.scatter)
-    inverse = np.linalg.pinv(whitener.whiten(columns / np.linalg.norm(columns, axis=0)))[-1]
-    by_model = inverse @ whitener.whiten(doubt(fit, model))
-    by_dwells = float(inverse @ inverse)
-    return float(np.sqrt(by_dwells / (by_dwells + by_model @ by_model)))
-
-
-def doubt(fit: Calibration, model: GyroModel) -> Array:
+def uncertainty_of(fit: Calibration, model: GyroModel) -> Array:
     """Return what 1-sigma deviations of model values add to each dwell, rad/s, shape (n, m)."""
     known = [term for term in seen(model) if term.fitted]
     if model.covariance is None or not known:
@@ -301,7 +297,9 @@ def _counted_well(fit: Calibration, model: GyroModel | None,
 
 def counted_from(fit: Calibration, temperature: float) -> Calibration:
     """Return the same fit with effects of temperature that count from another temperature."""
-    terms = [_with_reference(term, temperature) for term in fit.terms]
+    terms = [replace(term, values=(temperature, *term.values[1:])) if term.effect.shapes
+             and term.effect.shapes[0].name == 'reference_temperature' else term
+             for term in fit.terms]
     places = [place for place, term in enumerate(terms)
               if not any(shape.default is None for shape in term.effect.shapes)]
     channels = channels_of(fit.dwells)
@@ -316,12 +314,6 @@ def counted_from(fit: Calibration, temperature: float) -> Calibration:
     return replace(fit, terms=tuple(terms))
 
 
-def _with_reference(term: Term, temperature: float) -> Term:
-    if not term.effect.shapes or term.effect.shapes[0].name != 'reference_temperature':
-        return term
-    return replace(term, values=(temperature, *term.values[1:]))
-
-
 # models
 
 def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroModel:
@@ -329,12 +321,10 @@ def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroM
     effects = [each for each in NUISANCES if each in named.change.effects]
     if model is not None or not effects:
         return model or GyroModel()
-    return fit_effects(dwells, effects, _scatter(dwells, named)).model
-
-
-def _scatter(dwells: Dwells, named: Named) -> Scatter | None:
-    """Return the scatter that was found, if it is that of these dwells."""
-    return named.fit.scatter if len(named.fit.scatter.kept) == len(dwells) else None
+    scatter = named.fit.scatter
+    # if it is that of these dwells
+    same = len(scatter.kept) == len(dwells)
+    return fit_effects(dwells, effects, scatter if same else None).model
 
 
 def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
@@ -419,7 +409,7 @@ class Left:
     misfit: Mapping[str, float]
 
 
-def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
+def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
     """
     Look for structure in what a fit leaves.
 
@@ -427,8 +417,8 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     ----------
     fit : of dwells
     level : the chance to find any where there is none
-    doubt : what deviations of the model's values add to each dwell, rad/s, shape (n, m): that is
-        no structure
+    by_model : what deviations of the model's values add to each dwell, rad/s, shape (n, m): no
+        structure
 
     """
     used = take(fit.dwells, fit.scatter.kept)
@@ -436,7 +426,7 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
     known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
     found, gains, tried = [], {}, len(probes)
     while probes:
-        judged = [_judged(name, fit, known, columns, error, doubt)
+        judged = [_judged(name, fit, known, columns, error, by_model)
                   for name, columns in probes.items()]
         best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
         chance = min(1.0, tried * best.p_value)
@@ -449,14 +439,20 @@ def what_is_left(fit: Calibration, level: float, doubt: Array) -> Left:
 
 
 def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
-            doubt: Array) -> tuple[Unexplained, float]:
+            by_model: Array) -> tuple[Unexplained, float]:
     """Return what a curve explains beside what is known, its chance, and the misfit it saves."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
-    base = _orthonormal(whitener.whiten(known))
+    white = whitener.whiten(known)
+    left, sizes, _ = np.linalg.svd(white / np.linalg.norm(white, axis=0), full_matrices=False)
+    base = left[:, sizes > 1e-6 * sizes[0]]
     white = whitener.whiten(error)
     white = white - base @ (base.T @ white)
-    new = _beside(base, whitener.whiten(columns))
+    # orthonormal columns for what is new in the curve
+    curve = whitener.whiten(columns)
+    curve = curve / np.maximum(np.linalg.norm(curve, axis=0), 1e-300)
+    left, sizes, _ = np.linalg.svd(curve - base @ (base.T @ curve), full_matrices=False)
+    new = left[:, sizes > _NEW]
     count, freedom = new.shape[1], len(used) - base.shape[1] - new.shape[1]
     if not count or freedom < 3:
         return Unexplained(name, 0.0, 1.0), 0.0
@@ -465,30 +461,18 @@ def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
     # Columns in their own unit, for the covariance of the dwells may be another one.
     plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
     chance = _chance_of_curve(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error),
-                              new.T @ whitener.whiten(doubt))
+                              new.T @ whitener.whiten(by_model))
     return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
-def _chance_of_curve(uncertainty: Uncertainty, doubt: Array) -> float:
-    """Return how likely the last values are all doubt, by an F test averaged over the scatter."""
-    count = len(doubt)
+def _chance_of_curve(uncertainty: Uncertainty, by_model: Array) -> float:
+    """Return how likely the model's errors make the last values, by an F test over the scatter."""
+    count = len(by_model)
     values, covariances = (uncertainty.offsets[:, -count:],
-                           uncertainty.covariances[:, -count:, -count:] + doubt @ doubt.T)
+                           uncertainty.covariances[:, -count:, -count:] + by_model @ by_model.T)
     squares = np.einsum('ki,ki->k', values,
                         np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
     return float(uncertainty.weights @ fisher.sf(squares / count, count, uncertainty.freedom))
-
-
-def _orthonormal(columns: Array) -> Array:
-    left, sizes, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
-    return left[:, sizes > 1e-6 * sizes[0]]
-
-
-def _beside(base: Array, columns: Array) -> Array:
-    """Return orthonormal columns for what is new in some beside others."""
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    left, sizes, _ = np.linalg.svd(columns - base @ (base.T @ columns), full_matrices=False)
-    return left[:, sizes > _NEW]
 
 
 # the curves

@@ -61,8 +61,18 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
     fitted = (model is None or names & {BIAS.name, SCALE_FACTOR_ERROR.name}
               or any(each.candidate.cause in CATALOGUE and found.explaining(place)
                      for place, each in enumerate(found.named)))
-    new = _with_exact(extended(given, found, bias_deviation) if fitted else given,
-                      _of_the_output(quality))
+    new = extended(given, found, bias_deviation) if fitted else given
+    # limit and steps of the output, if they are findings, of the first log with them; exact
+    exact: dict[str, Term] = {}
+    for clean in quality:
+        sizes = {'saturation': clean.limit, 'quantization': clean.step}
+        for name in (each.effect for each in clean.findings if sizes.get(each.effect)):
+            exact.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
+    terms = [term for term in exact.values() if _is_within(term)]
+    if terms:
+        spread = np.zeros((len(terms), len(terms)))
+        new = replace(new, terms=_all(new.terms, terms),
+                      covariance=_covariance(new, terms, spread))
     figures = replace(given.noise, **{each.effect: getattr(noise, each.effect)
                                       for each in findings if each.effect in NAMES})
     if model is not None and same_effects(new, model) and figures == model.noise:
@@ -76,24 +86,20 @@ def with_findings(model: GyroModel | None, found: FittedValues, quality: Sequenc
 def extended(model: GyroModel, found: FittedValues, bias_deviation: float) -> GyroModel:
     """Return a model with all named effects of the gyro, bias and scale factor put right."""
     new, spread = _values(found, bias_deviation)
-    moves = _moves(found) and not doubts_scale(found)
-    outputs = [each.channels.output[each.kept] + each.added[each.kept]
-               for each in found.replays if moves]
-    temperatures = [each.channels.temperature[each.kept]
-                    for each in found.replays if 'temperature' in each.has]
-    return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
-                   rate_range=wider(model.rate_range, outputs, bool(model.terms)),
-                   temperature_range=wider(model.temperature_range, temperatures,
-                                           bool(model.terms)))
+    moves = _moves(found) and not implausible_scale(found)
+    return with_terms(model, new, spread, [each.channels.output[each.kept] + each.added[each.kept]
+                                           for each in found.replays if moves],
+                      [each.channels.temperature[each.kept]
+                       for each in found.replays if 'temperature' in each.has])
 
 
-def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Array,
-               temperatures: Array | None) -> GyroModel:
-    """Return a model with more terms of covariance `spread`, and ranges that hold a log, too."""
-    known = [] if temperatures is None else [temperatures]
+def with_terms(model: GyroModel, new: Sequence[Term], spread: Array, outputs: Sequence[Array],
+               temperatures: Sequence[Array]) -> GyroModel:
+    """Return a model with more terms of covariance `spread`, and ranges that hold the logs."""
+    was = bool(model.terms)
     return replace(model, terms=_all(model.terms, new), covariance=_covariance(model, new, spread),
-                   rate_range=wider(model.rate_range, [outputs], bool(model.terms)),
-                   temperature_range=wider(model.temperature_range, known, bool(model.terms)))
+                   rate_range=wider(model.rate_range, outputs, was),
+                   temperature_range=wider(model.temperature_range, temperatures, was))
 
 
 def noted(new: GyroModel, given: GyroModel, quality: Sequence[DataQuality],
@@ -146,9 +152,9 @@ def left_out(model: GyroModel, found: FittedValues) -> tuple[Named, ...]:
     return tuple(out)
 
 
-def doubts_scale(found: FittedValues) -> bool:
+def implausible_scale(found: FittedValues) -> bool:
     """
-    Tell whether a scale factor error was found that is not to be believed.
+    Tell whether the scale factor error that was found is implausible.
 
     Where the gyro hardly turns, the noise of the reference passes for motion that the gyro does
     not see: an error of up to -100 %.
@@ -165,29 +171,15 @@ def _moves(found: FittedValues) -> bool:
 
 # values
 
-def _of_the_output(quality: Sequence[DataQuality]) -> list[Term]:
-    """Return limit and steps of the output, if they are findings, of the first log with them."""
-    found: dict[str, Term] = {}
-    for clean in quality:
-        sizes = {'saturation': clean.limit, 'quantization': clean.step}
-        for name in (each.effect for each in clean.findings if sizes.get(each.effect)):
-            found.setdefault(name, Term(CATALOGUE[name], (float(sizes[name] or 0.0),)))
-    return [term for term in found.values() if _is_within(term)]
-
-
-def _with_exact(model: GyroModel, terms: Sequence[Term]) -> GyroModel:
-    """Return a model with effects whose values are exact."""
-    spread = np.zeros((len(terms), len(terms)))
-    return (replace(model, terms=_all(model.terms, terms),
-                    covariance=_covariance(model, terms, spread)) if terms else model)
-
-
 def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Array]:
     """Return what was found as terms, and the covariance of all values in a row, 0 if exact."""
-    doubtful = doubts_scale(found)
-    scale = 0.0 if doubtful else found.scale_factor_error.value
-    terms = [Term(BIAS, (_bias(found, scale),)), Term(SCALE_FACTOR_ERROR, (scale,))]
-    ranks: list[int | None] = [None, None if doubtful else found.place(-1, 0)]
+    implausible = implausible_scale(found)
+    scale = 0.0 if implausible else found.scale_factor_error.value
+    # the mean bias of the logs beside that scale factor error
+    rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
+    bias = np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates)
+    terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
+    ranks: list[int | None] = [None, None if implausible else found.place(-1, 0)]
     for place, known in enumerate(found.named):
         if known.candidate.cause in CATALOGUE and found.explaining(place):
             terms.append(_term(found, place))
@@ -200,12 +192,6 @@ def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Arr
         np.ix_(list(fitted.values()), list(fitted.values()))]
     spread[0, 0] = bias_deviation ** 2
     return terms, spread
-
-
-def _bias(found: FittedValues, scale: float) -> float:
-    """Return the mean bias of the logs beside a scale factor error."""
-    rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
-    return float(np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates))
 
 
 def _term(found: FittedValues, place: int) -> Term:

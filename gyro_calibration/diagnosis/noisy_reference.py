@@ -138,7 +138,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference,
         size = late.parameters['time_offset']
         deviation = (size.interval[1] - size.interval[0]) / (2.0 * 1.96)
         after = with_terms(after, [Term(CATALOGUE['time_offset'], (size.estimate,))],
-                           np.array([[deviation ** 2]]), np.array(after.rate_range), None)
+                           np.array([[deviation ** 2]]), [np.array(after.rate_range)], [])
     curve, trace = _pictures(extended, parts)
     return Diagnosis(
         tuple(with_remedies(findings, of_heading, after)), (), _noise(extended),
@@ -272,7 +272,8 @@ def _model(given: GyroModel, done: SpanFit, log: Log) -> GyroModel:
     spread[np.ix_(fits, fits)] = done.covariance[np.ix_(chosen, chosen)]
     assert log.output is not None
     output = log.output[np.isfinite(log.output)]
-    new = with_terms(given, terms, spread, output, log.temperature)
+    new = with_terms(given, terms, spread, [output],
+                     [] if log.temperature is None else [log.temperature])
     return new if given.noise.angle_random_walk else replace(new, noise=_noise(done))
 
 

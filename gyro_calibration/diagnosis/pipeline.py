@@ -38,8 +38,8 @@ from gyro_calibration.diagnosis.expected_output import unit_of_offset
 from gyro_calibration.diagnosis.experiments import experiment
 from gyro_calibration.diagnosis.extended_model import (
     calibrated,
-    doubts_scale,
     extended,
+    implausible_scale,
     left_out,
     noted,
     with_findings,
@@ -193,7 +193,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
               for each, _ in members}
     lasting = any(known not in out and not happens_once(known) for known in named)
     won = (gain(search, causes, model is not None)
-           if (lasting or changed) and not doubts_scale(found) else None)
+           if (lasting or changed) and not implausible_scale(found) else None)
     offered = won is None or not won.worse
     on_progress('report')
     findings = []
@@ -448,7 +448,7 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
                'holds 0.')
     scale, own = (found.scale_factor_error,
                   {term.effect.name for term in ([] if model is None else model.terms)})
-    if doubts_scale(found):
+    if implausible_scale(found):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is in no model: there is too little motion '
                'beside the noise of gyro and reference for it to be believed; turn faster, and '

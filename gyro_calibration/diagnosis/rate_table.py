@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 from gyro_calibration.calibration.dwells import Dwells, from_table, listed, take
@@ -42,7 +42,6 @@ from gyro_calibration.diagnosis.dwell_fit import (
     alternatives,
     assembled,
     change_of,
-    doubt,
     Left,
     model_before,
     name_causes,
@@ -53,6 +52,7 @@ from gyro_calibration.diagnosis.dwell_fit import (
     simulated,
     SINGLE_RATES,
     tried,
+    uncertainty_of,
     what_is_left,
 )
 from gyro_calibration.diagnosis.extended_model import notes_of
@@ -81,15 +81,13 @@ _LEFT, _OUTLYING = 0.2, 0.05
 _POWER = 0.95
 _METHOD = (
     'The rates and temperatures of the dwells were put through the simulation, and what the '
-    'measured outputs differ by was compared with',
-    'the effects of rate and temperature. How dwells and sweeps scatter was found by restricted '
-    'likelihood about a smooth surface. An',
-    'effect was taken where it predicts left-out sweeps better, and chance alone, averaged over '
-    'what the scatter may be, hardly shows as',
-    'much: of tables without any cause, {share:.2g} % give an alarm. Then curves over rate, '
-    'temperature and the order of the',
-    'dwells were tried on what is left. What is won was measured on sweeps that took no part in '
-    'choice or fit; intervals are of 95 %.')
+    'measured outputs differ by was compared with the effects of rate and temperature. How dwells '
+    'and sweeps scatter was found by restricted likelihood about a smooth surface. An effect was '
+    'taken where it predicts left-out sweeps better, and chance alone, averaged over what the '
+    'scatter may be, hardly shows as much: of tables without any cause, {share:.2g} % give an '
+    'alarm. Then curves over rate, temperature and the order of the dwells were tried on what is '
+    'left. What is won was measured on sweeps that took no part in choice or fit; intervals are '
+    'of 95 %.')
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8
 #: Bins of a curve at most, and dwells in each at least.
@@ -121,9 +119,8 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
                           'the bias; record several rates, both ways')
     record = decided(inspect(log, model))
     dwells = replace(dwells, output=dwells.output * record.factor)
-    known = _conclude(dwells, model, rate)
-    named = known.named
-    gain = _gain(dwells, model, rate, known.withdrawn) if named.causes else None
+    named, left, withdrawn = _concluded(dwells, model, rate)
+    gain = _gain(dwells, model, rate, withdrawn) if named.causes else None
     before = model_before(dwells, model, named)
     offered = bool(named.causes) and not (gain is not None and gain.worse)
     after = assembled(dwells, model, named.fit) if offered else before
@@ -135,39 +132,29 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
     if after is not before:
         after = replace(after, origin={**after.origin, **notes_of(findings, [record.factor])})
     return Diagnosis(
-        tuple(findings), known.left.found, Noise(), Noise() if model is None else model.noise,
+        tuple(findings), left.found, Noise(), Noise() if model is None else model.noise,
         gain, before, after, _cannot_show(dwells),
         curves(dwells, named.fit.scatter, before, after),
-        remarks=(*record.remarks, *dwells.remarks, *_remarks(dwells, model, known, gain, offered)),
-        false_alarm_rate=rate, method=' '.join(_METHOD).format(share=100.0 * rate))
+        remarks=(*record.remarks, *dwells.remarks,
+                 *_remarks(dwells, model, named, left, withdrawn, gain, offered)),
+        false_alarm_rate=rate, method=_METHOD.format(share=100.0 * rate))
 
 
 # the steps
 
-@dataclass(frozen=True)
-class _Known:
-    """What dwells show: named causes, and what is left."""
-
-    named: Named
-    left: Left
-    withdrawn: frozenset[str] = frozenset()
-
-
-def _conclude(dwells: Dwells, model: GyroModel | None, rate: float) -> _Known:
+def _concluded(dwells: Dwells, model: GyroModel | None, rate: float,
+               withdrawn: frozenset[str] = frozenset()) -> tuple[Named, Left, frozenset[str]]:
     """Name causes, and withdraw names along a variable where much has none."""
-    def concluded(withdrawn: frozenset[str]) -> _Known:
-        named = name_causes(dwells, model, rate, withdrawn)
-        return _Known(named, what_is_left(named.fit, _LEFT * rate, doubt(named.fit, named.model)),
-                      withdrawn)
-
-    known = concluded(frozenset())
-    named, misfit = known.named, known.left.misfit
+    named = name_causes(dwells, model, rate, withdrawn)
+    left = what_is_left(named.fit, _LEFT * rate, uncertainty_of(named.fit, named.model))
+    if withdrawn:
+        return named, left, withdrawn
     withdrawn = frozenset(
         effect.name for effect in named.causes if effect not in NUISANCES
-        and max((gain for name, gain in misfit.items()
+        and max((gain for name, gain in left.misfit.items()
                  if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
         > _WITHDRAWN * _strength_of(named, effect))
-    return concluded(withdrawn) if withdrawn else known
+    return _concluded(dwells, model, rate, withdrawn) if withdrawn else (named, left, withdrawn)
 
 
 def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
@@ -206,7 +193,13 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
     freedom = freedom_beside_surface(take(dwells, fit.scatter.kept))
     if not len(outlying) or min(freedom, fit.freedom) < 1:
         return
-    far = np.abs(fit.residual[outlying]) / _deviation_from(fit)[outlying]
+    # in standard deviations about a fit without them
+    used, shared = take(dwells, fit.scatter.kept), fit.scatter.shared(dwells)
+    columns = Whitener(used, fit.scatter).whiten(columns_of(used, fit.terms))
+    of_fit = columns_of(dwells, fit.terms) @ np.linalg.pinv(columns)
+    deviation = np.sqrt(fit.scatter.deviation(dwells) ** 2 + np.sum(shared ** 2, axis=1)
+                        + np.sum(of_fit ** 2, axis=1))
+    far = (np.abs(fit.residual) / deviation)[outlying]
     chance = min(1.0, len(dwells) * 2.0 * float(student.sf(far.max(), freedom)))
     if chance < level:
         cause, count = CAUSES['outliers'], float(len(outlying))
@@ -218,29 +211,15 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
                       along=RATE)
 
 
-def _deviation_from(fit: Calibration) -> Array:
-    """Return the standard deviation of each dwell about a fit without it, rad/s, shape (n,)."""
-    used, shared = take(fit.dwells, fit.scatter.kept), fit.scatter.shared(fit.dwells)
-    columns = Whitener(used, fit.scatter).whiten(columns_of(used, fit.terms))
-    of_fit = columns_of(fit.dwells, fit.terms) @ np.linalg.pinv(columns)
-    return np.asarray(np.sqrt(fit.scatter.deviation(fit.dwells) ** 2 + np.sum(shared ** 2, axis=1)
-                              + np.sum(of_fit ** 2, axis=1)))
-
-
 # findings
 
 def _strength_of(named: Named, effect: Effect) -> float:
     """Return by what the sum of squares falls with a cause."""
     if effect not in NUISANCES:
-        return _strength(named.change, named.changed(effect))
+        rest = _rest(named.change, named.changed(effect))
+        return math.inf if rest is None else rest.misfit - named.change.misfit
     return (change_of(named.fit, named.model, effect)
             / _with_deviations(named.fit, effect)[1][0]) ** 2
-
-
-def _strength(fit: Calibration, effect: Effect) -> float:
-    """Return by what the sum of squares falls with an effect."""
-    rest = _rest(fit, effect)
-    return math.inf if rest is None else rest.misfit - fit.misfit
 
 
 def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
@@ -328,19 +307,19 @@ def _evidence(named: Named, effect: Effect) -> str:
 
 # what a person should know
 
-def _remarks(dwells: Dwells, model: GyroModel | None, known: _Known, gain: Gain | None,
-             offered: bool) -> Iterator[str]:
-    fit = known.named.fit
-    if known.withdrawn:
-        yield (f'No name is given to {", ".join(sorted(known.withdrawn))}, for along the same '
+def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Left,
+             withdrawn: frozenset[str], gain: Gain | None, offered: bool) -> Iterator[str]:
+    fit = named.fit
+    if withdrawn:
+        yield (f'No name is given to {", ".join(sorted(withdrawn))}, for along the same '
                'variable much is left that has none.')
-    if known.named.causes and not offered:
+    if named.causes and not offered:
         yield ('The extension predicts left-out dwells worse than the simulation, so that it is '
                'not offered.')
     if gain is not None:
         yield (f'Heading errors are those that the error of a dwell makes in {WINDOW:g} s at its '
                'rate.')
-    if any(each.along == SINGLE_RATES for each in known.left.found):
+    if any(each.along == SINGLE_RATES for each in left.found):
         yield ('What repeats at single rates may be of the table, or of the place within a sweep '
                'where all sweeps have the same order.')
     scatter = fit.scatter
@@ -378,13 +357,11 @@ def _beside_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
     # Effects of the rate leave an error of the output, a polynomial of the output one of the rate.
     of_rate = rms((named.left_out
                    / named.model.steepness(channels_of(dwells)))[named.scatter.kept])
-    yield (f'{effects} alone, {_values(named)} values, predict the rates of left-out sweeps to '
+    count, of_polynomial = (sum(len(term.fitted) for term in fit.terms)
+                            for fit in (named, polynomial))
+    yield (f'{effects} alone, {count} values, predict the rates of left-out sweeps to '
            f'{of_rate / DEGREE:.3g} deg/s; a polynomial of the orders that the model has, '
-           f'{_values(polynomial)} values, to {polynomial.left_out_rms / DEGREE:.3g} deg/s.')
-
-
-def _values(fit: Calibration) -> int:
-    return sum(len(term.fitted) for term in fit.terms)
+           f'{of_polynomial} values, to {polynomial.left_out_rms / DEGREE:.3g} deg/s.')
 
 
 # what cannot be shown
@@ -450,19 +427,16 @@ def _curve(along: str, unit: str, values: Array, sign: Array, dwells: Dwells, sc
     outputs = [simulated(model, dwells) for model in (before, after)]
     errors = [sign * (dwells.output - outputs[0]), sign * (dwells.output - outputs[1]),
               sign * (outputs[0] - dwells.rate)]
-    bins = list(_bins(values, sign != 0.0))
+    # of equal width, those that hold something
+    count = max(1, min(_MOST_BINS, len(np.unique(values)), len(values) // _DWELLS_A_BIN))
+    edges = np.linspace(values.min(), values.max(), count + 1)
+    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, count - 1)
+    bins = [chosen for number in range(count)
+            if (chosen := (place == number) & (sign != 0.0)).any()]
     at, *means = (np.array([float(each[chosen].mean()) for chosen in bins])
                   for each in (values, *errors))
     deviation = np.array([_deviation(dwells, scatter, sign, chosen) for chosen in bins])
     return Curve(along, unit, at, means[0], means[1], deviation, means[2])
-
-
-def _bins(values: Array, wanted: Mask) -> Iterator[Mask]:
-    """Give the members of bins of equal width that hold something."""
-    count = max(1, min(_MOST_BINS, len(np.unique(values)), len(values) // _DWELLS_A_BIN))
-    edges = np.linspace(values.min(), values.max(), count + 1)
-    place = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, count - 1)
-    yield from (chosen for number in range(count) if (chosen := (place == number) & wanted).any())
 
 
 def _deviation(dwells: Dwells, scatter: Scatter, sign: Array, chosen: Mask) -> float:

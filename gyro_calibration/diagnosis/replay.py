@@ -318,28 +318,37 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     kept = trusted & np.isfinite(reference) & np.isfinite(log.output)
     if log.reference_rate is None:
         kept &= ~_corners(reference, log.output, kept, step / float(np.median(np.diff(time))))
-    _refuse_few(kept)
+    count = int(np.count_nonzero(kept))
+    if count < FEWEST:
+        raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are '
+                          'needed; the others are lost, repeated, outliers or near a limit: turn '
+                          'more slowly, or mend the line, and record again')
     place, interval = numbered(time, kept)
     _refuse_gaps(log.time[kept], place)
     every = max(1, math.ceil((place[-1] + 1) / MOST_POINTS))
-    channels = replace(channels_of(_surrounded(shown, model)), rate=smooth, time=time,
-                       heading=_heading(time, shown, smooth))
+    if model is not None and log.temperature is None:  # it has one to be simulated at
+        shown = replace(shown, temperature=np.full(len(log), model.reference_temperature))
+    # the heading that effects look at: the reference's, or the integral of its rate
+    heading = shown.reference_heading
+    if heading is None or not np.isfinite(heading).all():
+        heading = integral_of(time, np.nan_to_num(smooth))
+    channels = replace(channels_of(shown), rate=smooth, time=time, heading=heading)
+    has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
+                    if getattr(log, name) is not None)
     rounded = step if shown.reference_rate is None else 0.0
     filling = generator.standard_normal(place[-1] + 1)
     foreseen = _rounding(log.output, smooth, kept, codes) if codes else np.zeros(len(time))
     coarse = max(codes ** 2 / 12.0 - float(np.var(foreseen[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place,
-                   interval, every, filling, rounded, _known(log), np.zeros(len(time)), coarse)
+                   interval, every, filling, rounded, has, np.zeros(len(time)), coarse)
     plain = replace(plain, every=every * _smoothed(plain))
-    return plain if model is None else _simulated(plain, model)
-
-
-def _refuse_few(kept: Mask) -> None:
-    count = int(np.count_nonzero(kept))
-    if count < FEWEST:
-        raise DataRefused(f'{count} of {len(kept)} samples can be used, at least {FEWEST} are '
-                          'needed; the others are lost, stuck, wild or near a limit: turn more '
-                          'slowly, or mend the line, and record again')
+    if model is None:
+        return plain
+    # what the model adds is taken out of the output, and effects see the rate that its gyro sees
+    rate = model.distorted('rate', smooth, time)
+    added = model.output_in(plain.channels.moving(rate, rate)) - rate
+    return replace(plain, channels=plain.channels.moving(rate, plain.channels.output - added),
+                   reference=reference + (rate - smooth), added=added)
 
 
 def _refuse_gaps(time: Array, place: NDArray[np.intp]) -> None:
@@ -353,13 +362,6 @@ def _refuse_gaps(time: Array, place: NDArray[np.intp]) -> None:
                       f'least a fifth is needed; the longest gap, of {gaps[longest]:.6g} s, '
                       f'begins at {time[longest]:.3f} s: cut the log there, and give both parts, '
                       'or give --rate where the stamps are no use')
-
-
-def _surrounded(log: Log, model: GyroModel | None) -> Log:
-    """Return a log that has a temperature, where a model has one to be simulated at."""
-    if model is None or log.temperature is not None:
-        return log
-    return replace(log, temperature=np.full(len(log), model.reference_temperature))
 
 
 def _even(time: Array) -> Array:
@@ -432,15 +434,6 @@ def _filled(time: Array, values: Array) -> Array:
     return np.interp(time, time[known], values[known])
 
 
-def _simulated(plain: Replay, model: GyroModel) -> Replay:
-    """Take what a model adds out of the output, and show effects the rate that its gyro sees."""
-    channels = plain.channels
-    rate = model.distorted('rate', channels.rate, channels.time)
-    added = model.output_in(channels.moving(rate, rate)) - rate
-    return replace(plain, channels=channels.moving(rate, channels.output - added),
-                   reference=plain.reference + (rate - channels.rate), added=added)
-
-
 @cache
 def _fast(count: int) -> int:
     """Return the largest number up to a count whose only prime factors are 2, 3 and 5."""
@@ -481,11 +474,6 @@ def numbered(time: Array, kept: Mask) -> tuple[NDArray[np.intp], float]:
     steps = np.maximum(np.rint(np.diff(time) / interval), 1.0)
     place = np.concatenate([[0.0], np.cumsum(steps)]).astype(int)[kept]
     return place - place[0], float((time[kept][-1] - time[kept][0]) / (place[-1] - place[0]))
-
-
-def _known(log: Log) -> frozenset[str]:
-    return frozenset(name for name in ('temperature', 'specific_force', 'supply')
-                     if getattr(log, name) is not None)
 
 
 def _between_updates(time: Array, values: Array, step: float) -> Array:
@@ -548,10 +536,3 @@ def _without_rounding(rate: Array, step: float, interval: float) -> Array:
     power = uniform_filter1d(coefficients ** 2, _NEIGHBOURS, mode='nearest')
     return idct(coefficients * np.clip(1.0 - _OVER * rounding / np.maximum(power, 1e-300),
                                        0.0, 1.0), norm='ortho')
-
-
-def _heading(time: Array, log: Log, rate: Array) -> Array:
-    """Return the heading that effects look at: the reference's, or the integral of its rate."""
-    if log.reference_heading is not None and np.isfinite(log.reference_heading).all():
-        return log.reference_heading
-    return integral_of(time, np.nan_to_num(rate))

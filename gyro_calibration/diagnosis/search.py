@@ -175,7 +175,7 @@ class Search:
     rate : false alarms allowed a cause
     scanned : causes that are scanned for over all frequencies, or all moments
     unidentifiable : causes of which these logs leave nothing beside bias and scale factor error
-    banks, looked : what was made before, by the causes that were named then
+    banks, found_before : what was made before, by the causes that were named then
 
     """
 
@@ -186,7 +186,7 @@ class Search:
     scanned: frozenset[str] = SCANNED
     unidentifiable: frozenset[str] = frozenset()
     banks: dict[Key, Bank] = field_of(default_factory=dict)
-    looked: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
+    found_before: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -227,16 +227,13 @@ def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance
                           generator)
         judged = noise_likelihood(sample(residuals, *single, done.problem.starts), noises, by)
         found.append(_priced(evidence(judged, by, stock.groups), stock))
-    return _chance(np.concatenate(found), by_cause(stock.candidates))
-
-
-def _chance(found: Array, places: Mapping[str, list[int]]) -> Chance:
+    every = np.concatenate(found)
     start, scale, share = {}, {}, 0.15
-    for cause, own in places.items():
-        if not np.isfinite(found[:, own]).any():
+    for cause, own in by_cause(stock.candidates).items():
+        if not np.isfinite(every[:, own]).any():
             start[cause], scale[cause] = 0.0, 1.0  # it has no place in these data
             continue
-        most = np.sort(averaged(found[:, own]))[int((1.0 - share) * len(found)):]
+        most = np.sort(averaged(every[:, own]))[int((1.0 - share) * len(every)):]
         start[cause], scale[cause] = float(most[0]), max(float((most - most[0]).mean()), 0.7)
     return Chance(start, scale, share)
 
@@ -263,7 +260,7 @@ def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
     found = [each for each in search.candidates if each.cause in causes]
     whole = regression_problem(replays)
     return replace(search, problem=whole, bank=bank(whole, found), rate=rate,
-                   scanned=SCANNED & frozenset(causes), banks={}, looked={})
+                   scanned=SCANNED & frozenset(causes), banks={}, found_before={})
 
 
 def _of_likely_noises(whole: RegressionProblem, found: Sequence[Candidate]) -> RegressionProblem:
@@ -326,14 +323,14 @@ def _unfolded(each: Replay, frequency: float) -> float:
                                2 * samples.points)) ** 2
     folds = np.arange(each.every // 2 + 1) / each.step
     places = 2.0 * samples.duration * np.concatenate([folds + frequency, folds[1:] - frequency])
-    return float(max(places[places < len(power) - 3],
-                     key=lambda at: _outstanding(power, round(at)))) / (2.0 * samples.duration)
 
+    def outstanding(at: float) -> float:
+        """Return what the power at a frequency is over that of its neighbours."""
+        place = round(at)
+        return float(power[place - 2:place + 3].max()
+                     / np.median(power[max(place - 60, 0):place + 61]))
 
-def _outstanding(power: Array, place: int) -> float:
-    """Return what the power at a frequency is over that of its neighbours."""
-    return float(power[place - 2:place + 3].max()
-                 / np.median(power[max(place - 60, 0):place + 61]))
+    return float(max(places[places < len(power) - 3], key=outstanding)) / (2.0 * samples.duration)
 
 
 def _of_the_gyro(each: Replay, frequency: float) -> bool:
@@ -499,8 +496,7 @@ _POWERS = {'sine_response': 2.0, 'time_offset': 1.0, 'bandwidth': 1.0, 'clock_ra
 
 def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
     """Return a cause of fixed amplitude with the shape that its free amplitude suggests."""
-    power = _POWERS.get(candidate.cause)
-    if power is None:
+    if candidate.cause not in _POWERS:
         return candidate
     own = columns_of(candidate, before.problem.replays) / before.problem.deviation
     free = with_columns(before, own)
@@ -508,7 +504,7 @@ def _unbent(before: Fitted, candidate: Candidate) -> Candidate:
     ratio = float(values[-1])
     place = fitted_shapes(candidate)[0]
     return with_shape(candidate, place, candidate.shapes[place]
-                      * float(np.copysign(abs(ratio) ** (1.0 / power), ratio)))
+                      * float(np.copysign(abs(ratio) ** (1.0 / _POWERS[candidate.cause]), ratio)))
 
 
 def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
@@ -522,9 +518,9 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     """
     key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
                 for each in named)
-    if key not in search.looked:
-        search.looked[key] = _strongest(search, named)
-    return search.looked[key]
+    if key not in search.found_before:
+        search.found_before[key] = _strongest(search, named)
+    return search.found_before[key]
 
 
 def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
@@ -601,14 +597,11 @@ def searched(search: Search) -> tuple[Named, ...]:
     if all(is_named(each.candidate) for each in everything):
         return everything
     nameable = [each for each in search.candidates if is_named(each)]
-    named = _grown(replace(search, bank=bank(search.problem, nameable), banks={}, looked={}))
+    named = _grown(replace(search, bank=bank(search.problem, nameable), banks={}, found_before={}))
     return max((everything, named),
-               key=lambda each: fitted(search.problem, each).score - sum(map(_price, each)))
-
-
-def _price(known: Named) -> float:
-    """Return what a cause of a list costs, in logarithms of the likelihood."""
-    return price_of_freedom(known) + (0.0 if is_named(known.candidate) else MARGIN)
+               key=lambda named: fitted(search.problem, named).score - sum(
+                   price_of_freedom(each) + (0.0 if is_named(each.candidate) else MARGIN)
+                   for each in named))
 
 
 def price_of_freedom(known: Named) -> float:
