@@ -83,19 +83,14 @@ def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
         columns = _OF_THE_REFERENCE[name]
         return Candidate(name, shapes, lambda each: columns(each, *shapes), run)
     known = CATALOGUE[name]
-    if known.distortion is not None:
-        return Candidate(name, shapes, lambda each: (_distorted(each, name, *shapes),), run, 1.0)
+    if (distortion := known.distortion) is not None:
+        # what it changes of the rate: a delay, a lag, another clock, a limit
+        return Candidate(name, shapes, lambda each: (
+            distortion(each.channels.rate, each.channels.time, *shapes) - each.channels.rate,),
+            run, 1.0)
     amplitude = known.coefficients[0].default if known.coefficients else None
     return Candidate(name, shapes, lambda each: known.columns(each.channels, *shapes), run,
                      amplitude)
-
-
-def _distorted(each: Replay, name: str, *shapes: float) -> Array:
-    """Return what a distortion changes of the rate: a delay, a lag, another clock, a limit."""
-    rate = each.channels.rate
-    known = CATALOGUE[name].distortion
-    assert known is not None
-    return known(rate, each.channels.time, *shapes) - rate
 
 
 def _once_per_revolution(each: Replay) -> Sequence[Array]:
@@ -241,7 +236,6 @@ def _of_the_signal(interval: float) -> Iterator[Candidate]:
     yield effect('clock_rate', 1e-6)
 
 
-#: Cause -> the candidates of it, by their places in a list.
 def by_cause(found: Sequence[Candidate]) -> Mapping[str, list[int]]:
     """Return the places of the candidates of each cause."""
     places: dict[str, list[int]] = {}

@@ -72,17 +72,14 @@ _VERDICTS = {'adequate': 'Adequate: no cause was found',
 
 _METHOD = (
     '{logs} replayed through the simulation: the motion and the temperature as recorded, the '
-    'output as the model has it.',
-    'What the output then differs by, the residual, was compared with every cause of the '
-    'catalogue, under a noise of angle random walk,',
-    'flicker and rate random walk that was found together with the causes.',
-    'A cause is named where it shows more than the strongest of all causes does in noise drawn '
-    'for this very log, so that of logs without',
-    'any cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and '
-    'taken back where another one explains more.',
-    'Those that explain the same are given as a set, of which the simplest is in the model. Bias '
-    'and scale factor are fitted in any case.',
-    'The gain was measured on parts that took no part in this; intervals are of 95 %.')
+    'output as the model has it. What the output then differs by, the residual, was compared with '
+    'every cause of the catalogue, under a noise of angle random walk, flicker and rate random '
+    'walk that was found together with the causes. A cause is named where it shows more than the '
+    'strongest of all causes does in noise drawn for this very log, so that of logs without any '
+    'cause {share} give an alarm. Causes were added one at a time, refined, exchanged, and taken '
+    'back where another one explains more. Those that explain the same are given as a set, of '
+    'which the simplest is in the model. Bias and scale factor are fitted in any case. The gain '
+    'was measured on parts that took no part in this; intervals are of 95 %.')
 
 
 def report(diagnosis: Diagnosis) -> str:
@@ -109,21 +106,18 @@ def _as_it_was(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _header(diagnosis: Diagnosis) -> Markup:
-    what, won = headline(diagnosis)
+    what, gained = headline(diagnosis)
     gyro = ' '.join(clean(str(diagnosis.model.gyro.get(name, '')))
                     for name in ('name', 'serial_number')).strip()
     about = ' · '.join(filter(None, ['Diagnosis', gyro, ', '.join(map(clean, diagnosis.logs))]))
     return element('header', element('p', about, class_='about'), element('h1', what),
-                   element('p', won, class_='won'),
+                   element('p', gained, class_='gained'),
                    element('p', _VERDICTS[diagnosis.verdict],
-                           class_=f'verdict {diagnosis.verdict}'), _tiles(diagnosis.gain))
-
-
-def _tiles(gain: Gain | None) -> Markup | None:
-    if gain is None:
-        return None
-    return element('div', *(_tile(sentence(what).rstrip('.'), errors, unit)
-                            for what, errors, unit in _errors(gain)), class_='tiles')
+                           class_=f'verdict {diagnosis.verdict}'),
+                   None if diagnosis.gain is None else element(
+                       'div', *(_tile(sentence(what).rstrip('.'), errors, unit)
+                                for what, errors, unit in _errors(diagnosis.gain)),
+                       class_='tiles'))
 
 
 def _tile(what: str, errors: Change, unit: str) -> Markup:
@@ -137,8 +131,8 @@ def _tile(what: str, errors: Change, unit: str) -> Markup:
 
 
 def _gained(errors: Change, unit: str) -> str:
-    won = errors.before - errors.after
-    return str(quantity(Estimate(won, errors.interval or (won, won), unit)))
+    gained = errors.before - errors.after
+    return str(quantity(Estimate(gained, errors.interval or (gained, gained), unit)))
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
@@ -315,17 +309,14 @@ def _thinned(at: Array, *values: Array) -> list[Array]:
 
 def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
     facts = [*certainty(found), smallest(found), remedy(found, diagnosis)]
-    uncertain = element('p', alternatives(found), class_='doubt') if found.ambiguous_with else None
+    uncertain = (element('p', alternatives(found), class_='uncertain') if found.ambiguous_with
+                 else None)
     title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect),
-                    ' ', _code(found.effect))
+                    ' ', element('code', found.effect, class_='quiet')  # as files have it
+                    if spoken(found.effect) != clean(found.effect) else None)
     return element('article', title, *(element('p', text) for text in shown_by(found)),
                    _parameters(found), uncertain,
                    element('p', ' '.join(filter(None, facts)), class_='quiet'))
-
-
-def _code(effect: str) -> Markup | None:
-    """Return the name that files have, where it is another one."""
-    return element('code', effect, class_='quiet') if spoken(effect) != clean(effect) else None
 
 
 def _parameters(found: Finding) -> Markup | None:
@@ -357,10 +348,16 @@ def _shares(diagnosis: Diagnosis) -> Iterator[Markup]:
 
 
 def _gain(diagnosis: Diagnosis) -> Iterator[Markup | None]:
-    if diagnosis.gain is not None:
-        yield element('p', _gain_sentences(diagnosis.gain))
     parts = [] if diagnosis.heading is None else [draw(_heading(diagnosis.heading))]
-    parts += [] if diagnosis.gain is None else [_gain_table(diagnosis.gain)]
+    if diagnosis.gain is not None:
+        errors = _errors(diagnosis.gain)
+        yield element('p', ' '.join([
+            f'Measured on {clean(diagnosis.gain.held_out)}, which took no part in the choice or '
+            'the fit.', *(f'The extended model {change(each, unit, f"the {what}")}.'
+                          for what, each, unit in errors)]))
+        parts.append(_folding(['rms', 'before', 'after', 'reduction, 95 % interval'], [
+            [what, amount(each.before, unit), amount(each.after, unit), _gained(each, unit)]
+            for what, each, unit in errors]))
     yield _pairs(parts) if parts else None
 
 
@@ -369,19 +366,6 @@ def _errors(gain: Gain) -> list[tuple[str, Change, str]]:
     heading = ([] if gain.heading is None
                else [(f'heading error over {gain.window:g} s', gain.heading, 'rad')])
     return [*heading, ('rate error', gain.rate, 'rad/s')]
-
-
-def _gain_sentences(gain: Gain) -> str:
-    changes = [f'The extended model {change(errors, unit, f"the {what}")}.'
-               for what, errors, unit in _errors(gain)]
-    return ' '.join([f'Measured on {clean(gain.held_out)}, which took no part in the choice or '
-                     'the fit.', *changes])
-
-
-def _gain_table(gain: Gain) -> Markup:
-    return _folding(['rms', 'before', 'after', 'reduction, 95 % interval'], [
-        [what, amount(errors.before, unit), amount(errors.after, unit), _gained(errors, unit)]
-        for what, errors, unit in _errors(gain)])
 
 
 def _heading(curve: HeadingCurve) -> Chart:
@@ -433,6 +417,6 @@ def _method(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
     share = f'{100.0 * diagnosis.false_alarm_rate:.2g} %'
     yield element('p', sentence(diagnosis.method)
-                  or ' '.join(_METHOD).format(logs=logs, share=share))
+                  or _METHOD.format(logs=logs, share=share))
     yield _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None
     yield element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')

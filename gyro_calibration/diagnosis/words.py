@@ -103,7 +103,9 @@ def quantity(estimate: Estimate, parameter: str = '') -> Quantity:
     power = _power(max((abs(number) for number in numbers if math.isfinite(number)), default=0.0))
     value, low, high = (number / 10.0 ** power for number in numbers)
     width = high - low
-    decimals = _decimals(0.5 * width) if 0.0 < width < math.inf else None
+    # those that show two digits of the deviation
+    decimals = (min(max(0, 1 - math.floor(math.log10(0.5 * width))), 8)
+                if 0.0 < width < math.inf else None)
     interval = f'{_fixed(low, decimals)} to {_fixed(high, decimals)}' if width > 0.0 else ''
     return Quantity(_fixed(value, decimals), interval, _times(power), unit)
 
@@ -118,11 +120,6 @@ def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str,
 def _power(largest: float) -> int:
     """Return the power of ten to write beside numbers up to this one: 0 if readable without."""
     return 0 if largest == 0.0 or 1e-4 <= largest < 1e6 else math.floor(math.log10(largest))
-
-
-def _decimals(deviation: float) -> int:
-    """Return the decimals that show two digits of a deviation."""
-    return min(max(0, 1 - math.floor(math.log10(deviation))), 8)
 
 
 def _fixed(value: float, decimals: int | None) -> str:

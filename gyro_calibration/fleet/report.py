@@ -78,7 +78,7 @@ def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
     about = f'{len(records) - used} more logs are no evidence.' if used < len(records) else None
     body = joined(
         element('header', element('p', 'Fleet', class_='about'), element('h1', title),
-                element('p', about, class_='won') if about else None),
+                element('p', about, class_='gained') if about else None),
         element('main', *(part for place, found in enumerate(types)
                           for part in _type(found, place)), _logs(records)),
         _STYLE, _SCRIPT)
