@@ -16,11 +16,8 @@ tau is half the mean square of the difference between neighbouring means over ta
 at every sample (overlapping). Its uncertainty is computed: second differences of the angle are
 Gaussian, and the variances and covariances of their mean squares follow from theirs.
 
-Reading order, each imports only from those before it: `angle` (of samples, some of them lost),
-`rest` (refuses what is no gyro at rest), `record` (samples on an even grid); `parts` (of the
-noise), `covariance` (of Allan variances), `freedom` (degrees of it, and bounds), `chart` (the
-Allan deviation); `octaves` (the Allan variances that are fitted), `description` (a combination of
-parts, fitted), `ranking` (of all combinations), `figures` (of the likeliest).
+Reading order: `record` (samples at rest on an even grid), `deviation` (the chart, and the
+covariance of Allan variances), `noise_fit` (parts of the noise).
 
 """
 
@@ -29,10 +26,10 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from gyro_calibration.allan.chart import allan_deviation, AllanChart, averaging_sizes, Floor
-from gyro_calibration.allan.figures import Figure, fit_noise, NoiseFit
-from gyro_calibration.allan.parts import Part, PARTS
+from gyro_calibration.allan.deviation import allan_deviation, AllanChart, averaging_sizes, Floor
+from gyro_calibration.allan.noise_fit import Figure, fit_noise, NoiseFit
 from gyro_calibration.allan.record import even_record, Record
+from gyro_calibration.model.noise import Part, PARTS
 
 __all__ = ['PARTS', 'AllanChart', 'Figure', 'Floor', 'NoiseFit', 'Part', 'Record',
            'allan_deviation', 'averaging_sizes', 'even_record', 'fit_noise']

@@ -37,7 +37,7 @@ from gyro_calibration.calibration.likelihood import (
 from gyro_calibration.calibration.self_calibration import Limits
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Number
 from gyro_calibration.model.motion import from_rates, Motion
-from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.noise import increment_covariance, Noise
 import numpy as np
 from scipy.optimize import differential_evolution
 
@@ -220,7 +220,7 @@ def _noises(noise: Noise, duration: float, blocks: int, length: float, later: in
     cells = blocks * _CELLS
     edges = np.concatenate([np.linspace(0.0, duration, cells + 1),
                             duration + np.linspace(0.0, length, later + 1)[1:]])
-    covariance, spread = _covariance(noise, edges), _spread(blocks, duration / blocks)
+    covariance, spread = increment_covariance(noise, edges), _spread(blocks, duration / blocks)
     sums = np.tril(np.full((later, later), length / later))
     white = spread @ spread.T * (noise.angle_random_walk ** 2 * cells / duration)
     return _Noises(np.linalg.inv(white), spread @ covariance[:cells, :cells] @ spread.T,
@@ -233,24 +233,6 @@ def _spread(blocks: int, length: float) -> Array:
     rising = (np.arange(_CELLS) + 0.5) / _CELLS
     before, after = np.eye(blocks)[:-1], np.eye(blocks)[1:]
     return (np.kron(before, rising) + np.kron(after, rising[::-1])) * length / _CELLS
-
-
-def _covariance(noise: Noise, edges: Array) -> Array:
-    """
-    Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
-
-    Flicker and random walk have no variance, but their increments do: generalized covariances
-    -B² / pi log|t| and -K² / 2 |t|. Sums whose weights add up to zero, as the error of a bias
-    against a later bias, have the right variance.
-
-    """
-    apart = np.abs(edges[:, None] - edges)
-    logarithm = np.log(np.where(apart > 0.0, apart, 1.0))
-    twice = (-noise.bias_instability ** 2 / math.pi * apart ** 2 * (0.5 * logarithm - 0.75)
-             - noise.rate_random_walk ** 2 / 12.0 * apart ** 3)
-    lengths = np.diff(edges)
-    within = -np.diff(np.diff(twice, axis=0), axis=1) / np.outer(lengths, lengths)
-    return within + np.diag(noise.angle_random_walk ** 2 / lengths)
 
 
 def _heading(drive: Motion, time: Array) -> Array:

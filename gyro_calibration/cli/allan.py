@@ -154,8 +154,8 @@ def _said_of_fit(fit: NoiseFit) -> str:
     if fit.misfit:
         text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
                  'unexplained, which the intervals allow for')
-    if fit.rivals:
-        others = ' or '.join(' + '.join(rival) for rival in fit.rivals)
+    if fit.alternatives:
+        others = ' or '.join(' + '.join(each) for each in fit.alternatives)
         text += f'; {others} would describe them nearly as well, and a longer record would tell'
     return f'{text}.'
 
@@ -177,6 +177,6 @@ def _data(given: argparse.Namespace, record: Record, chart: AllanChart,
                                  'upper': upper, 'seen': fit.floor_reached},
             'floor': {**vars(chart.floor), 'reached': fit.floor_reached},
             'fitted_from_s': fit.shortest, 'fitted_to_s': fit.longest, 'misfit': fit.misfit,
-            'rivals': list(fit.rivals),
+            'rivals': list(fit.alternatives),
             'chart': {name: values.tolist() for name, values in columns.items()},
             'picture': given.picture, 'out': given.out}

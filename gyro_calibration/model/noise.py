@@ -8,10 +8,11 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Noise of a gyro after IEEE Std 952: angle random walk, bias instability, rate random walk."""
+"""Noise of a gyro after IEEE Std 952: its parts, their Allan variances, processes and samples."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -117,6 +118,91 @@ def known_mean(constant: Number) -> tuple[Number, Number]:
     ratio = CALIBRATED / constant
     gone = 1.0 - np.exp(-ratio)
     return 2.0 * (ratio - gone) / ratio ** 2, gone / ratio
+
+
+def increment_covariance(noise: Noise, edges: Array) -> Array:
+    """
+    Return the covariance of means of the noise between edges, s, shape (n - 1, n - 1), (rad/s)².
+
+    Flicker and random walk have no variance, but their increments do (`Part.covariance`). Sums
+    whose weights add up to zero, as the error of a bias against a later bias, have the right
+    variance.
+
+    """
+    apart, lengths = edges[:, None] - edges, np.diff(edges)
+    angle = (noise.bias_instability ** 2 * FLICKER.covariance(apart)
+             + noise.rate_random_walk ** 2 * RATE_RANDOM_WALK.covariance(apart))
+    means = np.diff(np.diff(angle, axis=0), axis=1) / np.outer(lengths, lengths)
+    return means + np.diag(noise.angle_random_walk ** 2 / lengths)
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """
+    A first-order Gauss-Markov process.
+
+    Attributes
+    ----------
+    density : of the white noise that drives it, rad/s/√s
+    correlation_time : s
+
+    """
+
+    density: float
+    correlation_time: float
+
+    def allan_variance(self, duration: Array) -> Array:
+        """Return the Allan variance at averaging times, s, of shape (n,) (IEEE 952, C.21)."""
+        ratio = duration / self.correlation_time
+        # the difference of the exponentials loses all digits where the ratio is small
+        series = ratio ** 3 * (2.0 / 3.0 - ratio / 2.0)
+        bracket = 2.0 * ratio + 4.0 * np.expm1(-ratio) - np.expm1(-2.0 * ratio)
+        bracket = np.where(ratio < 1e-3, series, bracket)
+        return self.density ** 2 * self.correlation_time * bracket / (2.0 * ratio ** 2)
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    A part of the noise, by the slope of its Allan deviation (IEEE Std 952, C.1).
+
+    Attributes
+    ----------
+    name, symbol, unit : as in IEEE Std 952; the unit in SI
+    slope : of the Allan deviation in the logarithmic chart
+    factor : Allan variance = factor * coefficient² * tau ** (2 slope)
+    covariance : of the angle, for a coefficient of 1, as a function of the time between, up to
+        terms that second differences remove
+
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    slope: float
+    factor: float
+    covariance: Callable[[Number], Array]
+
+    def variance(self, time: Number) -> Array:
+        """Return the Allan variance for a coefficient of 1."""
+        return self.factor * np.asarray(time, dtype=float) ** (2.0 * self.slope)
+
+
+def _flicker_covariance(time: Number) -> Array:
+    """Return t² ln t / (2 pi): the second difference has the Allan variance 2 ln 2 / pi."""
+    size = np.abs(time)
+    return size ** 2 * np.log(np.where(size == 0.0, 1.0, size)) / (2.0 * math.pi)
+
+
+ANGLE_RANDOM_WALK = Part('angle_random_walk', 'N', 'rad/√s', -0.5, 1.0,
+                         lambda time: -0.5 * np.abs(time))
+FLICKER = Part('flicker', 'B', 'rad/s', 0.0, ALLAN_FLOOR ** 2, _flicker_covariance)
+RATE_RANDOM_WALK = Part('rate_random_walk', 'K', 'rad/s/√s', 0.5, 1.0 / 3.0,
+                        lambda time: np.abs(time) ** 3 / 12.0)
+QUANTIZATION = Part('quantization', 'Q', 'rad', -1.0, 3.0,
+                    lambda time: (np.asarray(time) == 0.0).astype(float))
+RATE_RAMP = Part('rate_ramp', 'R', 'rad/s²', 1.0, 0.5, lambda time: 0.0 * np.asarray(time))
+PARTS = (ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK, QUANTIZATION, RATE_RAMP)
 
 
 def simulate_noise(noise: Noise, count: int, interval: float,

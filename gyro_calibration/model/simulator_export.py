@@ -27,37 +27,12 @@ from xml.sax.saxutils import escape
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import Channels
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.noise import Noise
+from gyro_calibration.model.noise import GaussMarkov, Noise
 import numpy as np
 from scipy.optimize import minimize
 
 #: Below this step, rad/s, Gazebo does not quantize.
 _FINEST_STEP = 1e-6
-
-
-@dataclass(frozen=True)
-class GaussMarkov:
-    """
-    A first-order Gauss-Markov process.
-
-    Attributes
-    ----------
-    density : of the white noise that drives it, rad/s/√s
-    correlation_time : s
-
-    """
-
-    density: float
-    correlation_time: float
-
-    def allan_variance(self, duration: Array) -> Array:
-        """Return the Allan variance at averaging times, s, of shape (n,) (IEEE 952, C.21)."""
-        ratio = duration / self.correlation_time
-        # the difference of the exponentials loses all digits where the ratio is small
-        series = ratio ** 3 * (2.0 / 3.0 - ratio / 2.0)
-        bracket = 2.0 * ratio + 4.0 * np.expm1(-ratio) - np.expm1(-2.0 * ratio)
-        bracket = np.where(ratio < 1e-3, series, bracket)
-        return self.density ** 2 * self.correlation_time * bracket / (2.0 * ratio ** 2)
 
 
 def gauss_markov(noise: Noise, interval: float, span: float) -> tuple[GaussMarkov, float]:

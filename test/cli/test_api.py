@@ -47,11 +47,11 @@ def run_model():
     return self_calibrate(simulate(GYRO, 'calibration', seed=1), 'calibration', NOISE)
 
 
-@pytest.mark.parametrize('order', ['import gyro_calibration.allan.chart; {}',
-                                   '{}; import gyro_calibration.allan.chart'])
+@pytest.mark.parametrize('order', ['import gyro_calibration.allan.deviation; {}',
+                                   '{}; import gyro_calibration.allan.deviation'])
 def test_allan_is_a_function_and_a_folder_whichever_comes_first(order):
     program = order.format('from gyro_calibration import allan') + """
-import gyro_calibration, gyro_calibration.allan.chart as chart, numpy
+import gyro_calibration, gyro_calibration.allan.deviation as chart, numpy
 from gyro_calibration.allan import allan_deviation
 log = gyro_calibration.simulate(gyro_calibration.read_model(
     {'effects': {}, 'noise': {'angle_random_walk': 1e-3}}), 'rest', seed=1)

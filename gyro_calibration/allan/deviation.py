@@ -1,0 +1,281 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+Overlapping Allan deviation over averaging time, with bounds.
+
+Everything but the chart is in samples. An Allan variance is a mean square of second differences of
+the angle, and mean squares of Gaussian values have the covariance 2 c² summed over all pairs
+(Greenhall and Riley, Uncertainty of stability variances based on finite differences, PTTI 2003).
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import Any
+
+from gyro_calibration.allan.record import angle_of, lost_before, refuse_few, whole
+from gyro_calibration.logs.log import Array, DataRefused, Progress
+from gyro_calibration.logs.stamps import Integers
+from gyro_calibration.model.noise import (
+    ALLAN_FLOOR,
+    ANGLE_RANDOM_WALK,
+    FLICKER,
+    Part,
+    PARTS,
+    QUANTIZATION,
+    RATE_RAMP,
+    RATE_RANDOM_WALK,
+)
+import numpy as np
+from scipy.special import chdtri
+
+#: Samples in a block: its few arrays stay in the cache for all averaging times.
+_BLOCK = 16384
+#: numpy gives longer products to several threads, which costs more than it saves.
+_PRODUCT = 8192
+#: Lags to a window, and to the longer one of two: more change the covariance by less than 1 %.
+_FINE, _COARSE = 8, 512
+#: Places of quantization and ramp among the parts, and parts whose second differences are
+#: independent over longer times.
+_QUANTIZATION, _RAMP = PARTS.index(QUANTIZATION), PARTS.index(RATE_RAMP)
+_FORGETTING = [place for place, part in enumerate(PARTS)
+               if part not in (RATE_RANDOM_WALK, RATE_RAMP)]
+
+
+@dataclass(frozen=True)
+class Floor:
+    """
+    The lowest point of a chart, by the upper bound.
+
+    The deviation itself would not do: at the end of the chart single points are low by chance.
+
+    Attributes
+    ----------
+    time : averaging time, s
+    deviation, lower, upper : Allan deviation there and its 95 % bounds, rad/s
+
+    """
+
+    time: float
+    deviation: float
+    lower: float
+    upper: float
+
+    @property
+    def bias_instability(self) -> tuple[float, float, float]:
+        """Return B, 1 / 0.664 of the floor (IEEE Std 952), and its bounds, rad/s."""
+        return self.deviation / ALLAN_FLOOR, self.lower / ALLAN_FLOOR, self.upper / ALLAN_FLOOR
+
+
+@dataclass(frozen=True)
+class AllanChart:
+    """
+    The overlapping Allan deviation, each array of shape (n,).
+
+    Attributes
+    ----------
+    interval : between samples, s
+    samples : how many the record has, lost ones included
+    size : averaging times in samples
+    deviation : rad/s
+    differences : how many second differences the mean square is taken over
+    degrees_of_freedom : equivalent ones, of the mean square
+    lower, upper : bounds of the deviation with 95 % confidence, rad/s
+
+    """
+
+    interval: float
+    samples: int
+    size: Integers
+    deviation: Array
+    differences: Integers
+    degrees_of_freedom: Array
+    lower: Array
+    upper: Array
+
+    @property
+    def floor(self) -> Floor:
+        """Return the lowest point."""
+        lowest = int(np.argmin(self.upper))
+        return Floor(*(float(values[lowest])
+                       for values in (self.time, self.deviation, self.lower, self.upper)))
+
+    @property
+    def time(self) -> Array:
+        """Return the averaging times, s."""
+        return self.size * self.interval
+
+
+def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
+    """Return averaging times in samples, evenly spaced in log, up to a third of the record."""
+    decades = math.log10(max(samples // 3, 1))
+    return np.unique(np.round(
+        np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
+
+
+def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array | None = None,
+                    progress: Progress = iter) -> AllanChart:
+    """
+    Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
+
+    Parameters
+    ----------
+    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
+    interval : s
+    times : averaging times, s, taken to the nearest whole number of intervals; default: ten a
+        decade, up to a third of the record
+    progress : is given the blocks of the record to go through, such as a progress bar
+
+    Raises
+    ------
+    DataRefused : too few samples, or an averaging time that does not fit twice into the record
+
+    """
+    refuse_few(int(np.isfinite(rate).sum()))
+    samples = len(rate)
+    if times is None:
+        sizes = averaging_sizes(samples)
+    else:
+        sizes = np.unique(np.round(np.asarray(times, dtype=float) / interval).astype(np.int64))
+        if not sizes.size or sizes[0] < 1 or 2 * sizes[-1] > samples:
+            given = (f'{sizes[0] * interval:g} to {sizes[-1] * interval:g} s' if sizes.size
+                     else 'none')
+            raise DataRefused(f'averaging times: {given}; wanted at least one sample, '
+                              f'{interval:g} s, and at most half the record, '
+                              f'{samples // 2 * interval:g} s: choose others, or record longer')
+    sums, counts = _square_sums(rate, sizes, progress)
+    some = counts > 0
+    sizes, counts = sizes[some], counts[some]
+    variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
+    freedom = _degrees_of_freedom(samples, sizes, variance) * counts / (samples + 1 - 2 * sizes)
+    # A few windows that fit between gaps are nearly the same ones and count less than a single
+    # one, but for rounding: their deviation has no upper bound.
+    bounded = freedom >= 1.0 - 1e-9
+    sizes, counts = sizes[bounded], counts[bounded]
+    variance, freedom = variance[bounded], freedom[bounded]
+    return AllanChart(interval, samples, sizes, np.sqrt(variance), counts, freedom,
+                      *chi_squared_bounds(variance, freedom))
+
+
+def _square_sums(rate: Array, sizes: Integers, progress: Progress) -> tuple[Array, Integers]:
+    """Return the sums of the squared second differences of the angle, and their numbers."""
+    angle, lost = angle_of(rate), lost_before(rate)
+    twice, buffer = 2.0 * angle, np.empty(_BLOCK)
+    sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
+    for begin in progress(range(0, len(angle), _BLOCK)):
+        for place, size in enumerate(sizes.tolist()):
+            end = min(begin + _BLOCK, len(angle) - 2 * size)
+            if end <= begin:
+                break
+            block = buffer[:end - begin]
+            np.add(angle[begin + 2 * size:end + 2 * size], angle[begin:end], out=block)
+            np.subtract(block, twice[begin + size:end + size], out=block)
+            if lost is None:
+                counts[place] += len(block)
+            else:
+                kept = whole(lost, size, begin, end)
+                block *= kept
+                counts[place] += np.count_nonzero(kept)
+            sums[place] += sum(float(part @ part) for part in (block[:_PRODUCT], block[_PRODUCT:]))
+    return sums, counts
+
+
+# degrees of freedom
+
+def chi_squared_bounds(mean_square: Any, freedom: Any) -> tuple[Any, Any]:
+    """Return the 95 % bounds of a root mean square (NIST SP 1065, eq. 45)."""
+    lower, upper = (np.sqrt(mean_square * freedom / chdtri(freedom, tail))
+                    for tail in (0.025, 0.975))
+    return lower, upper
+
+
+def _degrees_of_freedom(samples: int, sizes: Integers, variance: Array) -> Array:
+    """Return (sum of variances)² / sum of covariances² (Greenhall and Riley, PTTI 2003)."""
+    freedom = []
+    for size, part in zip(sizes.tolist(), _parts_by_slope(sizes, variance)):
+        count = samples + 1 - 2 * size
+        # quantization is white: its covariance is above zero at single lags only
+        stride = 1 if part is QUANTIZATION else max(1, size // _FINE)
+        lags = np.arange(min(10 * size, count - 1) // stride + 1) * stride
+        squares = _lag_covariance(part, size, size, lags) ** 2 * (count - lags) * stride
+        freedom.append(max(1.0, float(squares[0]) * count / stride
+                           / float(2.0 * squares.sum() - squares[0])))
+    return np.array(freedom)
+
+
+def _parts_by_slope(sizes: Integers, variance: Array) -> list[Part]:
+    """
+    Return the random part that fits the slope of each Allan variance best.
+
+    The slope of the logarithm is that from half to twice each time, -1 for a lone one.
+    Quantization stands at the short end; a steep fall elsewhere is chance.
+
+    """
+    low, high = (np.searchsorted(sizes, sizes / 2.0),
+                 np.searchsorted(sizes, 2.0 * sizes, side='right') - 1)
+    rise = np.log(np.maximum(variance[high], 1e-300) / np.maximum(variance[low], 1e-300))
+    slopes = np.where(
+        high > low, rise / np.where(high > low, np.log(sizes[high] / sizes[low]), 1.0), -1.0)
+    parts = [min((ANGLE_RANDOM_WALK, FLICKER, RATE_RANDOM_WALK),
+                 key=lambda part: abs(2.0 * part.slope - slope)) for slope in slopes]
+    steep = int(np.argmin(np.append(slopes < -1.5, False)))
+    return [QUANTIZATION] * steep + parts[steep:]
+
+
+# covariance of second differences of the angle, and of Allan variances
+
+def _lag_covariance(part: Part, first: int, second: int, lags: Integers) -> Array:
+    """Return the covariance of second differences over `first` and `second` samples at lags."""
+    return np.sum([a * b * part.covariance(lags + (j * second - i * first))
+                   for i, a in enumerate((1.0, -2.0, 1.0))
+                   for j, b in enumerate((1.0, -2.0, 1.0))], axis=0)
+
+
+def covariance_form(samples: int, first: int, second: int) -> Array:
+    """
+    Return the covariance of two Allan variances as a form of squared coefficients, shape (5, 5).
+
+    Angle quantization is white: only lags at which two of its samples meet count. A ramp is no
+    noise, but multiplies it: the covariance of squares of values with a mean m also has 4 m² c.
+
+    """
+    counts, area = ((samples + 1 - 2 * first, samples + 1 - 2 * second),
+                    float(first) ** 2 * float(second) ** 2)
+
+    def pairs_at(lags: Integers) -> Integers:
+        """Return how many pairs of second differences stand at each lag."""
+        return np.maximum(np.minimum(counts[0], counts[1] - lags) - np.maximum(0, -lags), 0)
+
+    # lags that are dense enough for all but quantization
+    longer, shorter = max(first, second), min(first, second)
+    stride = max(1, shorter // _FINE, longer // _COARSE)
+    lags = np.arange(-(min(10 * longer, counts[0]) // stride),
+                     min(10 * longer, counts[1]) // stride + 1) * stride
+    values = np.array([_lag_covariance(part, first, second, lags) for part in PARTS])
+    values[_QUANTIZATION] = 0.0
+    if stride > max(1, shorter // 2):
+        values[_FORGETTING] = 0.0  # independent over times so far apart
+    pairs = pairs_at(lags) * float(stride)
+    # lags at which two samples of quantization meet
+    lags = np.unique([i * first - j * second for i in range(3) for j in range(3)])
+    meeting = np.array([_lag_covariance(part, first, second, lags) for part in PARTS])
+    meeting_pairs = pairs_at(lags)
+    # not a product of matrices, which starts threads
+    form = np.array([[2.0 * (pairs * one * other).sum() for other in values] for one in values])
+    form[_QUANTIZATION] = form[:, _QUANTIZATION] = 2.0 * (
+        meeting * meeting[_QUANTIZATION] * meeting_pairs).sum(axis=1)
+    slopes = (values * pairs).sum(axis=1)
+    slopes[_QUANTIZATION] = meeting[_QUANTIZATION] @ meeting_pairs
+    form[_RAMP] = form[:, _RAMP] = 2.0 * area * slopes
+    return form / (4.0 * area * counts[0] * counts[1])

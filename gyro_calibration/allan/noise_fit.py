@@ -1,0 +1,467 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""
+The noise figures of a record: the coefficient of each part of the noise, and its bounds.
+
+Allan variances at octaves are fitted by every combination of parts (`Description`), which are
+ranked by likelihood (`Ranking`); the best of them gives the figures.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+import itertools
+import math
+
+from gyro_calibration.allan.deviation import (
+    allan_deviation,
+    AllanChart,
+    chi_squared_bounds,
+    covariance_form,
+)
+from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.model.noise import Noise, Part, PARTS, QUANTIZATION
+import numpy as np
+from scipy.optimize import nnls
+from scipy.special import chdtrc
+
+#: What a further part must take off -2 ln likelihood. White noise alone then shows no further part
+#: in 95 of 100 records.
+_EVIDENCE = 10.0
+#: A combination of other parts explains a record as well if its -2 ln likelihood is within this.
+_ALIKE = 6.0
+#: A combination that is likelier by this, but lacks evidence, widens the bounds.
+_WIDENS = 1.0
+#: -2 ln likelihood above its least at the ends of an interval of 95 %: that of chi squared.
+_CONFIDENCE = 3.84
+#: Least probability of a misfit as large as that of an accepted description.
+_CHANCE = 0.05
+#: Shares by which the Allan deviations may differ from the sum of the parts; the smallest one that
+#: suffices is taken.
+_MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
+#: The least number of octaves that shows a slope and its end.
+_FEWEST_OCTAVES = 4
+#: Places of the parts; beside them, what a filter takes from the variance: over times beyond its
+#: memory that has the slope of quantization, with the other sign.
+_N, _B, _K, _Q, _R = range(len(PARTS))
+_BEND = len(PARTS)
+#: Combinations of parts, without and with quantization, and with a bend of a random walk.
+_COMBINATIONS = [
+    combination for count in range(len(PARTS))
+    for places in itertools.combinations((_N, _B, _K, _R), count)
+    for combination in (places, (*places, _Q), (*places, _BEND) if _N in places else ())
+    if combination]
+
+
+@dataclass(frozen=True)
+class Octaves:
+    """
+    Allan variances at octaves and the terms of their covariance, all in samples.
+
+    Attributes
+    ----------
+    variance : shape (n,)
+    columns : of each part, and of a bend, for a coefficient of 1, shape (n, 6)
+    forms : the covariance as a quadratic form of squared coefficients, shape (n, n, 5, 5)
+
+    """
+
+    variance: Array
+    columns: Array
+    forms: Array
+
+    @classmethod
+    def of(cls, chart: AllanChart) -> Octaves:
+        columns = np.column_stack([*(part.variance(chart.size) for part in PARTS),
+                                   -QUANTIZATION.variance(chart.size)])
+        scarcity = np.sqrt((chart.samples + 1 - 2 * chart.size) / chart.differences)
+        forms = (_forms(chart.samples, tuple(chart.size.tolist()))
+                 * np.outer(scarcity, scarcity)[:, :, None, None])
+        return cls(chart.deviation ** 2, columns, forms)
+
+    def since(self, start: int) -> Octaves:
+        """Leave out the shortest averaging times."""
+        return Octaves(self.variance[start:], self.columns[start:], self.forms[start:, start:])
+
+    def covariance(self, squares: Array) -> Array:
+        """Return the covariance of the variances, shape (n, n), for these squared coefficients."""
+        return np.einsum('ijpq,p,q->ij', self.forms, squares[:_BEND], squares[:_BEND])
+
+    def model(self, squares: Array) -> Array:
+        """Return the sum of the parts for these squared coefficients, kept above zero."""
+        return np.maximum(self.columns @ squares, 1e-3 * self.variance)
+
+
+@lru_cache(maxsize=8)
+def _forms(samples: int, sizes: tuple[int, ...]) -> Array:
+    """Return the covariances as forms of the squared coefficients, shape (n, n, 5, 5)."""
+    forms = np.zeros((len(sizes),) * 2 + (len(PARTS),) * 2)
+    for i, j in itertools.combinations_with_replacement(range(len(sizes)), 2):
+        form = covariance_form(samples, sizes[i], sizes[j])
+        forms[i, j] = forms[j, i] = 0.5 * (form + form.T)
+    return forms
+
+
+@dataclass(frozen=True)
+class Description:
+    """
+    A combination of parts, fitted to octaves.
+
+    Attributes
+    ----------
+    octaves : the Allan variances that it describes
+    squares : squared coefficients, shape (6,)
+    half : Cholesky factor of the covariance of the variances
+
+    """
+
+    octaves: Octaves
+    squares: Array
+    half: Array
+
+    @property
+    def held(self) -> list[int]:
+        """Return the places of the parts with a coefficient above zero."""
+        return np.nonzero(self.squares)[0].tolist()
+
+    def _scores(self) -> tuple[Array, float]:
+        """
+        Return standard normal scores, and -2 ln of the density that they stand for.
+
+        A mean square is no Gaussian value; its cube root nearly is (Wilson and Hilferty, 1931).
+
+        """
+        model, deviation = self.octaves.model(self.squares), np.sqrt((self.half ** 2).sum(axis=1))
+        ninth = (deviation / model) ** 2 / 9.0
+        normal = (np.cbrt(self.octaves.variance / model) - 1.0 + ninth) / np.sqrt(ninth)
+        half = self.half / deviation[:, None]
+        density = (np.log(ninth).sum() + 2.0 / 3.0 * np.log(model).sum()
+                   + 2.0 * np.log(half.diagonal()).sum())
+        return np.linalg.solve(half, normal), float(density)
+
+    @cached_property
+    def surprise(self) -> float:
+        """Return -2 ln likelihood, up to a constant of all combinations."""
+        normal, density = self._scores()
+        return float(normal @ normal) + density
+
+    def cost(self) -> float:
+        """
+        Return -2 ln likelihood with the evidence that each part must bring.
+
+        A ramp must bring more, since in a single record a random walk looks like one.
+
+        """
+        return self.surprise + _EVIDENCE * len(self.held) + _ALIKE * (_R in self.held)
+
+    def likely(self) -> bool:
+        """Return whether chance explains the residuals."""
+        normal, _ = self._scores()
+        return chdtrc(len(normal) - len(self.held), float(normal @ normal)) > _CHANCE
+
+    def estimate(self, places: Sequence[int]) -> tuple[Array, Array]:
+        """Return the squares of parts by least squares, also negative; standard deviations."""
+        white = np.linalg.solve(self.half, self.octaves.columns[:, list(places)])
+        size = np.linalg.norm(white, axis=0)
+        inverse = np.linalg.pinv((white / size).T @ (white / size))
+        found = inverse @ (white / size).T @ np.linalg.solve(self.half, self.octaves.variance)
+        return found / size, np.sqrt(inverse.diagonal()) / size
+
+    def deviation(self, place: int) -> float:
+        """Return the standard deviation of the square of a part that is held."""
+        return float(self.estimate(self.held)[1][self.held.index(place)])
+
+    def bounds(self, place: int) -> tuple[float, float]:
+        """Return 95 % bounds of a coefficient, whose square is taken as a mean square."""
+        square = self.squares[place]
+        lower, upper = chi_squared_bounds(
+            square, max(2.0 * (square / self.deviation(place)) ** 2, 1.0))
+        return float(lower), float(upper)
+
+
+def describe(octaves: Octaves, places: tuple[int, ...], misfit: float, held_at: int = -1,
+             square: float = 0.0) -> Description:
+    """
+    Fit a combination of parts, none negative, with the covariance that the fitted noise implies.
+
+    For `misfit` see `NoiseFit`. A further part may be held at a squared coefficient.
+
+    """
+    given = np.zeros(_BEND + 1)
+    if held_at >= 0:
+        given[held_at] = square
+    both = np.column_stack([octaves.columns[:, places],
+                            octaves.variance - octaves.columns @ given])
+    squares, half = given.copy(), np.diag(octaves.variance)
+    for number in range(12):
+        white = np.linalg.solve(half, both)
+        size = np.linalg.norm(white[:, :-1], axis=0)
+        found = nnls(white[:, :-1] / size, white[:, -1])[0] / size
+        if not (found.any() or square) or (number and np.allclose(
+                squares[list(places)], found, rtol=1e-4, atol=0.0)):
+            break
+        squares[list(places)] = found
+        model, covariance = octaves.model(squares), octaves.covariance(squares)
+        covariance[np.diag_indices(len(model))] += 4.0 * (misfit * model) ** 2
+        try:
+            half = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            # nearly singular, as that of a ramp alone: correlations are kept away from one
+            size = np.sqrt(np.maximum(covariance.diagonal(), 1e-12 * model ** 2))
+            values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+            half = size[:, None] * np.linalg.cholesky(
+                (vectors * np.maximum(values, 1e-4)) @ vectors.T)
+    return Description(octaves, squares, half)
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """
+    All combinations of parts, fitted to the same octaves.
+
+    Attributes
+    ----------
+    start : the first octave that they describe
+    misfit : see `NoiseFit`
+    descriptions : the likeliest first
+
+    """
+
+    start: int
+    misfit: float
+    descriptions: tuple[Description, ...]
+
+    @property
+    def best(self) -> Description:
+        """Return the likeliest."""
+        return self.descriptions[0]
+
+    @property
+    def seen(self) -> list[int]:
+        """Return the places of the best's parts; after a bent end quantization is no figure."""
+        return [place for place in self.best.held if place != _BEND
+                and (place != _Q or self.start == 0)]
+
+    @cached_property
+    def alternatives(self) -> list[Description]:
+        """Return the combinations of other parts, not more, that are nearly as likely."""
+        best = self.best
+        return [each for each in self.descriptions
+                if each.surprise < best.surprise + _ALIKE and len(each.held) <= len(best.held)
+                and not set(each.held) - {_BEND, _Q} <= set(best.held)]
+
+    @cached_property
+    def possible(self) -> list[Description]:
+        """Return the best, those likelier without evidence, and those with an alternative."""
+        best = self.best
+        both = [{*best.held, *other.held} for other in self.alternatives]
+        return [best, *(each for each in self.descriptions
+                        if each.surprise < best.surprise - _WIDENS or set(each.held) in both)]
+
+
+def rank(octaves: Octaves) -> Ranking:
+    """
+    Rank all combinations of parts.
+
+    The first octave is the earliest one that chance allows; if none is, a misfit is added. The
+    filters that bend the short end fade slowly: one octave more than that is left out.
+
+    Raises
+    ------
+    DataRefused : no combination describes the octaves
+
+    """
+    last = max(len(octaves.variance) // 2 - 1, 0)
+    for misfit, start in itertools.product(_MISFITS, range(last + 1)):
+        ranking = _rank_since(octaves, start, misfit)
+        if ranking.best.likely():
+            return _rank_since(octaves, start + 1, misfit) if 0 < start < last else ranking
+    raise DataRefused(f'the Allan deviations are more than {100 * _MISFITS[-1]:.0f} % off any sum '
+                      'of the five kinds of noise: there is something else in the record, such as '
+                      'a swing or a vibration; record again at rest')
+
+
+def _rank_since(octaves: Octaves, start: int, misfit: float) -> Ranking:
+    since = octaves.since(start)
+    return Ranking(start, misfit, tuple(sorted(
+        (describe(since, places, misfit) for places in _COMBINATIONS), key=Description.cost)))
+
+
+@dataclass(frozen=True)
+class Figure:
+    """
+    The coefficient of one part of the noise.
+
+    Attributes
+    ----------
+    part : which
+    value : its coefficient, in the part's unit; 0 where the record shows none
+    standard_deviation : of the coefficient, if there are no parts but those that are seen; nan
+        where the record shows none
+    lower, upper : bounds with 95 % confidence, also if there is a little of other parts; where the
+        record shows none, 0 and the largest coefficient that it can hide
+
+    """
+
+    part: Part
+    value: float
+    standard_deviation: float
+    lower: float
+    upper: float
+
+    def variance(self, time: Array) -> Array:
+        """Return the Allan variance that it makes, (rad/s)²."""
+        return self.value ** 2 * self.part.variance(time)
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """
+    The noise figures of a record.
+
+    Attributes
+    ----------
+    figures : by symbol: N, B, K, Q, R
+    chart : the Allan deviations that were fitted, at octaves
+    shortest, longest : the averaging times that the fit holds for, s
+    misfit : by how much more the Allan deviations differ from the sum of the parts than chance
+        allows, as a share of them
+    alternatives : the symbols of other combinations of parts that explain the record nearly as
+        well
+
+    """
+
+    figures: dict[str, Figure]
+    chart: AllanChart
+    shortest: float
+    longest: float
+    misfit: float
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def noise(self) -> Noise:
+        """Return the figures that a model holds."""
+        return Noise(*(self.figures[symbol].value for symbol in 'NBK'))
+
+    @property
+    def noise_bounds(self) -> dict[str, tuple[float, float]]:
+        """Return the bounds of these figures, by their names in a model."""
+        return {name: (self.figures[symbol].lower, self.figures[symbol].upper)
+                for name, symbol in zip(Noise.__dataclass_fields__, 'NBK')}
+
+    def deviation(self, time: Array) -> Array:
+        """Return the Allan deviation, rad/s, that the figures add up to."""
+        return np.sqrt(sum(figure.variance(time) for figure in self.figures.values()))
+
+    @property
+    def floor_reached(self) -> bool:
+        """Return whether N and Q make less than half of the variance, an octave before the end."""
+        time = self.chart.time[-2]
+        falling = sum(figure.variance(time) for figure in self.figures.values()
+                      if figure.part.slope < 0.0)
+        return bool(falling < 0.5 * self.deviation(time) ** 2)
+
+
+def fit_noise(rate: Array, interval: float) -> NoiseFit:
+    """
+    Fit the parts of the noise to the Allan variances at octaves, and keep those that are seen.
+
+    The squared coefficients are found by generalized least squares (as in the generalized method
+    of wavelet moments of Guerrier, Skaloud, Stebler and Victoria-Feser, JASA 2013), none of them
+    negative, with the covariance that the fitted noise itself implies. Of all combinations the
+    likeliest is kept, if each further part makes the data likelier by more than chance does. The
+    shortest averaging times are left out until the sum of the parts describes the rest, because
+    the filters of a gyro bend that end.
+
+    Parameters
+    ----------
+    rate : rad/s, shape (n,), one sample an interval; nan where a sample is lost
+    interval : s
+
+    Raises
+    ------
+    DataRefused : too few samples, or no sum of the parts describes them
+
+    """
+    chart = allan_deviation(rate, interval, 2.0 ** np.arange(
+        max(math.floor(math.log2(max(len(rate), 8) / 6.0)), 1) + 1) * interval)
+    if len(chart.size) < _FEWEST_OCTAVES or not chart.deviation.all():
+        raise DataRefused(f'{len(chart.size)} octaves of averaging times without a gap, the '
+                          'lowest Allan deviation '
+                          f'{chart.deviation.min(initial=math.inf):g} rad/s; wanted '
+                          f'{_FEWEST_OCTAVES} octaves, all above 0: record longer and without '
+                          'losses')
+    ranking = rank(Octaves.of(chart))
+    figures = {part.symbol: _figure(ranking, place, interval)
+               for place, part in enumerate(PARTS)}
+    return NoiseFit(figures, chart, float(chart.time[ranking.start]), float(chart.time[-1]),
+                    ranking.misfit, tuple(sorted({
+                        ''.join(PARTS[place].symbol for place in each.held if place != _BEND)
+                        for each in ranking.alternatives})))
+
+
+def _figure(ranking: Ranking, place: int, interval: float) -> Figure:
+    """Return a figure with bounds that hold with and without parts of too little evidence."""
+    best, part = ranking.best, PARTS[place]
+    value, deviation = 0.0, math.nan
+    lower, upper = _bounds(ranking, place)
+    if place in ranking.seen:
+        value = math.sqrt(best.squares[place])
+        deviation = 0.5 * best.deviation(place) / value
+        ends = [(lower, upper), *(each.bounds(place) for each in ranking.possible
+                                  if place in each.held)]
+        lower, upper = min(value, *(low for low, _ in ends)), max(value, *(up for _, up in ends))
+    else:
+        lower = 0.0
+    unit = interval ** -part.slope
+    return Figure(part, *(each * unit for each in (value, deviation, lower, upper)))
+
+
+def _bounds(ranking: Ranking, place: int) -> tuple[float, float]:
+    """
+    Return the coefficients between which -2 ln likelihood is within `_CONFIDENCE` of the least.
+
+    At each coefficient the other parts are fitted anew, N, B and K among them, which may be there
+    without being seen, so that what one of them takes from another is in the bounds.
+
+    """
+    octaves, misfit = ranking.best.octaves, ranking.misfit
+    held = {_N, _B, _K, *(each for one in (*ranking.possible, *ranking.alternatives)
+                          for each in one.held)}
+    others = tuple(sorted(held - {place}))
+    joint = describe(octaves, (*others, place), misfit)
+    (*_, square), (*_, deviation) = joint.estimate((*others, place))
+
+    @cache
+    def surprise(coefficient: float) -> float:
+        return describe(octaves, others, misfit, place, coefficient ** 2).surprise
+
+    found = math.sqrt(joint.squares[place])
+    scale = math.sqrt(max(square, 0.0) + deviation)
+    likeliest = min((found, *(scale * factor for factor in (0.25, 0.5, 0.75, 0.9, 1.0, 1.1))),
+                    key=surprise)
+    limit = surprise(likeliest) + _CONFIDENCE
+
+    def border(inside: float, outside: float) -> float:
+        for _ in range(12):
+            middle = 0.5 * (inside + outside)
+            inside, outside = ((middle, outside) if surprise(middle) < limit
+                               else (inside, middle))
+        return inside
+
+    high = max(likeliest, scale)
+    while surprise(high) < limit and high < 1e3 * scale:
+        high *= 1.5
+    lower = 0.0 if surprise(0.0) < limit else border(likeliest, 0.0)
+    return lower, border(likeliest, high)
