@@ -31,10 +31,10 @@ import math
 from gyro_calibration.calibration.course_over_ground import fit_course, is_course, PRIORS
 from gyro_calibration.calibration.fit_quality import DRIVE
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
-from gyro_calibration.calibration.run_faults import refuse_dead
 from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
+from gyro_calibration.logs.quality import refuse_dead
 from gyro_calibration.logs.stamps import lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term

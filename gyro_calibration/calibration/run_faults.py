@@ -11,7 +11,7 @@
 """
 What went wrong in a run that its profile does not explain: a name, a test and a remedy for each.
 
-A gyro that is dead or saturated shows that by itself. What the robot did otherwise shows by which
+What the robot did otherwise shows by which
 motion explains the run best: the profile with one deviating stretch, driven faster or slower,
 begun late, or ended early.
 
@@ -29,15 +29,6 @@ from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
-#: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
-#: toggles.
-_DEAD = 0.9
-#: A flat top has at least so many samples at a limit, this part of all, and so many times as many
-#: as the code beside it.
-_FLAT, _FLAT_PART, _FLAT_RATIO = 10, 0.005, 3.0
-#: Where this part of neighbours differ at a steady rate, in blocks of so many samples, the noise
-#: is resolved, and no honest top stays in one code.
-_RESOLVED, _BLOCK = 0.2, 10
 #: Length of the pieces that motions are compared by, and step of the begins, ends and offsets that
 #: are tried, s. A long run has longer pieces, at most so many: the search takes the cube of their
 #: number.
@@ -113,65 +104,6 @@ def unit_error(scale: float, by_profile: bool = True) -> str:
     cause = f'either {gyro}, or {profile}' if by_profile else gyro
     return (f'the gyro reports {abs(scale):.4g} times what was turned{turned}: '
             f'{cause}; mend the unit')
-
-
-def refuse_dead(rate: Array) -> None:
-    """Refuse samples of one value, or nearly all of one."""
-    if np.ptp(rate) == 0.0:
-        raise DataRefused(f'all {len(rate)} samples have the same value, {rate[0]:g} rad/s: '
-                          'the gyro is dead or not powered')
-    values, counts = np.unique(rate, return_counts=True)
-    part = counts.max() / len(rate)
-    if part > _DEAD:
-        raise DataRefused(f'{100 * part:.1f} % of the samples have the same value, '
-                          f'{values[counts.argmax()]:g} rad/s: the gyro is dead, not powered, '
-                          'or did not move')
-
-
-def refuse_saturated(output: Array) -> None:
-    """
-    Refuse an output that stays at its largest or smallest value as no noise does.
-
-    Codes so coarse that they hide the noise stay honestly: only the profile can tell then.
-
-    """
-    limit = _limit(output)
-    if limit is not None and _resolved(output):
-        raise _saturated(output, limit)
-
-
-def _saturated(output: Array, limit: float) -> DataRefused:
-    part = 100 * np.mean(output == limit)
-    return DataRefused(f'the gyro is saturated: {part:.0f} % of the samples are at its limit of '
-                       f'{limit / DEGREE:.4g} deg/s; turn slower, or set a wider range')
-
-
-def _limit(output: Array) -> float | None:
-    """Return the largest or smallest value if it is a flat top."""
-    values, counts = np.unique(output, return_counts=True)
-    if len(values) < 2:
-        return None
-    for end, beside in ((-1, -2), (0, 1)):
-        if (counts[end] >= max(_FLAT, _FLAT_PART * len(output))
-                and counts[end] > _FLAT_RATIO * counts[beside]):
-            return float(values[end])
-    return None
-
-
-def _resolved(output: Array) -> bool:
-    """
-    Tell whether the codes resolve the noise: whether they change at a steady rate.
-
-    The steady rate is that of the flattest quarter of the blocks away from both ends.
-
-    """
-    blocks = output[:len(output) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
-    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
-    if len(blocks) < 4:
-        return False
-    slopes = np.abs(blocks[:, _BLOCK // 2:].mean(axis=1) - blocks[:, :_BLOCK // 2].mean(axis=1))
-    flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
-    return bool(np.mean(np.diff(flattest, axis=1) != 0.0) > _RESOLVED)
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,12 @@ from gyro_calibration.calibration.run_faults import (
     followed,
     Pieces,
     pieces,
-    refuse_dead,
     refuse_robot,
-    refuse_saturated,
     slip_sentence,
     unit_error,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise
 from gyro_calibration.logs.stamps import even_times
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import Motion
@@ -432,13 +431,15 @@ def check_rest(time: Array, rate: Array, fit: Fit, noise: Noise | None = None,
         raise DataRefused(f'after the run {duration:.1f} s of rest came, '
                           f'wanted {limits.rest:g} s: leave the robot at rest after it')
     corrected = (rate - fit.bias) / (1.0 + fit.scale_factor_error)
-    deviation = _rest_deviation(duration, corrected, fit, noise)
-    mean = float(corrected.mean())
+    noise, white, mean = noise or Noise(), _deviation_of_mean(corrected), float(corrected.mean())
+    deviation = math.sqrt(max(white, noise.angle_random_walk / math.sqrt(duration)) ** 2
+                          + noise.wander(duration, duration)
+                          + float(np.nan_to_num(fit.covariance[1, 1])))
     check = RestCheck(mean, deviation,
                       max(limits.drift, -float(ndtri(0.5 * false_refusals)) * deviation),
                       _turned_throughout(fit, mean, deviation))
     begun, ended = (float(half.mean()) for half in np.array_split(corrected, 2))
-    if abs(ended - begun) > 2.0 * CHANCE * max(_white(corrected, duration), limits.drift / CHANCE):
+    if abs(ended - begun) > 2.0 * CHANCE * max(white, limits.drift / CHANCE):
         raise DataRefused('after the run the robot still moved, its rate changed by '
                           f'{abs(ended - begun) / DEGREE:.2f} deg/s: '
                           'leave it at rest after the run')
@@ -490,7 +491,7 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
         return None
     corrected = (rate[first:last] - fit.bias) / (1.0 + fit.scale_factor_error)
     means = np.array([part.mean() for part in np.array_split(corrected, 4)])
-    apart = max(CHANCE * 2.0 * _white(corrected, limits.rest), _DRIVING)
+    apart = max(CHANCE * 2.0 * _deviation_of_mean(corrected), _DRIVING)
     # a slow and steady turn is no drive: before the fit it passed for a bias
     return (None if abs(means.mean()) > limits.bias or np.ptp(means) > 2.0 * apart
             else slice(int(first), int(last)))
@@ -501,17 +502,9 @@ def rest_after(time: Array, rate: Array, fit: Fit, motion: Motion,
 SETTLED, _DRIVING = 1.0, 0.25 * DEGREE
 
 
-def _white(rate: Array, duration: float) -> float:
-    """Return the standard deviation of the mean by white noise, from differences, rad/s."""
-    return float(np.std(np.diff(rate))) / math.sqrt(2.0 * len(rate))
-
-
-def _rest_deviation(duration: float, rate: Array, fit: Fit, noise: Noise | None) -> float:
-    white = _white(rate, duration)
-    if noise is not None:
-        white = max(white, noise.angle_random_walk / math.sqrt(duration))
-    wander = 0.0 if noise is None else noise.wander(duration, duration)
-    return math.sqrt(white ** 2 + wander + float(np.nan_to_num(fit.covariance[1, 1])))
+def _deviation_of_mean(rate: Array) -> float:
+    """Return the standard deviation of a mean at rest by white noise, rad/s."""
+    return white_noise(rate, 1) / math.sqrt(len(rate))
 
 
 def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,

@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import math
 
 from gyro_calibration.calibration.likelihood import CHANCE, Fit
-from gyro_calibration.calibration.run_faults import refuse_dead, refuse_saturated, unit_error
+from gyro_calibration.calibration.run_faults import unit_error
 from gyro_calibration.calibration.self_calibration import Limits, refuse_samples, refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.quality import refuse_dead, refuse_saturated, white_noise
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.special import ndtri
@@ -111,10 +112,13 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
-    white = _white(time, rate, noise)
+    noise = noise or Noise()
+    # N², rad²/s: what neighbours show of it, and no less than what is known
+    white = max(white_noise(rate) ** 2 * float(np.median(np.diff(time))),
+                noise.angle_random_walk ** 2)
     first, last = _rests(time, rate, white)
     duration = last.begin - first.end
-    bias, variance = _bias(first, last, noise or Noise(), limits)
+    bias, variance = _bias(first, last, noise, limits)
     integral = integrate(time, rate)
     begin, end = np.interp((first.end, last.begin), time, integral)
     turned = float(end - begin) - bias * duration
@@ -126,13 +130,6 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     covariance = np.array([[of_turned / (count * TURN) ** 2, shared], [shared, variance]])
     return Turns(Fit(scale - 1.0, bias, covariance), count, duration,
                  (first.duration, last.duration))
-
-
-def _white(time: Array, rate: Array, noise: Noise | None) -> float:
-    """Return N², rad²/s: what neighbours show of it, and no less than what is known."""
-    seen = (float(np.median(np.abs(np.diff(rate, 2))) / 0.6745) ** 2 / 6.0
-            * float(np.median(np.diff(time))))
-    return max(seen, 0.0 if noise is None else noise.angle_random_walk ** 2)
 
 
 def _rests(time: Array, rate: Array, white: float) -> tuple[_Rest, _Rest]:

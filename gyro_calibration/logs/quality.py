@@ -14,8 +14,13 @@ from __future__ import annotations
 
 import math
 
-from gyro_calibration.logs.log import Array, Mask
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
 import numpy as np
+from scipy.special import ndtri
+
+#: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
+#: toggles.
+_DEAD = 0.9
 
 
 def robust_deviation(values: Array) -> float:
@@ -23,14 +28,22 @@ def robust_deviation(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
 
 
-def white_noise(values: Array) -> float:
-    """Return the standard deviation of the white part of a signal, by third differences."""
-    off = np.abs(np.diff(values, 3))
+def white_noise(values: Array, order: int = 3) -> float:
+    """
+    Return the standard deviation of the white part of a signal, by its differences.
+
+    Parameters
+    ----------
+    values : shape (n,); differences with nan are left out
+    order : of the differences: 3 in motion; 1 at rest, where noise that a filter has smoothed
+        shows best
+
+    """
+    off = np.abs(np.diff(values, order))
     off = off[np.isfinite(off)]
-    # Not by the median: an output of few codes has differences of zero mostly. Of a normal
-    # distribution, 90 % are within 1.645 standard deviations.
-    of_one = 1.6448536269514722 * math.sqrt(20.0)
-    return float(np.quantile(off, 0.9)) / of_one if off.size else math.inf
+    # Not by the median: an output of few codes has differences of zero mostly.
+    return (float(np.quantile(off, 0.9)) / -float(ndtri(0.05)) / math.sqrt(math.comb(
+        2 * order, order)) if off.size else math.inf)
 
 
 def quantization_step(values: Array) -> float:
@@ -82,3 +95,51 @@ def repeated_samples(output: Array) -> Mask:
     for run in runs(np.concatenate([[False], np.diff(output) == 0.0])):
         repeated[run] = run.stop - run.start > longest
     return repeated
+
+
+def refuse_dead(output: Array) -> None:
+    """Refuse samples of one value, or nearly all of one."""
+    values, counts = np.unique(output, return_counts=True)
+    share, value = counts.max() / len(output), float(values[counts.argmax()])
+    if len(values) == 1:
+        raise DataRefused(f'all {len(output)} samples have the same value, {value:g} rad/s: '
+                          'the gyro is dead or not powered')
+    if share > _DEAD:
+        raise DataRefused(f'{100 * share:.1f} % of the samples have the same value, {value:g} '
+                          'rad/s: the gyro is dead, not powered, or did not move')
+
+
+def refuse_saturated(output: Array) -> None:
+    """
+    Refuse an output that stays at its largest or smallest value as no noise does.
+
+    A flat top has at least 10 samples and 0.5 % of all at a limit, three times as many as at the
+    next value. Codes so coarse that they hide the noise stay honestly: only the profile can show a
+    limit then.
+
+    """
+    values, counts = np.unique(output, return_counts=True)
+    if len(values) < 2 or not _noise_is_resolved(output):
+        return
+    for end, neighbour in ((-1, -2), (0, 1)):
+        if counts[end] >= max(10, 0.005 * len(output)) and counts[end] > 3 * counts[neighbour]:
+            raise DataRefused(
+                f'the gyro is saturated: {100 * counts[end] / len(output):.0f} % of the samples '
+                f'are at its limit of {values[end] / DEGREE:.4g} deg/s; turn slower, or set a '
+                'wider range')
+
+
+def _noise_is_resolved(output: Array) -> bool:
+    """
+    Tell whether a fifth of neighbouring samples differ where the rate is steady.
+
+    That is in the flattest quarter of blocks of ten samples away from the extreme values.
+
+    """
+    blocks = output[:len(output) // 10 * 10].reshape(-1, 10)
+    blocks = blocks[((blocks != output.max()) & (blocks != output.min())).all(axis=1)]
+    if len(blocks) < 4:
+        return False
+    slopes = np.abs(blocks[:, 5:].mean(axis=1) - blocks[:, :5].mean(axis=1))
+    flattest = blocks[np.argsort(slopes)[:len(blocks) // 4]]
+    return bool(np.mean(np.diff(flattest, axis=1) != 0.0) > 0.2)
