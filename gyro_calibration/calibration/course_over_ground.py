@@ -32,7 +32,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from gyro_calibration.calibration.likelihood import encoder_step, Fit, robust_residual
+from gyro_calibration.calibration.likelihood import Fit, robust_residual
 from gyro_calibration.calibration.noise_grid import (
     GridFit,
     heading_noise,
@@ -42,6 +42,7 @@ from gyro_calibration.calibration.noise_grid import (
 )
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 
@@ -208,7 +209,7 @@ def is_course(time: Array, rate: Array, motion: Motion) -> bool:
     motion : by the reference
 
     """
-    if encoder_step(motion.heading) > ROUNDED:
+    if quantization_step(motion.heading) > ROUNDED:
         return False
     interval = np.diff(np.concatenate([[time[0]], motion.time, [time[-1]]]))
     lost = float(np.sum(interval[interval > 5.0 * np.median(interval)]))

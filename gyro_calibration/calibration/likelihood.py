@@ -28,6 +28,7 @@ import math
 
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
+from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
@@ -307,7 +308,7 @@ def _points(motion: Motion, block: float, slip: float) -> _Points:
         time = np.arange(0.0, motion.duration + 1e-9, 0.01)
         return _Points(time, motion.heading_at(time), np.ones(len(time)),
                        *following(motion, time, slip))
-    step = encoder_step(motion.heading)
+    step = quantization_step(motion.heading)
     if not step:
         return _Points(motion.time, motion.heading, np.ones(len(motion.time)),
                        np.empty((len(motion.time), 0)))
@@ -469,16 +470,6 @@ def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
         size = np.abs(residual)
         weights = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-12))
     return residual
-
-
-def encoder_step(heading: Array) -> float:
-    """Return the step of an encoder's heading, rad, or 0 if the heading has no such step."""
-    steps = np.abs(np.diff(heading))
-    moved = steps[steps > 1e-9]
-    if not len(moved):
-        return 0.0
-    step = float(np.median(moved[moved < 1.5 * moved.min()]))
-    return step if np.abs(moved / step - np.round(moved / step)).max() < 0.2 else 0.0
 
 
 class _Covariance:

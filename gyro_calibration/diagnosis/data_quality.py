@@ -44,8 +44,6 @@ from gyro_calibration.diagnosis.expected_output import (
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Reference
 from gyro_calibration.diagnosis.gates import evened, prepared
 from gyro_calibration.diagnosis.samples import (
-    Codes,
-    codes_of,
     dead_band,
     Limit,
     limit_of,
@@ -56,7 +54,7 @@ from gyro_calibration.diagnosis.samples import (
     SIDE,
 )
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.logs.quality import robust_deviation, white_noise
+from gyro_calibration.logs.quality import Codes, codes_of, robust_deviation, white_noise
 from gyro_calibration.logs.stamps import number_stamps, Stamps
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np

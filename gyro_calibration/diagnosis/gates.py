@@ -37,9 +37,8 @@ from gyro_calibration.diagnosis.expected_output import (
     unit_of_scale,
 )
 from gyro_calibration.diagnosis.findings import Estimate, Finding, Gate
-from gyro_calibration.diagnosis.samples import codes_of
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.logs.quality import white_noise
+from gyro_calibration.logs.quality import codes_of, white_noise
 from gyro_calibration.model.gyro_model import GyroModel
 import numpy as np
 

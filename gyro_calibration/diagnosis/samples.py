@@ -24,22 +24,13 @@ import math
 
 from gyro_calibration.diagnosis.expected_output import bridged, Compared
 from gyro_calibration.logs.log import Array, Mask
-from gyro_calibration.logs.quality import runs
+from gyro_calibration.logs.quality import Codes, runs
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtr
 
-#: Values closer than this, relative to the largest, are one: a change of units rounds them.
-_SAME = 1e-12
-#: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
-_ALIGNED = 0.7
-#: Quantiles of the gaps between codes where the step is known for: where codes are left out, only
-#: few gaps are as small.
-_STARTS = (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5)
-#: Codes on each side that a step is found among before it is carried further.
-_SOME = 8
 #: The count of the extreme code is compared with that of so many next to it, or of those within
 #: this part of the white noise.
 _NEIGHBOURS, _WITHIN = 4, 0.05
@@ -56,91 +47,6 @@ _DIGIT = 10.0
 _AWAY = 1.5
 #: What is expected so many standard deviations beyond a dead band may well be in it.
 _EDGE = 2.0
-
-
-@dataclass(frozen=True)
-class Codes:
-    """
-    The values that occur, in order, and how often: arrays of shape (m,).
-
-    Attributes
-    ----------
-    step : between neighbouring codes; 0 where there is no such step
-    aligned : how well the codes lie on it, 0 to 1
-    deviation : standard deviation of the step
-
-    """
-
-    values: Array
-    counts: Array
-    step: float = 0.0
-    aligned: float = 0.0
-    deviation: float = 0.0
-
-
-def codes_of(values: Array) -> Codes:
-    """Return the codes of values without nan: the coarsest lattice, up to rounding in print."""
-    found, counts = np.unique(values, return_counts=True)
-    apart = np.concatenate([[True], np.diff(found) > _SAME * np.abs(found[[0, -1]]).max()])
-    first = np.flatnonzero(apart)
-    codes = Codes(found[first], np.add.reduceat(counts, first))
-    gaps = np.diff(codes.values)
-    starts = set(np.quantile(gaps, _STARTS).tolist()) if gaps.size else ()
-    for start in sorted(starts, reverse=True):
-        step, aligned, deviation = _lattice(codes, start)
-        if aligned > _ALIGNED:
-            return Codes(codes.values, codes.counts, step, aligned, deviation)
-    return codes
-
-
-def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
-    """Refine a step from near to far codes; return it, the alignment, and its deviation."""
-    gaps = np.diff(codes.values)
-    near = gaps < 8.5 * step
-    step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
-    # about the densest place
-    width = min(2 * _SOME, len(codes.values) - 1)
-    spans = codes.values[width:] - codes.values[:-width]
-    first = int(np.argmin(spans))
-    place, span = codes.values - codes.values[first + width // 2], float(spans[first])
-    reach, deviation = span / step + 0.5, 0.0
-    while True:
-        within = np.abs(place) < reach * step
-        aligned, offset = _alignment(place[within], codes.counts[within], step)
-        if aligned < _ALIGNED:
-            return step, aligned, deviation
-        number = np.rint((place[within] - offset) / step)
-        if np.ptp(number) > 0.0:
-            step, off, spread = _line(number, place[within])
-            good = np.abs(off) <= 0.3 * abs(step)
-            if np.ptp(number[good]) > 0.0:
-                step, off, spread = _line(number[good], place[within][good])
-            deviation = float(np.std(off) / spread)
-        if within.all():
-            return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
-        reach *= 4.0
-
-
-def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
-    """
-    Return the length of the mean phase of places on a lattice, and the shift of the lattice.
-
-    The place that occurs most is left out: beside a value that comes at every rest, all others
-    would count for nothing.
-
-    """
-    counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
-              if len(counts) > 1 else counts)
-    mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
-    return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
-
-
-def _line(number: Array, place: Array) -> tuple[float, Array, float]:
-    """Return a slope, the residuals of places, and the root of the sum of squares of numbers."""
-    centred, apart = number - number.mean(), place - place.mean()
-    squares = float(centred @ centred)
-    slope = float(centred @ apart) / squares
-    return slope, apart - slope * centred, float(np.sqrt(squares))
 
 
 def steps_about(codes: Codes, output: Array) -> Array:

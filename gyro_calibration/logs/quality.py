@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Mask
@@ -21,6 +22,8 @@ from scipy.special import ndtri
 #: A gyro that gives one value in more than this part of its samples is dead, even if its last bit
 #: toggles.
 _DEAD = 0.9
+#: Least length of the mean phase of codes on a lattice: 1 for exact codes, 0 for any values.
+_ALIGNED = 0.7
 
 
 def robust_deviation(values: Array) -> float:
@@ -46,13 +49,103 @@ def white_noise(values: Array, order: int = 3) -> float:
         2 * order, order)) if off.size else math.inf)
 
 
+@dataclass(frozen=True)
+class Codes:
+    """
+    The values that occur, in order, and how often: arrays of shape (m,).
+
+    Attributes
+    ----------
+    step : between neighbouring codes; 0 where there is no such step
+    aligned : how well the codes lie on it, 0 to 1
+    deviation : standard deviation of the step
+
+    """
+
+    values: Array
+    counts: Array
+    step: float = 0.0
+    aligned: float = 0.0
+    deviation: float = 0.0
+
+
+def codes_of(values: Array) -> Codes:
+    """Return the codes of values without nan: the coarsest lattice, up to rounding in print."""
+    found, counts = np.unique(values, return_counts=True)
+    # a change of units rounds values that are one
+    apart = np.concatenate([[True], np.diff(found) > 1e-12 * np.abs(found[[0, -1]]).max()])
+    first = np.flatnonzero(apart)
+    codes = Codes(found[first], np.add.reduceat(counts, first))
+    gaps = np.diff(codes.values)
+    if not gaps.size:
+        return codes
+    # where codes are left out, only few gaps are as small as the step
+    for start in sorted({float(gap) for gap in np.quantile(
+            gaps, (0.0, 0.001, 0.02, 0.05, 0.1, 0.25, 0.5))}, reverse=True):
+        step, aligned, deviation = _lattice(codes, start)
+        if aligned > _ALIGNED:
+            return Codes(codes.values, codes.counts, step, aligned, deviation)
+    return codes
+
+
+def _lattice(codes: Codes, step: float) -> tuple[float, float, float]:
+    """Refine a step from near to far codes; return it, the alignment, and its deviation."""
+    gaps = np.diff(codes.values)
+    near = gaps < 8.5 * step
+    step = float(gaps[near].sum() / max(np.rint(gaps[near] / step).sum(), 1.0))
+    # begin among the 16 densest codes, and go on to four times as many steps each time
+    width = min(16, len(codes.values) - 1)
+    span = codes.values[width:] - codes.values[:-width]
+    first = int(np.argmin(span))
+    place = codes.values - codes.values[first + width // 2]
+    reach, deviation = float(span[first]) / step + 0.5, 0.0
+    while True:
+        within = np.abs(place) < reach * step
+        aligned, offset = _alignment(place[within], codes.counts[within], step)
+        if aligned < _ALIGNED:
+            return step, aligned, deviation
+        number = np.rint((place[within] - offset) / step)
+        if np.ptp(number) > 0.0:
+            step, deviation = _slope(number, place[within])
+        if within.all():
+            return (step, aligned, deviation) if np.ptp(number) > 0.0 else (step, 0.0, 0.0)
+        reach *= 4.0
+
+
+def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
+    """
+    Return the length of the mean phase of places on a lattice, and the shift of the lattice.
+
+    The place that occurs most is left out: beside a value that comes at every rest, all others
+    would count for nothing.
+
+    """
+    counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)
+              if len(counts) > 1 else counts)
+    mean = np.sum(counts * np.exp(2j * np.pi * place / step)) / counts.sum()
+    return float(np.abs(mean)), float(np.angle(mean)) * step / (2.0 * np.pi)
+
+
+def _slope(number: Array, place: Array) -> tuple[float, float]:
+    """Return the slope of places over whole numbers, without outliers, and its deviation."""
+    slope, off, spread = _line(number, place)
+    good = np.abs(off) <= 0.3 * abs(slope)
+    if np.ptp(number[good]) > 0.0:
+        slope, off, spread = _line(number[good], place[good])
+    return slope, float(np.std(off) / spread)
+
+
+def _line(number: Array, place: Array) -> tuple[float, Array, float]:
+    """Return a slope, the residuals of places, and the root of the sum of squares of numbers."""
+    centred, apart = number - number.mean(), place - place.mean()
+    squares = float(centred @ centred)
+    slope = float(centred @ apart) / squares
+    return slope, apart - slope * centred, float(np.sqrt(squares))
+
+
 def quantization_step(values: Array) -> float:
-    """Return the step of an encoder or another digital output; about 0 where it has none."""
-    # Rounding in the file splits a step in two sizes, and fast turns leave steps out: so it is
-    # neither the smallest nor the median gap.
-    gaps = np.diff(np.unique(values))
-    gaps = gaps[gaps > 1e-9]
-    return float(np.quantile(gaps, 0.05)) if len(gaps) else 0.0
+    """Return the step of an encoder or another digital output; 0 where it has none."""
+    return codes_of(values).step
 
 
 def runs(mask: Mask) -> list[slice]:

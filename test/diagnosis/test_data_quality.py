@@ -24,8 +24,9 @@ from gyro_calibration.diagnosis.expected_output import (
 )
 from gyro_calibration.diagnosis.gates import refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
-from gyro_calibration.diagnosis.samples import codes_of, repeated_samples
+from gyro_calibration.diagnosis.samples import repeated_samples
 from gyro_calibration.logs.log import COLUMNS, DataRefused, DEGREE, Log, read_log
+from gyro_calibration.logs.quality import codes_of
 from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
