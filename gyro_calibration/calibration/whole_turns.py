@@ -69,20 +69,6 @@ class Turns:
     rests: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """A rest: from and to, s, the mean rate, rad/s, and its variance by white noise."""
-
-    begin: float
-    end: float
-    mean: float
-    variance: float
-
-    @property
-    def duration(self) -> float:
-        return self.end - self.begin
-
-
 def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
                     limits: Limits | None = None, noise: Noise | None = None,
                     marking: float = MARKING, output: Array | None = None) -> Turns:
@@ -108,79 +94,67 @@ def calibrate_turns(time: Array, rate: Array, turns: int | None = None,
     DataRefused : with the reason and the remedy
 
     """
-    limits = limits or Limits()
+    limits, noise = limits or Limits(), noise or Noise()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
-    noise = noise or Noise()
     # N², rad²/s: what neighbours show of it, and no less than what is known
     white = max(white_noise(rate) ** 2 * float(np.median(np.diff(time))),
                 noise.angle_random_walk ** 2)
-    first, last = _rests(time, rate, white)
-    duration = last.begin - first.end
-    bias, variance = _bias(first, last, noise, limits)
-    integral = integrate(time, rate)
-    begin, end = np.interp((first.end, last.begin), time, integral)
-    turned = float(end - begin) - bias * duration
+    begin, end = _motion(time, rate, white)
+    rests = float(begin - time[0]), float(time[-1] - end)
+    first, last = float(rate[time <= begin].mean()), float(rate[time >= end].mean())
+    duration = end - begin
+    wander = noise.wander(duration, min(rests))
+    of_both = white / rests[0] + white / rests[1]
+    bias, variance = 0.5 * (first + last), 0.25 * of_both + 0.5 * wander
+    _refuse_bias(last - first, math.sqrt(of_both + wander), bias, limits)
+    integral = np.interp((begin, end), time, integrate(time, rate))
+    turned = float(integral[1] - integral[0]) - bias * duration
     count = _counted(turned / TURN, turns, limits)
     scale = turned / (count * TURN)
-    _refuse_scale(scale, limits)
+    if abs(scale - 1.0) > limits.scale_factor_error:
+        raise DataRefused(
+            f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
+            f'{100 * limits.scale_factor_error:.0f} %: count the turns again, and look at the '
+            'sensitivity')
     of_turned = white * duration + variance * duration ** 2 + (scale * marking) ** 2
     shared = -variance * duration / (count * TURN)
     covariance = np.array([[of_turned / (count * TURN) ** 2, shared], [shared, variance]])
-    return Turns(Fit(scale - 1.0, bias, covariance), count, duration,
-                 (first.duration, last.duration))
+    return Turns(Fit(scale - 1.0, bias, covariance), count, duration, rests)
 
 
-def _rests(time: Array, rate: Array, white: float) -> tuple[_Rest, _Rest]:
-    """Return the rests at both ends."""
+def _motion(time: Array, rate: Array, white: float) -> tuple[float, float]:
+    """Return where the turns begin and end, s: the rest before and the rest after them."""
     part = ((time - time[0]) / _PART).astype(int)
-    count = np.maximum(np.bincount(part), 1)
-    means = np.bincount(part, rate) / count
-    apart = max(CHANCE * math.sqrt(white / _PART), _MOVING)
-    found = []
+    means = np.bincount(part, rate) / np.maximum(np.bincount(part), 1)
+    limit = max(CHANCE * math.sqrt(white / _PART), _MOVING)
+    lengths = []
     for name, values in (('before', means), ('after', means[:-1][::-1])):
-        length = _steady(values, apart) * _PART - _SETTLING
-        if length < REST:
+        # how many of the means, from the first on, differ by no more than by chance
+        middle = np.array([np.median(values[:end]) for end in range(1, len(values) + 1)])
+        steady = int(np.argmax(np.append(np.abs(values - middle) > limit, True)))
+        lengths.append(steady * _PART - _SETTLING)
+        if lengths[-1] < REST:
             raise DataRefused(
-                f'the robot rests for {max(length, 0.0):.1f} s {name} the turns, wanted {REST:g} '
-                's at least: leave it at rest on the mark, and record until after that')
-        found.append(length)
-    if sum(found) >= time[-1] - time[0] - 2.0 * _SETTLING:
+                f'the robot rests for {max(lengths[-1], 0.0):.1f} s {name} the turns, wanted '
+                f'{REST:g} s at least: leave it at rest on the mark, and record until after that')
+    if sum(lengths) >= time[-1] - time[0] - 2.0 * _SETTLING:
         raise DataRefused('the gyro rests all the time: did the robot turn, '
                           'and is the gyro alive?')
-    return (_rest(time, rate, time[0], time[0] + found[0], white),
-            _rest(time, rate, time[-1] - found[1], time[-1], white))
+    return float(time[0] + lengths[0]), float(time[-1] - lengths[1])
 
 
-def _steady(means: Array, apart: float) -> int:
-    """Return how many of the means, from the first on, differ by no more than by chance."""
-    middle = np.array([np.median(means[:end]) for end in range(1, len(means) + 1)])
-    moved = np.abs(means - middle) > apart
-    return int(np.argmax(np.append(moved, True)))
-
-
-def _rest(time: Array, rate: Array, begin: float, end: float, white: float) -> _Rest:
-    inside = (time >= begin) & (time <= end)
-    return _Rest(float(begin), float(end), float(rate[inside].mean()), white / float(end - begin))
-
-
-def _bias(first: _Rest, last: _Rest, noise: Noise, limits: Limits) -> tuple[float, float]:
-    """Return the mean bias over the turns, as the mean of both rests, and its variance."""
-    apart = last.begin - first.end
-    wander = noise.wander(apart, min(first.duration, last.duration))
-    difference, expected = (last.mean - first.mean,
-                            math.sqrt(first.variance + last.variance + wander))
+def _refuse_bias(difference: float, expected: float, bias: float, limits: Limits) -> None:
+    """Refuse rests that differ by more than chance (`expected` is 1 sigma), or no bias, rad/s."""
     if abs(difference) > max(-float(ndtri(0.5 * _FALSE_REFUSALS)) * expected, limits.drift):
         raise DataRefused(
             f'the rests before and after the turns differ by {difference / DEGREE:.4f} deg/s, '
             f'{abs(difference) / expected:.1f} standard deviations: the robot did not rest at '
             'both ends, or the gyro still warms up; wait, and run again')
-    bias = 0.5 * (first.mean + last.mean)
     if abs(bias) > limits.bias:
         raise DataRefused(f'a bias of {bias / DEGREE:.2f} deg/s is beyond '
                           f'{limits.bias / DEGREE:g} deg/s: did the robot rest at both ends?')
-    return bias, 0.25 * (first.variance + last.variance) + 0.5 * wander
 
 
 def _counted(measured: float, turns: int | None, limits: Limits) -> int:
@@ -189,40 +163,20 @@ def _counted(measured: float, turns: int | None, limits: Limits) -> int:
     if not count:
         raise DataRefused(f'{measured:.2f} turns are left when all is added up: '
                           'turn once at least, all in one direction or nearly so')
-    if turns is None:
-        _refuse_many(measured, count)
-    else:
-        _refuse_units(measured / turns, limits)
-    if abs(measured - count) > (AMBIGUOUS if turns else COUNTED * abs(count)):
-        raise DataRefused(_ambiguous(measured, turns))
-    return count
-
-
-def _refuse_many(measured: float, count: int) -> None:
-    if COUNTED * (2 * abs(count) + 1) > 1.0:
+    if turns is None and COUNTED * (2 * abs(count) + 1) > 1.0:
         raise DataRefused(f'{abs(measured):.2f} turns are too many to count by a gyro that may be '
-                          f'off by {100 * COUNTED:g} %: say how many they were')
-
-
-def _refuse_units(scale: float, limits: Limits) -> None:
-    """Refuse a scale that another unit or sign explains; a factor of two may be a wrong count."""
-    unit = (unit_error(scale, by_profile=False)
-            if abs(scale - 1.0) > limits.scale_factor_error and not 0.4 < abs(scale) < 2.5 else '')
-    if unit:
-        raise DataRefused(unit)
-    refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
-                 "else set the driver's parameter invert")
-
-
-def _ambiguous(measured: float, turns: int | None) -> str:
-    said = f', and {turns} were said' if turns else ''
-    return (f'the gyro counts {measured:.2f} turns{said}: that is no whole number that can be '
-            'told from the next; close the turns on the mark, count them, or make fewer')
-
-
-def _refuse_scale(scale: float, limits: Limits) -> None:
-    if abs(scale - 1.0) > limits.scale_factor_error:
+                          f'off by {100 * COUNTED:g} %: give the number of turns')
+    if turns is not None:
+        # another unit or sign explains the scale; a factor of two may be a wrong count
+        scale = measured / turns
+        beyond = abs(scale - 1.0) > limits.scale_factor_error and not 0.4 < abs(scale) < 2.5
+        if beyond and (unit := unit_error(scale, by_profile=False)):
+            raise DataRefused(unit)
+        refuse_scale(scale - 1.0, 'mark', 'clockwise turns count negative; '
+                     "else set the driver's parameter invert")
+    if abs(measured - count) > (AMBIGUOUS if turns else COUNTED * abs(count)):
+        given = f', and {turns} were given' if turns else ''
         raise DataRefused(
-            f'a scale factor error of {100 * (scale - 1.0):.0f} % is beyond '
-            f'{100 * limits.scale_factor_error:.0f} %: count the turns again, and look at the '
-            'sensitivity')
+            f'the gyro counts {measured:.2f} turns{given}: that is no whole number that can be '
+            'distinguished from the next; close the turns on the mark, count them, or make fewer')
+    return count

@@ -25,6 +25,7 @@ import math
 
 from gyro_calibration.files import LARGEST
 from gyro_calibration.logs.log import Array, DEGREE
+from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -177,7 +178,8 @@ class HealthMonitor:
         """
         time, output, rate = (np.array(values) for values in vars(self._gathered).values())
         self.restart()
-        self._step = min(self._step, step_of(output))
+        if np.ptp(output) > 0.0:
+            self._step = min(self._step, quantization_step(output))
         rest = examine(time, output, rate, self._noise, self._level, self._step, bias_variance,
                        age, promised)
         if rest is not None:
@@ -260,12 +262,6 @@ def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
     sigmas = max(abs(mean) - unsure, 0.0) / math.sqrt(variance) if variance > 0.0 else math.nan
     fits = not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level
     return mean, sigmas, fits, math.sqrt(of_noise + noise.wander(duration, duration))
-
-
-def step_of(output: Array) -> float:
-    """Return the smallest difference of neighbours above zero, rad/s; inf where there is none."""
-    steps = np.abs(np.diff(output))
-    return float(steps[steps > 0.0].min(initial=math.inf))
 
 
 def _differences(output: Array, size: int) -> Array:

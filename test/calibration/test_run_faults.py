@@ -280,7 +280,7 @@ def test_turns_are_counted_where_that_can_be():
 NO_TURNS = {
     'half a turn too much': (turned(2.5), 2, 'counts 2.5'),
     'half a turn, uncounted': (turned(2.5), None, 'counts 2.5'),
-    'one more': (turned(3), 2, 'and 2 were said'),
+    'one more': (turned(3), 2, 'and 2 were given'),
     'too many to count': (turned(12, speed=90.0), None, 'too many to count'),
     'the other way': (turned(2), -2, 'the other way'),
     'not at all': (turned(2), 0, 'turn once at least'),

@@ -129,7 +129,7 @@ def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
 def test_the_gyro_may_count_the_turns_and_a_wrong_count_is_refused():
     run, _ = ran(TURNS, ROUND, rules(), math.inf)
     assert '2 whole turns' in calibrated(run, rules(turned=0), Noise(), '')[1]
-    with pytest.raises(DataRefused, match='3 were said|turns'):
+    with pytest.raises(DataRefused, match='3 were given|turns'):
         calibrated(run, rules(turned=3), Noise(), '')
 
 

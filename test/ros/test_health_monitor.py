@@ -18,7 +18,7 @@ from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.gyro_model import SelfCalibration
 from gyro_calibration.model.motion import ROBOT
 from gyro_calibration.model.noise import Noise, simulate_noise
-from gyro_calibration.ros.health_monitor import changed, examine, HealthMonitor, step_of, STRETCH
+from gyro_calibration.ros.health_monitor import changed, examine, HealthMonitor, STRETCH
 import numpy as np
 import pytest
 
@@ -179,10 +179,6 @@ def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_judged():
 def test_without_noise_figures_there_is_nothing_to_check():
     assert (not HealthMonitor(Noise(), 0.001).works and not HealthMonitor(MEMS, 0.0).works
             and HealthMonitor(MEMS, 0.001).works)
-
-
-def test_the_step_of_codes_is_their_smallest_difference():
-    assert step_of(np.array([0.0, 3.0, 3.0, 1.0, 2.5])) == 1.5 and step_of(np.zeros(5)) == math.inf
 
 
 def test_a_calibration_that_changed_by_more_than_chance_is_said_in_vain_as_often_as_stated():
