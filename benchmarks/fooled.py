@@ -221,7 +221,7 @@ WAYS: dict[str, tuple[Callable[[Run], Array], Motion, str]] = {
     'half the sensitivity': (of_scale(0.5), CALIBRATION, 'half its sensitivity'),
     'twice the sensitivity': (of_scale(2.0), CALIBRATION, 'twice its sensitivity'),
     'one speed': (lambda run: run.gyro(run.follow(profile(one_speed()))), one_speed(),
-                  'cannot be parted'),
+                  'cannot be separated'),
     **{f'gyro in {name}': (of_scale(factor), CALIBRATION, f'gyro is in {said}')
        for name, (factor, said) in UNITS.items()},
     **{f'profile in {name}': (good, scaled(factor), f'profile in {said}')

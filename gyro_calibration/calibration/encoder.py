@@ -222,7 +222,7 @@ def _refuse_motion(motion: Motion, limits: Limits) -> None:
         mean = motion.heading[-1] / motion.duration
         raise DataRefused(f'the reference turns at one speed, {mean / DEGREE:.1f} deg/s '
                           f'(it varies by {spread / DEGREE:.2f} deg/s), so scale and bias cannot '
-                          'be parted: turn in both senses, or at another speed too, '
+                          'be separated: turn in both senses, or at another speed too, '
                           'or with a rest')
 
 

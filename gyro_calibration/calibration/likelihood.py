@@ -26,13 +26,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 import math
 
+from gyro_calibration.calibration.noise_grid import Tridiagonal
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded, helmert, solve_banded
+from scipy.linalg import helmert
 
 
 @dataclass(frozen=True)
@@ -472,26 +473,13 @@ def robust_residual(columns: Array, turned: Array, passes: int) -> Array:
     return residual
 
 
-class _Covariance:
-    """Covariance of the increments, up to one factor, by rate and reference noise; banded."""
+class _Covariance(Tridiagonal):
+    """Covariance of the increments, up to one factor, by rate and reference noise."""
 
     def __init__(self, data: _Increments, ratio: float):
-        band = np.zeros((2, len(data.turned)))
-        self._reference = ratio * data.reference
-        band[0, 1:] = data.neighbours[1:] - self._reference[1:-1]
-        band[1] = data.walk + self._reference[1:] + self._reference[:-1]
-        self.ratio = ratio
-        self._factor = cholesky_banded(band)
-        self.log_determinant = 2.0 * float(np.log(self._factor[1]).sum())
-
-    def solve(self, vector: Array) -> Array:
-        """Return the inverse times a vector or matrix."""
-        return cho_solve_banded((self._factor, False), vector)
-
-    def whiten(self, vector: Array) -> Array:
-        """Return the vector as independent values of one variance."""
-        lower = np.array([self._factor[1], np.append(self._factor[0, 1:], 0.0)])
-        return solve_banded((1, 0), lower, vector)
+        self.ratio, self._reference = ratio, ratio * data.reference
+        super().__init__(data.walk + self._reference[1:] + self._reference[:-1],
+                         data.neighbours - self._reference[:-1])
 
     def reference_error(self, residual: Array) -> Array:
         """Return the expected contribution of the noise of the headings to the residual."""

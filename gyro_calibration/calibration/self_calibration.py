@@ -150,8 +150,7 @@ def fit_heading(time: Array, rate: Array, motion: Motion) -> Fit:
     step = np.diff(time)
     g = np.column_stack([np.cumsum(step * rate[:-1]), np.cumsum(step)])
     z = motion.heading_at(time[1:]) - motion.heading_at(time[:1])
-    scale, offset = _solve(g.T @ g, g.T @ z)
-    return _from_inverse(scale, offset)
+    return _fit_inverse(g.T @ g, g.T @ z)
 
 
 def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
@@ -166,20 +165,16 @@ def fit_rate(time: Array, rate: Array, motion: Motion) -> Fit:
     """
     true = motion.rate_at(time)
     g = np.array([[rate @ rate, rate.sum()], [rate.sum(), len(rate)]])
-    scale, offset = _solve(g, np.array([true @ rate, true.sum()]))
-    return _from_inverse(scale, offset)
+    return _fit_inverse(g, np.array([true @ rate, true.sum()]))
 
 
-def _solve(matrix: Array, vector: Array) -> Array:
+def _fit_inverse(matrix: Array, vector: Array) -> Fit:
+    """Solve for s̄ and b̄ of eq. 3, and return them as s and b."""
     if not np.linalg.cond(matrix) < 1e12:
-        raise DataRefused('the gyro did not change its rate, so scale and bias cannot be parted: '
-                          'turn both ways, with stops')
-    return np.linalg.solve(matrix, vector)
-
-
-def _from_inverse(scale: float, offset: float) -> Fit:
-    """Turn s̄ and b̄ of eq. 3 into s and b."""
-    return Fit(float(1.0 / scale - 1.0), float(-offset / scale), np.full((2, 2), np.nan))
+        raise DataRefused('the gyro did not change its rate, so scale and bias cannot be '
+                          'separated: turn both ways, with stops')
+    scale, offset = np.linalg.solve(matrix, vector).tolist()
+    return Fit(1.0 / scale - 1.0, -offset / scale, np.full((2, 2), np.nan))
 
 
 METHODS = {'likelihood': fit_likelihood, 'heading': fit_heading, 'rate': fit_rate}
@@ -215,27 +210,24 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
     refuse_saturated(rate if output is None else output)
-    _refuse_motion(time, motion, limits)
     run = pieces(time, rate)
-    _refuse_run(run, motion, limits)
+    _refuse_run(time, run, motion, limits)
     if method == 'likelihood':
         fit = _fit_likelihood(time, rate, motion, limits.time_offset, reference.scale_deviation)
     else:
         fit = METHODS[method](time, rate, motion)
-    fit = replace(fit, covariance=fit.covariance + _shared(fit, reference, noise),
+    # what no run shows: wander of the bias, and errors of the reference
+    scale, floor = 1.0 + fit.scale_factor_error, 0.0 if noise is None else noise.floor
+    hidden = np.diag([(scale * reference.scale_deviation) ** 2,
+                      floor ** 2 + (scale * reference.rate_deviation) ** 2])
+    fit = replace(fit, covariance=fit.covariance + hidden,
                   goodness=_goodness(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
-        fit = _drawn(fit, prior)
+        gain = prior @ np.linalg.inv(prior + fit.covariance)
+        s, b = (gain @ (fit.scale_factor_error, fit.bias)).tolist()
+        fit = replace(fit, scale_factor_error=s, bias=b, covariance=gain @ fit.covariance)
     _refuse_fit(fit, run, motion, limits)
     return fit
-
-
-def _drawn(fit: Fit, prior: Array) -> Fit:
-    """Return the fit together with what was known of (s, b) before, about zero."""
-    gain = prior @ np.linalg.inv(prior + fit.covariance)
-    s, b = gain @ (fit.scale_factor_error, fit.bias)
-    return replace(fit, scale_factor_error=float(s), bias=float(b),
-                   covariance=gain @ fit.covariance)
 
 
 def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float,
@@ -250,13 +242,6 @@ def _fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offse
         look_slower(fit, stamps, rate, motion), rate)
 
 
-def _shared(fit: Fit, reference: Reference, noise: Noise | None) -> Array:
-    """Return the covariance of (s, b) that no run shows: bias wander, and reference errors."""
-    scale = 1.0 + fit.scale_factor_error
-    return np.diag([(scale * reference.scale_deviation) ** 2,
-                    _wander(noise) + (scale * reference.rate_deviation) ** 2])
-
-
 def _goodness(fit: Fit, reference: Reference, noise: Noise | None) -> Goodness | None:
     """Compare the residual with the known noise of means over neighbouring blocks."""
     if noise is None or not noise.angle_random_walk or not fit.freedom:
@@ -267,11 +252,6 @@ def _goodness(fit: Fit, reference: Reference, noise: Noise | None) -> Goodness |
     chi_square = fit.squares / known
     return Goodness(chi_square, fit.freedom, float(chdtrc(fit.freedom, chi_square)),
                     fit.angle_random_walk / math.sqrt(known))
-
-
-def _wander(noise: Noise | None) -> float:
-    """Return the variance of the bias, (rad/s)², that averaging does not reduce."""
-    return 0.0 if noise is None else noise.floor ** 2
 
 
 def refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
@@ -288,16 +268,6 @@ def refuse_samples(time: Array, rate: Array, limits: Limits) -> None:
                           'missing: mend the line and run again')
 
 
-def _refuse_motion(time: Array, motion: Motion, limits: Limits) -> None:
-    if not np.isfinite(motion.heading).all():
-        raise DataRefused('the reference was lost somewhere in the profile: '
-                          'leave those points out, or run again')
-    if time[-1] - time[0] < 0.9 * motion.duration - 2.0 * limits.time_offset:
-        covered = time[-1] - time[0]
-        raise DataRefused(f"the samples cover {covered:.1f} s of the profile's "
-                          f'{motion.duration:.1f} s: record the whole motion')
-
-
 def refuse_scale(s: float, reference: str, remedy: str) -> None:
     """Refuse a gyro that saw almost none of the reference's turns, or all with the other sign."""
     if abs(1.0 + s) < 0.5:
@@ -308,32 +278,38 @@ def refuse_scale(s: float, reference: str, remedy: str) -> None:
                           f'(scale {1 + s:.2f}): {remedy}')
 
 
-def _refuse_run(run: Pieces, motion: Motion, limits: Limits) -> None:
-    """Refuse another unit or sign, a profile of one speed, and a run that is not the profile."""
+def _refuse_run(time: Array, run: Pieces, motion: Motion, limits: Limits) -> None:
+    """Refuse a run that is not the whole profile, another unit or sign, or one speed alone."""
+    if not np.isfinite(motion.heading).all():
+        raise DataRefused('the reference was lost somewhere in the profile: '
+                          'leave those points out, or run again')
+    covered = float(time[-1] - time[0])
+    if covered < 0.9 * motion.duration - 2.0 * limits.time_offset:
+        raise DataRefused(f"the samples cover {covered:.1f} s of the profile's "
+                          f'{motion.duration:.1f} s: record the whole motion')
     largest = limits.time_offset + FOLLOWING
     left, scale = followed(run, motion, largest)
     if left <= EXPLAINED:
-        _refuse_units(scale - 1.0, limits)
-    _refuse_one_speed(motion, limits)
-    if left <= EXPLAINED:
-        return
-    if np.std(run.turned) < 0.1 * np.std(run.headings(motion)):
-        refuse_scale(scale - 1.0, 'profile', '')
-    refuse_robot(run, motion, largest)
-
-
-def _refuse_one_speed(motion: Motion, limits: Limits) -> None:
+        unit = unit_error(scale) if abs(scale - 1.0) > limits.scale_factor_error else ''
+        if unit:
+            raise DataRefused(unit)
+        refuse_scale(scale - 1.0, 'profile', "set the driver's parameter invert")
     spread = float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05))))
     if spread < limits.rate_spread:
         raise DataRefused('the profile turns at one speed (its rate varies by '
-                          f'{spread / DEGREE:.2f} deg/s): scale and bias cannot be parted; '
+                          f'{spread / DEGREE:.2f} deg/s): scale and bias cannot be separated; '
                           'turn both ways, with stops')
+    if left > EXPLAINED:
+        if np.std(run.turned) < 0.1 * np.std(run.headings(motion)):
+            refuse_scale(scale - 1.0, 'profile', '')
+        refuse_robot(run, motion, largest)
 
 
 def _refuse_fit(fit: Fit, run: Pieces, motion: Motion, limits: Limits) -> None:
     """Refuse by the first cause found; causes that spoil later checks come first."""
     largest = limits.time_offset + FOLLOWING
     turned, size = fit.residual
+    s, b = fit.scale_factor_error, fit.bias
     deviation = float(np.nan_to_num(math.sqrt(fit.covariance[0, 0])))
     slip = slip_sentence(turned, fit.stretch[0], size)
     slipped = turned > limits.residual and size > SLIP
@@ -341,22 +317,6 @@ def _refuse_fit(fit: Fit, run: Pieces, motion: Motion, limits: Limits) -> None:
         refuse_robot(run, motion, largest, slip)
     if slipped:
         raise DataRefused(slip)
-    _refuse_values(fit, deviation, limits)
-    _refuse_noise(fit, motion, limits)
-    refuse_repeating(fit, limits.repeating)
-    refuse_useless(fit, limits.heading)
-
-
-def _refuse_units(s: float, limits: Limits) -> None:
-    """Refuse a scale that another unit or sign explains."""
-    unit = unit_error(1.0 + s) if abs(s) > limits.scale_factor_error else ''
-    if unit:
-        raise DataRefused(unit)
-    refuse_scale(s, 'profile', "set the driver's parameter invert")
-
-
-def _refuse_values(fit: Fit, deviation: float, limits: Limits) -> None:
-    s, b = fit.scale_factor_error, fit.bias
     if abs(s) > limits.scale_factor_error + 3.0 * deviation:
         raise DataRefused(f'a scale factor error of {100 * s:.0f} % is beyond '
                           f'{100 * limits.scale_factor_error:.0f} %: look at the sensitivity and '
@@ -369,22 +329,15 @@ def _refuse_values(fit: Fit, deviation: float, limits: Limits) -> None:
                           f'wanted {100 * limits.scale_standard_deviation:g} %: turn further, '
                           'faster, or more often, '
                           'and check that the profile is the one that was driven')
-
-
-def _refuse_noise(fit: Fit, motion: Motion, limits: Limits) -> None:
-    """
-    Refuse noise that no robot makes on a profile.
-
-    Against measured headings the deviations include the noise of mount and encoder.
-
-    """
+    # against measured headings the deviations include the noise of mount and encoder
     unexplained = fit.angle_random_walk * math.sqrt(motion.duration)
-    if motion.rate is None or fit.goodness is None or unexplained <= limits.unexplained:
-        return
-    if fit.goodness.noise_ratio > limits.noise_ratio:
+    if (motion.rate is not None and fit.goodness is not None and unexplained > limits.unexplained
+            and fit.goodness.noise_ratio > limits.noise_ratio):
         raise DataRefused(f'the run is {fit.goodness.noise_ratio:.1f} times as noisy as the model '
                           f'says, at most {limits.noise_ratio:g} are allowed: look whether the '
                           'gyro is fixed and the robot shakes, or measure the noise anew (allan)')
+    refuse_repeating(fit, limits.repeating)
+    refuse_useless(fit, limits.heading)
 
 
 @dataclass(frozen=True)
@@ -530,46 +483,33 @@ def calibrate_bias(time: Array, rate: Array, limits: Limits | None = None,
     limits = limits or Limits()
     refuse_samples(time, rate, limits)
     refuse_dead(rate if output is None else output)
-    blocks = np.array([block.mean() for block in np.array_split(rate, 10)])
-    within = math.sqrt(np.mean([block.var(ddof=1) for block in np.array_split(rate, 10)])
-                       / (len(rate) / 10))
-    _refuse_change(np.abs(blocks - np.median(blocks)), np.full(10, within))
-    _refuse_change(*_steps(blocks, within))
-    # Ten blocks may scatter by half of what they should by chance.
-    of_model = (noise.angle_random_walk ** 2 / float(time[-1] - time[0]) if noise is not None
-                else 0.0)
-    bias, deviation = float(rate.mean()), math.sqrt(max(blocks.var(ddof=1) / 10.0, of_model)
-                                                    + _wander(noise))
+    parts = np.array_split(rate, 10)
+    blocks = np.array([part.mean() for part in parts])
+    within = math.sqrt(np.mean([part.var(ddof=1) for part in parts]) / (len(rate) / 10))
+    # each mean against their median, and the mean of those after each block against that before
+    first, sums = np.arange(1, 10), np.cumsum(blocks)
+    last = 10 - first
+    changes = np.abs(np.concatenate([blocks - np.median(blocks),
+                                     (sums[-1] - sums[:-1]) / last - sums[:-1] / first]))
+    deviations = within * np.sqrt(np.concatenate([np.ones(10), 1.0 / first + 1.0 / last]))
+    beyond = changes[changes > np.maximum(CHANCE * deviations, 0.05 * DEGREE)]
+    if len(beyond):
+        raise DataRefused(f'the gyro was moved: its mean changed by {beyond.max() / DEGREE:.2f} '
+                          'deg/s within the rest; keep it still and run again')
+    noise = noise or Noise()
+    # ten blocks may scatter by half of what they should by chance
+    white = max(blocks.var(ddof=1) / 10.0,
+                noise.angle_random_walk ** 2 / float(time[-1] - time[0]))
+    bias = float(rate.mean())
     if abs(bias) > limits.bias:
         raise DataRefused(f'a mean of {bias / DEGREE:.2f} deg/s is beyond '
                           f'{limits.bias / DEGREE:g} deg/s: the gyro turns, or is broken')
-    if noise is not None and noise.angle_random_walk:
-        _refuse_shaking(time, rate, noise)
-    return bias, deviation
-
-
-def _steps(blocks: Array, within: float) -> tuple[Array, Array]:
-    """Return the change of the mean at each block and its standard deviation, shape (n - 1,)."""
-    first = np.arange(1, len(blocks))
-    last = len(blocks) - first
-    sums = np.cumsum(blocks)
-    return (np.abs((sums[-1] - sums[:-1]) / last - sums[:-1] / first),
-            within * np.sqrt(1.0 / first + 1.0 / last))
-
-
-def _refuse_change(changes: Array, deviations: Array) -> None:
-    beyond = np.where(changes > np.maximum(CHANCE * deviations, 0.05 * DEGREE), changes, 0.0).max()
-    if beyond:
-        raise DataRefused(f'the gyro was moved: its mean changed by {beyond / DEGREE:.2f} deg/s '
-                          'within the rest; keep it still and run again')
-
-
-def _refuse_shaking(time: Array, rate: Array, noise: Noise) -> None:
     expected = math.sqrt(noise.rate_variance(float(np.median(np.diff(time)))))
-    if rate.std() > 3.0 * expected:
+    if expected and rate.std() > 3.0 * expected:
         raise DataRefused(f'the rate varies by {rate.std() / DEGREE:.2f} deg/s where rest gives '
                           f'{expected / DEGREE:.2f} deg/s: '
                           'stop the robot and its motors, and run again')
+    return bias, math.sqrt(white + noise.floor ** 2)
 
 
 def record(fit: Fit, method: str, time: str, temperature: float | None) -> SelfCalibration:
