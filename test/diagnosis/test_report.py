@@ -238,16 +238,14 @@ def test_the_page_is_well_formed_and_has_each_name_once(made):
     assert {tag for tag, _ in page.elements} >= {'h1', 'main', 'section', 'style', 'script'}
 
 
-def test_the_page_refers_to_nothing_outside(made):
-    for tag, attributes in Page(report(made)).elements:
+def test_the_page_refers_to_nothing_outside_and_allows_itself_no_network(made):
+    elements = Page(report(made)).elements
+    for tag, attributes in elements:
         assert tag not in ('img', 'link', 'iframe', 'object', 'embed', 'base', 'form', 'a')
         assert not {'src', 'href', 'srcset', 'action', 'style'} & set(attributes)
         assert not any(name.startswith('on') for name in attributes)
-
-
-def test_the_page_allows_itself_no_network(made):
     policy, = [attributes['content']
-               for tag, attributes in Page(report(made)).elements if attributes.get('http-equiv')]
+               for _, attributes in elements if attributes.get('http-equiv')]
     assert policy.startswith("default-src 'none';")
 
 
@@ -299,8 +297,10 @@ def test_a_set_is_named_with_the_experiment_that_parts_it():
     assert 'To distinguish them: heat and cool the gyro within one log.' in text
 
 
-def test_among_several_causes_a_set_is_in_brackets():
+def test_among_several_causes_a_set_is_in_brackets_and_sizes_are_in_data_sheet_units():
     assert 'time offset (or bandwidth), cubic nonlinearity and 2 more' in headline(several())[0]
+    text = ' '.join(lines(several()))
+    assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
 
 
 def test_a_diagnosis_of_another_kind_leaves_out_what_it_did_not_measure():
@@ -316,11 +316,6 @@ def test_where_no_extension_is_offered_nothing_is_drawn_as_after_it():
                           unexplained=(Unexplained('temperature', 0.2, 1e-7),)))
     assert ('data-name="after"' in report(whole) and 'data-name="after"' not in text
             and 'as extended' not in text)
-
-
-def test_sizes_are_in_the_units_of_people():
-    text = ' '.join(lines(several()))
-    assert '20.10 (19.80 to 20.40) ms' in text and 'deg/s/K' in text and 'rad' not in text
 
 
 @pytest.mark.parametrize('value, interval, unit, words', [
@@ -465,42 +460,28 @@ def browser(tmp_path_factory):
 SCREENS = {'watch': (320, 480), 'phone': (360, 800), 'tablet': (768, 1024), 'desk': (1280, 900)}
 
 
-@pytest.fixture(params=SCREENS)
-def screen(request):
-    """Return the size of a screen."""
-    return SCREENS[request.param]
-
-
-@pytest.fixture(scope='module')
-def path(made, tmp_path_factory):
-    """Return a file with the page."""
-    path = tmp_path_factory.mktemp('page') / 'report.html'
-    path.write_text(report(made), encoding='utf-8')
-    return path
-
-
 #: Elements that reach beyond the right edge of the screen, except inside scrolling boxes.
 BEYOND = ('[...document.querySelectorAll("body *")].filter(each => !each.closest(".scroll, svg") '
           '&& each.getBoundingClientRect().right > innerWidth + 0.5).map(each => '
           'each.outerHTML.slice(0, 80))')
 
 
-def test_the_page_fits_the_screen(browser, path, screen):
-    browser.show(path, *screen)
-    assert browser.tell('innerWidth') == screen[0]
-    assert browser.tell('document.documentElement.scrollWidth') <= screen[0]
-    assert browser.tell(BEYOND) == []
-
-
-def test_the_page_opens_without_complaint_and_without_network(browser, path, screen):
-    browser.show(path, *screen)
-    kinds = ('Runtime.exceptionThrown', 'Log.entryAdded', 'Runtime.consoleAPICalled')
-    complaints = [event for event in browser.events if event.get('method') in kinds]
-    asked = [event['params']['request']['url']
-             for event in browser.events if event.get('method') == 'Network.requestWillBeSent']
-    assert not complaints
-    assert asked == [path.as_uri()]
-    assert browser.tell('document.title').startswith('Diagnosis of ')
+def test_the_page_fits_each_screen_and_opens_without_complaint_and_network(
+        browser, made, tmp_path):
+    path = tmp_path / 'report.html'
+    path.write_text(report(made), encoding='utf-8')
+    for width, height in SCREENS.values():
+        browser.show(path, width, height)
+        methods = [event.get('method') for event in browser.events]
+        asked = [event['params']['request']['url'] for event, method
+                 in zip(browser.events, methods) if method == 'Network.requestWillBeSent']
+        assert not {'Runtime.exceptionThrown', 'Log.entryAdded',
+                    'Runtime.consoleAPICalled'} & set(methods)
+        assert asked == [path.as_uri()]
+        assert browser.tell('document.title').startswith('Diagnosis of ')
+        assert browser.tell('innerWidth') == width
+        assert browser.tell('document.documentElement.scrollWidth') <= width
+        assert browser.tell(BEYOND) == []
 
 
 @pytest.fixture(scope='module')
@@ -511,8 +492,8 @@ def whole_path(tmp_path_factory):
     return path
 
 
-def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path, screen):
-    browser.show(whole_path, *screen)
+def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path):
+    browser.show(whole_path, *SCREENS['phone'])
     count = browser.tell('document.querySelectorAll("figure.chart").length')
     browser.tell('document.querySelectorAll("figure.chart").forEach((each, place) => each.id = '
                  '"chart" + place)')
@@ -527,8 +508,9 @@ def test_pointing_at_each_chart_shows_the_values_there(browser, whole_path, scre
                             '.cursor")).visibility') == 'visible'
 
 
+@pytest.mark.parametrize('screen', SCREENS)
 def test_the_values_shown_are_those_pointed_at(browser, whole_path, screen):
-    browser.show(whole_path, *screen)
+    browser.show(whole_path, *SCREENS[screen])
     temperatures = []
     browser.tell('[...document.querySelectorAll("figure")].find(each => '
                  'each.textContent.startsWith("Residual along temperature")).id = "thermal"')

@@ -11,6 +11,7 @@
 """Each effect's formula, and one test for all: simulate, compensate, and the rate is back."""
 
 from dataclasses import replace
+import itertools
 import math
 
 from gyro_calibration.logs.log import DEGREE
@@ -181,26 +182,25 @@ def test_saturation_and_quantization_come_after_the_noise():
                 and (name == 'quantization') == bool((codes == np.round(codes)).all())), name
 
 
-@pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items() if effect.undone])
-def test_what_cannot_be_undone_is_passed_over(name):
-    effect = CATALOGUE[name]
-    model, _, _, output = distorted(
-        name, *(0.01 if each.default is None else each.default for each in effect.parameters))
-    assert model.rate(output, 25.0).tolist() == output.tolist()
-    uncertain = replace(model, covariance=np.eye(1))
-    assert not rate_sensitivity(uncertain, output, output, 25.0).any()
+def test_what_cannot_be_undone_is_passed_over():
+    for name, effect in CATALOGUE.items():
+        if effect.undone:
+            model, _, _, output = distorted(name, *(
+                0.01 if each.default is None else each.default for each in effect.parameters))
+            assert model.rate(output, 25.0).tolist() == output.tolist(), name
+            uncertain = replace(model, covariance=np.eye(1))
+            assert not rate_sensitivity(uncertain, output, output, 25.0).any(), name
 
 
-@pytest.mark.parametrize('name', CATALOGUE)
-def test_columns_have_the_shape_of_the_rates(name):
-    effect = CATALOGUE[name]
+def test_columns_have_the_shape_of_the_rates():
     rate = np.linspace(-1.0, 1.0, 5)
-    shapes = [0.5] * len(effect.shapes)
-    columns = effect.columns(Channels(rate, rate, 25.0), *shapes)
-    assert [np.shape(column) for column in columns] == [(5,)] * len(effect.coefficients)
-    for index, w in enumerate(rate):
-        assert [column[index] for column in columns] == list(
-            effect.columns(Channels(float(w), float(w), 25.0), *shapes))
+    for effect in CATALOGUE.values():
+        shapes = [0.5] * len(effect.shapes)
+        columns = effect.columns(Channels(rate, rate, 25.0), *shapes)
+        assert [np.shape(each) for each in columns] == [(5,)] * len(effect.coefficients), effect
+        for index, w in enumerate(rate.tolist()):
+            assert [column[index] for column in columns] == list(
+                effect.columns(Channels(w, w, 25.0), *shapes)), effect
 
 
 def test_the_sine_response_is_the_sine_of_the_sagnac_phase():
@@ -231,16 +231,14 @@ def eq_12(matrix, output, degc):
         [output ** 3, output ** 2, output, 1.0])
 
 
-@pytest.mark.parametrize('output', [-100.0, -12.5, 0.0, 3.0, 100.0])
-@pytest.mark.parametrize('degc', [0.0, 25.0, 45.0])
-def test_the_matrix_of_eq_11_gives_the_error_of_eq_12_and_one_subtraction_compensates(
-        output, degc):
+def test_the_matrix_of_eq_11_gives_the_error_of_eq_12_and_one_subtraction_compensates():
     model = gyro('rate_temperature_polynomial')
-    error = model.error(Channels(rate=math.nan, output=output * DEGREE, temperature=degc))
-    assert error / DEGREE == pytest.approx(eq_12(C, output, degc), abs=1e-12)
-    # Eq. 13.
-    assert compensate(model, output * DEGREE, degc).rate / DEGREE == pytest.approx(
-        output - eq_12(C, output, degc), abs=1e-12)
+    for output, degc in itertools.product((-100.0, -12.5, 0.0, 3.0, 100.0), (0.0, 25.0, 45.0)):
+        error = model.error(Channels(rate=math.nan, output=output * DEGREE, temperature=degc))
+        assert error / DEGREE == pytest.approx(eq_12(C, output, degc), abs=1e-12)
+        # eq. 13
+        assert compensate(model, output * DEGREE, degc).rate / DEGREE == pytest.approx(
+            output - eq_12(C, output, degc), abs=1e-12)
 
 
 @pytest.mark.parametrize('matrix', [C, C[:, 2:], C[2:], [[0.5]], [[1e-4, 0.5]]],
