@@ -369,44 +369,6 @@ def test_a_simulation_of_a_single_sample_is_wrong_use(run, model, tmp_path):
             and not (tmp_path / 'out.csv').exists())
 
 
-ROWS = {
-    'values of 1e300': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
-        f'{k / 10},{1e300 * (k % 3)},{k % 3}\n' for k in range(500)),
-    'values of 1e20': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
-        f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n' for k in range(500)),
-    'values of 1e-300': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
-        f'{k / 10},{1e-300 * k},{k}\n' for k in range(500)),
-    'an eternity': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
-        f'{k * 1e17},{k % 7},{k % 5}\n' for k in range(500)),
-    'an instant': 'time_s,gyro_dps,reference_heading_deg\n' + ''.join(
-        f'{k * 2e-9},{k % 7},{k % 5}\n' for k in range(500)),
-    'one dwell': 'gyro_dps,reference_rate_dps\n' + '1.5,2\n' * 40,
-    'samples far apart': 'time_s,gyro_dps,reference_rate_dps\n' + ''.join(
-        f'{k * 1e10},{k % 7},{k % 5}\n' for k in range(200)),
-    'two samples': 'time_s,gyro_dps\n1e10,1\n2e10,-1e20\n',
-    'heat': 'gyro_dps,reference_rate_dps,temperature_degc\n' + ''.join(
-        f'{k},{k},{(k % 3) * 1e19}\n' for k in range(60)),
-}
-
-
-@pytest.mark.parametrize('text', ROWS.values(), ids=ROWS)
-@pytest.mark.parametrize('words', [
-    ('fit', '--out', 'OUT'), ('fit', '--method', 'dwells'), ('fit', '--method', 'likelihood'),
-    ('fit', '--method', 'rate'), ('turn',), ('fit', '--polynomial'), ('allan',),
-    ('self-calibrate',), ('self-calibrate', '--turns', 'nearest'),
-    ('compensate', '--model', 'NOISY', '--out', 'OUT', '--threshold', '0'),
-    ('compensate', '--model', 'NOISY', '--out', 'OUT', '--hindsight')], ids=' '.join)
-def test_what_no_gyro_says_is_refused_in_a_sentence_or_computed(run, tmp_path, words, text):
-    (tmp_path / 'log.csv').write_text(text)
-    (tmp_path / 'noisy.yaml').write_text(NOISY_GYRO)
-    given = {'OUT': tmp_path / 'out', 'NOISY': tmp_path / 'noisy.yaml'}
-    with np.errstate(all='ignore'):
-        code, answer, error = run(words[0], tmp_path / 'log.csv',
-                                  *[given.get(word, word) for word in words[1:]], '--json')
-    said = [line for line in error.splitlines() if line.startswith('gyro_calibration: ')]
-    assert code in (0, 1, 2) and len(said) == (code > 0) and bool(answer) == (code == 0)
-
-
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):
     """Its sum would be waited for without end: whoever wrote it has gone."""
     rows = ''.join(f'{rate * 0.95 + 0.1 + 0.001 * (k % 3)},{rate}\n'

@@ -455,6 +455,23 @@ ODD = {
     'tabs': b'time_s\tgyro_dps\n0\t1\n1\t1\n', 'counts': b'time_s,gyro_counts\n0,1\n1,2\n2,1\n',
     'bom and crlf': b'\xef\xbb\xbftime_s,gyro_dps\r\n0,1\r\n1,2\r\n2,1\r\n',
     'cr': b'time_s,gyro_dps\r0,1\r1,2\r2,1\r',
+    **{name: f'{columns}\n{"".join(map(row, range(500)))}'.encode() for name, columns, row in (
+        ('values of 1e300', 'time_s,gyro_dps,reference_rate_dps',
+         lambda k: f'{k / 10},{1e300 * (k % 3)},{k % 3}\n'),
+        ('values of 1e20 on a table', 'time_s,gyro_dps,reference_rate_dps',
+         lambda k: f'{k / 10},{1e20 * (k % 3)},{k // 100 * 20}\n'),
+        ('values of 1e-300', 'time_s,gyro_dps,reference_heading_deg',
+         lambda k: f'{k / 10},{1e-300 * k},{k}\n'),
+        ('an eternity', 'time_s,gyro_dps,reference_heading_deg',
+         lambda k: f'{k * 1e17},{k % 7},{k % 5}\n'),
+        ('an instant', 'time_s,gyro_dps,reference_heading_deg',
+         lambda k: f'{k * 2e-9},{k % 7},{k % 5}\n'),
+        ('one dwell', 'gyro_dps,reference_rate_dps', lambda k: '1.5,2\n'),
+        ('samples far apart', 'time_s,gyro_dps,reference_rate_dps',
+         lambda k: f'{k * 1e10},{k % 7},{k % 5}\n'),
+        ('heat', 'gyro_dps,reference_rate_dps,temperature_degc',
+         lambda k: f'{k},{k},{(k % 3) * 1e19}\n'))},
+    'two samples': b'time_s,gyro_dps\n1e10,1\n2e10,-1e20\n',
 }
 
 
@@ -478,7 +495,10 @@ VERBS = {
     'hindsight': 'compensate {log} --model {model} --out {out} --hindsight',
     'counts': 'compensate {log} --model {model} --out {out} --sensitivity 1e19',
     'rate': 'compensate {log} --model {model} --out {out} --rate 1e-19',
-    'fit': 'fit {log} --out {out}',
+    'threshold': 'compensate {log} --model {model} --out {out} --threshold 0',
+    'fit': 'fit {log} --out {out}', 'polynomial': 'fit {log} --polynomial',
+    **{f'fit by {name}': f'fit {{log}} --method {name}'
+       for name in ('dwells', 'likelihood', 'rate')},
     'allan': 'allan {log} --out {out}', 'self-calibrate': 'self-calibrate {log} --out {out}',
     'profile': 'self-calibrate {log} --profile {log} --out {out}',
     'turns': 'self-calibrate {log} --turns nearest --out {out}',
