@@ -165,10 +165,12 @@ def test_where_a_hangup_is_ignored_a_recording_goes_on():
 
 
 def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
+    """Where columns have a unit, no sensitivity stands beside it."""
     with gyro(tmp_path / 'gyro'):
         code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
         assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
-        before = (tmp_path / 'a.csv').read_bytes()
+        notes, before = read(tmp_path / 'a.csv').notes, (tmp_path / 'a.csv').read_bytes()
+        assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
         code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
     assert (code == 2 and 'is there already' in error
             and (tmp_path / 'a.csv').read_bytes() == before)
@@ -234,13 +236,6 @@ def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_told(run, t
                                       '--seconds', '6', '--json'))
     assert code == 0 and read(tmp_path / 'a.csv').temperature is None
     assert 'temperature_degc came too late for a column of a log' in out
-
-
-def test_columns_with_a_unit_have_no_sensitivity_beside_it(run, tmp_path):
-    with gyro(tmp_path / 'gyro'):
-        assert run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))[0] == 0
-    notes = read(tmp_path / 'a.csv').notes
-    assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
 
 
 def test_a_port_that_is_not_there_is_told_and_leaves_no_file(run, tmp_path):

@@ -17,7 +17,6 @@ import re
 
 from fake_port import World
 import pytest
-import yaml
 
 pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
@@ -38,14 +37,6 @@ KEYS = {
 
 
 # Parameters
-
-
-def test_there_are_twelve_parameters_and_the_configuration_holds_each_with_its_default():
-    text = CONFIGURATION.read_text()
-    given = yaml.safe_load(text)['/**/driver_node']['ros__parameters']
-    assert len(PARAMETERS) == 12 and list(given) == [each.name for each in PARAMETERS]
-    assert [tuple(value) if isinstance(value, list) else value for value in given.values()] == [
-        each.default for each in PARAMETERS]
 
 
 @pytest.mark.parametrize(('given', 'sentence'), [

@@ -10,8 +10,6 @@
 
 """What is recorded is in the file, whole piece by whole piece: rows of a log, chunks of MCAP."""
 
-import gzip
-from pathlib import Path
 
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
@@ -368,13 +366,3 @@ def test_what_a_reference_does_not_report_is_no_column(topic):
     log = topic.read()
     assert (log.reference_rate is None
             and np.nanmax(np.abs(log.reference_heading)) == pytest.approx(0.1, abs=1e-6))
-
-
-def test_pieces_of_a_packed_log_are_whole_by_themselves(tmp_path):
-    recorder = CsvRecorder(str(tmp_path / 'a.csv.gz'), notes)
-    for stamp, sample in samples():
-        recorder.add_sample(stamp, sample)
-        recorder.flush()
-    data = Path(tmp_path / 'a.csv.gz').read_bytes()  # not closed yet
-    assert gzip.decompress(data).count(b'\n') > 100
-    recorder.close()
