@@ -34,7 +34,7 @@ import pytest
 
 FUZZER = Path(__file__).parents[1] / 'benchmarks' / 'fuzz.py'
 #: Target -> how many inputs hypothesis tries; YAML takes ten times as long as the rest.
-EXAMPLES = {'model': 25, 'bias table': 20, 'motion limits': 40, 'arguments': 40,
+EXAMPLES = {'model': 40, 'bias table': 20, 'motion limits': 40, 'arguments': 40,
             'recording .db3': 40}
 
 #: What the fuzzers found: target, input.

@@ -125,19 +125,6 @@ def test_what_is_no_log_is_refused_with_file_row_and_column(tmp_path, text, mess
     assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(LogError, match='nothing.csv'):
-        read_log(tmp_path / 'nothing.csv')
-
-
-@pytest.mark.parametrize('read', [read_log, read_in_pairs])
-@pytest.mark.parametrize('path', ['/dev/zero', '/dev/null', '.'])
-def test_a_device_or_a_folder_is_no_log(path, read):
-    with pytest.raises(LogError,
-                       match='it is a (device|folder), where a file or a pipe is wanted'):
-        read(path)
-
-
 def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('gyro_calibration.logs.log.GROWN', 1 << 16)
     path = tmp_path / 'log.csv.gz'
