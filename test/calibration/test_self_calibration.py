@@ -262,7 +262,6 @@ def test_a_bump_below_the_limit_does_little_harm():
 ONE_SPEED = from_rates(np.array([0.0, 20.0]), np.array([0.5, 0.5]))
 OTHER = turns([(2, 0), (5, -40), (3, 20), (5, 40), (4, -20), (1, 0)])
 GAP = (TIME < 8.0) | (TIME > 9.0)
-SPEEDS = turns([(10, 20), (10, 10)])
 REFUSED = {
     'too few samples': (TIME[:40], run()[:40], CALIBRATION, 'only 40 samples came; at least 50'),
     'a gap': (TIME[GAP], run()[GAP], CALIBRATION, 'no samples came for 1.0'),

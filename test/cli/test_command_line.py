@@ -355,19 +355,13 @@ def test_an_empty_option_is_wrong_use(run, model, log, words):
 
 @pytest.mark.parametrize('words', [
     ('--sample-rate', '1e-300'), ('--sample-rate', '1e300'), ('--temperature', 'nan'),
-    ('--temperature', '1e9'), ('--sample-rate', '1e9')])
+    ('--temperature', '1e9'), ('--sample-rate', '1e9'), ('--sample-rate', '0.001')])
 def test_a_simulation_beyond_all_bounds_is_wrong_use(run, model, tmp_path, words):
     code, text, error = run('simulate', '--model', model, '--motion', 'rest',
                             '--out', tmp_path / 'out.csv', *words)
     assert (code == 2 and not text and 'Traceback' not in error
             and not (tmp_path / 'out.csv').exists())
-
-
-def test_a_simulation_of_a_single_sample_is_wrong_use(run, model, tmp_path):
-    code, text, error = run('simulate', '--model', model, '--motion', 'rest',
-                            '--out', tmp_path / 'out.csv', '--sample-rate', 0.001)
-    assert (code == 2 and not text and 'less than two samples; give a higher rate' in error
-            and not (tmp_path / 'out.csv').exists())
+    assert '0.001' not in words or 'less than two samples; give a higher rate' in error
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):

@@ -289,10 +289,6 @@ STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
 @pytest.mark.parametrize('model, calibration, hint', [
     ('', 'effects: {}\n', 'holds none'),
     ('effects: {}\n' + STORED, 'effects: {}\n', 'holds none'),
-    ('', 'effects: {}\ngyro: {serial_number: "8"}\n' + STORED,
-     'the serial number 8, and the model to one without'),
-    ('effects: {}\ngyro: {serial_number: "7"}\n', 'effects: {}\n' + STORED,
-     'without a serial number, and the model to 7'),
     ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
     ('', '', 'the file'),
 ])

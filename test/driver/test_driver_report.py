@@ -12,7 +12,6 @@
 
 import itertools
 import math
-from pathlib import Path
 import re
 
 from fake_port import World
@@ -28,7 +27,6 @@ from gyro_calibration.ros.driver_node import Messages, PARAMETERS, settings
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import record
 
-CONFIGURATION = Path(__file__).parents[2] / 'config' / 'driver.yaml'
 KEYS = {
     'samples', 'rate_hz', 'lost_samples', 'refused_samples', 'refused_temperatures',
     'device_faults', 'discarded_bytes', 'longest_gap_s', 'clock_steps', 'last_event', 'port',

@@ -28,7 +28,6 @@ XV3500 = Noise(2.5 * DEGREE / 60.0, 18.0 * DEGREE / 3600.0)
 SCALE, BIAS = 3e-4, 2.5 * DEGREE / 60.0 / math.sqrt(20.0)
 KNOWN = np.diag([SCALE ** 2, BIAS ** 2 + XV3500.floor ** 2])
 INTERVAL = 0.05
-NO_REST = Settings(false_alarms=0.0)
 
 
 def sensitivity_of(rate):

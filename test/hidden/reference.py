@@ -33,8 +33,6 @@ import numpy as np
 #: White noise of a fix, side slip at rest and its growth with the rate, rad, rad and s, and time
 #: over which it wanders, s.
 FIX, SLIP, GROWTH, WANDERS = math.radians(0.3), math.radians(0.3), 2.0, 3.0
-#: Rate below which the vehicle stands and has no course, rad/s.
-STANDS = 1e-9
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import contextlib
 from dataclasses import replace
 import math
 import random
-import tracemalloc
 
 from gyro_calibration.model.effects import CATALOGUE, rate_temperature_polynomial
 from gyro_calibration.model.gyro_model import (
@@ -169,15 +168,13 @@ def test_effects_with_a_past_are_written_by_hand(tmp_path):
     assert model.looks_around and not read(tmp_path, 'effects: {bias: {bias: 1.0}}').looks_around
 
 
-@pytest.mark.parametrize('name', CATALOGUE)
-def test_every_effect_survives_its_file(tmp_path, name):
-    values = tuple(0.5 if each.default is None else each.default
-                   for each in CATALOGUE[name].parameters)
-    bounds = [each.bounds for each in CATALOGUE[name].parameters]
-    model = GyroModel((Term(CATALOGUE[name], tuple(float(np.clip(value, *limits))
-                                                   for value, limits in zip(values, bounds))),))
-    write_model(tmp_path / 'model.yaml', model)
-    assert read_model(tmp_path / 'model.yaml').terms == model.terms
+def test_every_effect_survives_its_file(tmp_path):
+    for effect in CATALOGUE.values():
+        model = GyroModel((Term(effect, tuple(
+            float(np.clip(0.5 if each.default is None else each.default, *each.bounds))
+            for each in effect.parameters)),))
+        write_model(tmp_path / 'model.yaml', model)
+        assert read_model(tmp_path / 'model.yaml').terms == model.terms
 
 
 @pytest.mark.parametrize('text, message', BAD.values(), ids=BAD)
@@ -195,20 +192,6 @@ def test_a_missing_file_is_refused(tmp_path):
         read_model(tmp_path / 'model.yaml')
     with pytest.raises(ModelError, match='cannot be read'):
         read_model(tmp_path)
-
-
-@pytest.mark.parametrize('where',
-                         ['effects: {{bias: {{bias: {}}}}}', 'effects: {{}}\ngyro: {{name: {}}}',
-                          'effects: {{}}\nversion: {}'])
-def test_a_file_that_unfolds_to_gigabytes_is_refused_in_little_memory(tmp_path, where):
-    layers = ['a0: &a0 [x, x, x, x, x, x, x, x, x, x]']
-    layers += [f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 10)]
-    tracemalloc.start()
-    with pytest.raises(ModelError):
-        read(tmp_path, '\n'.join(layers) + '\n' + where.format('*a9') + '\n')
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 5e6
 
 
 def is_read_or_refused(folder, text):

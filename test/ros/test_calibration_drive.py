@@ -86,14 +86,6 @@ def test_the_next_start_uses_the_stored_calibration_and_the_heading_is_right(tmp
     assert abs(error) < 4.0 * deviation and deviation < 0.008 * 8.0 * FULL
 
 
-def test_a_calibration_behind_another_model_is_not_used_and_the_reason_is_given(tmp_path):
-    (tmp_path / 'calibration.yaml').write_text(
-        'effects: {bias: {bias: 0.1}}\nself_calibration: {scale_factor_error: 0.2, bias: 0.3}')
-    rig = Rig(tmp_path)
-    assert rig.feed([0.5])[0].rate == 0.5
-    assert 'belongs to another model' in rig.pipeline.store.hint
-
-
 def test_a_calibration_that_cannot_be_stored_is_used_and_the_answer_warns(tmp_path):
     (tmp_path / 'file').write_text('')
     rig = rested(tmp_path, calibration_file=tmp_path / 'file' / 'calibration.yaml',
