@@ -52,10 +52,8 @@ def test_a_burst_of_bad_fixes_does_not_move_the_bias():
 
 
 def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
-    consumer, fibre = (
-        calibrate_encoder(drive(3, turning=0.0), technology=name).fit
-        for name in ('mems', 'closed_loop_fog')
-    )
+    consumer, fibre = (calibrate_encoder(drive(3, turning=0.0), technology=name).fit
+                       for name in ('mems', 'closed_loop_fog'))
     for fit, largest in ((consumer, 0.02), (fibre, 0.001)):
         assert abs(fit.scale_factor_error) < 0.5 * largest
         assert math.sqrt(fit.covariance[0, 0]) < 1.1 * largest
@@ -63,8 +61,7 @@ def test_a_drive_without_turns_leaves_the_scale_to_the_prior():
 
 
 @pytest.mark.parametrize(
-    'follows', [0.0, -1.0, math.pi / 180.0], ids=['alive at rest', 'upside down', 'in rad/s']
-)
+    'follows', [0.0, -1.0, math.pi / 180.0], ids=['alive at rest', 'upside down', 'in rad/s'])
 def test_a_gyro_that_does_not_follow_is_refused(follows):
     with pytest.raises(DataRefused, match='does not follow'):
         calibrate_encoder(drive(4, follows=follows))
@@ -74,8 +71,7 @@ def test_another_drives_gyro_is_refused():
     log, other = drive(5), drive(6)
     with pytest.raises(DataRefused, match='does not follow'):
         calibrate_encoder(
-            Log(time=log.time, output=other.output, reference_heading=log.reference_heading)
-        )
+            Log(time=log.time, output=other.output, reference_heading=log.reference_heading))
 
 
 @pytest.mark.parametrize('name', ['wid_03', 'wid_07', 'rc_car_j_unit3'])

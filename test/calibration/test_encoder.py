@@ -225,10 +225,8 @@ def test_stated_intervals_hold_between_pieces_of_a_measured_log(data):
 
     The scatter of s and b is between a third and twice of what is stated.
     """
-    fits = [
-        calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit
-        for start in np.arange(0.0, 1490.0, 150.0)
-    ]
+    fits = [calibrate_encoder(measured(data, 'pitch_slow', start, start + 150.0)).fit
+            for start in np.arange(0.0, 1490.0, 150.0)]
     scatter = np.std([(fit.scale_factor_error, fit.bias) for fit in fits], axis=0, ddof=1)
     stated = np.sqrt(np.mean([np.diag(fit.covariance) for fit in fits], axis=0))
     assert (scatter < 2.0 * stated).all() and (scatter > stated / 3.0).all(), (scatter, stated)

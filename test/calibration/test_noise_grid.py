@@ -30,49 +30,29 @@ SCALE, BIAS = 1.01, 0.3 * DEGREE
 def headings(generator, count=240, walk=0.2 * DEGREE, reference=0.5 * DEGREE, motion=0.03):
     """Return times, rates, and headings of a gyro's integral and of a reference with noise."""
     time = np.arange(count + 1.0)
-    rate = (
-        20.0
-        * DEGREE
-        * np.sin(2.0 * math.pi * time / 37.0)
-        * (np.sin(2.0 * math.pi * time / 131.0) > -0.3)
-    )
+    rate = (20.0 * DEGREE * np.sin(2.0 * math.pi * time / 37.0)
+            * (np.sin(2.0 * math.pi * time / 131.0) > -0.3))
     true = np.cumsum(rate)
     turned = SCALE * true + BIAS * time + np.cumsum(generator.standard_normal(count + 1)) * walk
-    return (
-        time,
-        rate,
-        turned,
-        true + (reference + motion * np.abs(rate)) * generator.standard_normal(count + 1),
-    )
+    return (time, rate, turned,
+            true + (reference + motion * np.abs(rate)) * generator.standard_normal(count + 1))
 
 
 def fitted(time, rate, turned, seen, **options):
     """Return the fit of scale and bias to increments."""
     cosines, wanders = wander(time)
     columns = np.column_stack([np.diff(seen), np.diff(time)])
-    return noise_grid(
-        np.diff(turned),
-        columns,
-        heading_noise(time, rate, **options),
-        cosines,
-        wanders,
-        noisy_column=0,
-        wandering=1,
-    )
+    return noise_grid(np.diff(turned), columns, heading_noise(time, rate, **options), cosines,
+                      wanders, noisy_column=0, wandering=1)
 
 
 def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
     generator = np.random.default_rng(1)
     n, q = 40, 3
-    columns, shared, observed = (
-        generator.standard_normal((n, 2)),
-        generator.standard_normal((n, q)),
-        generator.standard_normal(n),
-    )
-    parts = [
-        BandedNoise('a', np.full(n, 2.0), np.full(n, -0.9), (0.5, 0.5)),
-        BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5)),
-    ]
+    columns, shared, observed = (generator.standard_normal((n, 2)),
+                                 generator.standard_normal((n, q)), generator.standard_normal(n))
+    parts = [BandedNoise('a', np.full(n, 2.0), np.full(n, -0.9), (0.5, 0.5)),
+             BandedNoise('b', np.linspace(1.0, 2.0, n), None, (1.5, 1.5))]
     variance = np.array([1.0, 0.5, 0.1])
     found = noise_grid(observed, columns, parts, shared, [_shared('c', variance, 2.0)])
     dense = 0.25 * (
@@ -84,8 +64,7 @@ def test_at_known_sizes_it_is_the_restricted_likelihood_of_the_textbook():
     values = np.linalg.solve(information, columns.T @ inverse @ observed)
     left = observed - columns @ values
     wanted = -0.5 * (
-        np.linalg.slogdet(dense)[1] + np.linalg.slogdet(information)[1] + left @ inverse @ left
-    )
+        np.linalg.slogdet(dense)[1] + np.linalg.slogdet(information)[1] + left @ inverse @ left)
     assert found.log_likelihood == pytest.approx(wanted, rel=1e-9)
     np.testing.assert_allclose(found.values, values, rtol=1e-8)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-8)
@@ -109,19 +88,13 @@ def test_whitened_noise_is_independent():
 def test_the_sizes_of_the_noise_are_found():
     found = fitted(
         *headings(
-            np.random.default_rng(2), 2000, walk=0.5 * DEGREE, reference=0.2 * DEGREE, motion=0.1
-        )
+            np.random.default_rng(2), 2000, walk=0.5 * DEGREE, reference=0.2 * DEGREE, motion=0.1)
     )
-    for name, size in (
-        ('angle_random_walk', 0.5 * DEGREE),
-        ('reference', 0.2 * DEGREE),
-        ('motion', 0.1),
-    ):
+    for name, size in (('angle_random_walk', 0.5 * DEGREE), ('reference', 0.2 * DEGREE),
+                       ('motion', 0.1)):
         estimate, low, high = found.sizes[name]
         assert 0.6 * size < estimate < 1.6 * size and 0.99 * low <= estimate <= 1.01 * high, (
-            name,
-            found.sizes[name],
-        )
+            name, found.sizes[name])
 
 
 def test_noise_of_the_reference_does_not_make_the_scale_smaller():
@@ -132,14 +105,8 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
         generator = np.random.default_rng([seed, 1])
         true = (turned - BIAS * time) / SCALE
         seen = true + 7.0 * DEGREE * generator.standard_normal(len(true))
-        found = fitted(
-            time,
-            np.zeros_like(time),
-            turned,
-            seen,
-            unit=5.0 * DEGREE,
-            angle_random_walk=(0.02 * DEGREE,) * 2,
-        )
+        found = fitted(time, np.zeros_like(time), turned, seen, unit=5.0 * DEGREE,
+                       angle_random_walk=(0.02 * DEGREE,) * 2)
         errors.append(found.values[0] - SCALE)
         plain = np.polyfit(np.diff(seen), np.diff(turned), 1)[0]
         assert plain < 0.85 * SCALE
@@ -149,10 +116,8 @@ def test_noise_of_the_reference_does_not_make_the_scale_smaller():
 def test_a_gap_of_the_reference_is_a_long_span():
     time, rate, turned, seen = headings(np.random.default_rng(3))
     kept = (time < 60.0) | (time > 150.0)
-    whole, parts = (
-        fitted(time, rate, turned, seen),
-        fitted(time[kept], rate[kept], turned[kept], seen[kept]),
-    )
+    whole, parts = (fitted(time, rate, turned, seen),
+                    fitted(time[kept], rate[kept], turned[kept], seen[kept]))
     assert parts.values[0] == pytest.approx(SCALE, abs=4.0 * parts.deviations[0])
     assert parts.values[1] == pytest.approx(BIAS, abs=4.0 * parts.deviations[1])
     assert parts.deviations[0] > whole.deviations[0]
@@ -161,13 +126,8 @@ def test_a_gap_of_the_reference_is_a_long_span():
 def test_a_value_that_nothing_shows_keeps_its_prior():
     time, rate, turned, seen = headings(np.random.default_rng(4))
     columns = np.column_stack([np.zeros(len(time) - 1), np.diff(time)])
-    found = noise_grid(
-        np.diff(turned - SCALE * seen),
-        columns,
-        heading_noise(time, rate),
-        prior_mean=np.array([1.0, 0.0]),
-        prior_deviation=np.array([0.02, math.inf]),
-    )
+    found = noise_grid(np.diff(turned - SCALE * seen), columns, heading_noise(time, rate),
+                       prior_mean=np.array([1.0, 0.0]), prior_deviation=np.array([0.02, math.inf]))
     assert found.values[0] == pytest.approx(1.0) and found.deviations[0] == pytest.approx(0.02)
     assert found.values[1] == pytest.approx(BIAS, abs=4.0 * found.deviations[1])
 
@@ -179,18 +139,13 @@ def test_too_few_observations_are_refused():
 
 @pytest.mark.evidence
 @pytest.mark.parametrize(
-    'noise', [(0.02, 0.5, 0.03), (0.2, 0.5, 0.03), (0.5, 0.1, 0.0), (0.05, 0.02, 0.005)], ids=str
-)
+    'noise', [(0.02, 0.5, 0.03), (0.2, 0.5, 0.03), (0.5, 0.1, 0.0), (0.05, 0.02, 0.005)], ids=str)
 def test_intervals_hold_the_truth(noise):
     walk, reference, motion = noise
     held = np.zeros(2)
     for seed in range(60):
-        time, rate, turned, seen = headings(
-            np.random.default_rng(seed),
-            walk=walk * DEGREE,
-            reference=reference * DEGREE,
-            motion=motion,
-        )
+        time, rate, turned, seen = headings(np.random.default_rng(seed), walk=walk * DEGREE,
+                                            reference=reference * DEGREE, motion=motion)
         found = fitted(time, rate, turned, seen)
         held += np.abs(found.values - (SCALE, BIAS)) < 1.96 * found.deviations
     assert (held / 60 > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)).all()

@@ -28,10 +28,8 @@ def write(path, dwells):
     """Write dwells as a rate table."""
     columns = (values.tolist() for values in (dwells.sweep, dwells.rate / DEGREE,
                                               dwells.output / DEGREE, dwells.temperature))
-    lines = [
-        'sweep,reference_rate_dps,gyro_dps,temperature_degc',
-        *(','.join(map(repr, row)) for row in zip(*columns))
-    ]
+    lines = ['sweep,reference_rate_dps,gyro_dps,temperature_degc',
+             *(','.join(map(repr, row)) for row in zip(*columns))]
     path.write_text('\n'.join(lines) + '\n')
     return path
 

@@ -91,10 +91,8 @@ def draw_calibration_run(path):
     return draw_run(path, time, rate, (rate - 0.002) / 1.03, CALIBRATION)
 
 
-IN_GREY = {
-    'turns': lambda path: draw_turns(path, warm()),
-    'turns without temperature': lambda path: draw_turns(path, without_temperature()),
-}
+IN_GREY = {'turns': lambda path: draw_turns(path, warm()),
+           'turns without temperature': lambda path: draw_turns(path, without_temperature())}
 PICTURES = {
     **IN_GREY,
     'surface': lambda path: draw_surface(path, warm(), fitted(warm())),

@@ -28,11 +28,8 @@ def drive(seed=0, heading_noise=0.0):
     """Return a log of a gyro with a bias and a heading as its reference."""
     generator = np.random.default_rng(seed)
     output = 1.01 * MOTION + 0.005 + 2e-3 * generator.standard_normal(len(TIME))
-    return Log(
-        output=output,
-        time=TIME,
-        reference_heading=HEADING + heading_noise * generator.standard_normal(len(TIME)),
-    )
+    return Log(output=output, time=TIME,
+               reference_heading=HEADING + heading_noise * generator.standard_normal(len(TIME)))
 
 
 def other_motion():
@@ -45,8 +42,7 @@ def tumbling(log):
     """Return a log whose axis tilts: the gyro sees a part of the turns, and other turns."""
     tilt = np.cos(0.9 * TIME)
     return replace(
-        log, output=log.output * tilt + 1.5 * np.sin(0.13 * TIME) * np.sqrt(1.0 - tilt**2)
-    )
+        log, output=log.output * tilt + 1.5 * np.sin(0.13 * TIME) * np.sqrt(1.0 - tilt**2))
 
 
 WRONG = {
@@ -60,19 +56,12 @@ WRONG = {
     'stamps in ms': lambda log: replace(log, time=1e3 * log.time),
     'stamps ten times too slow': lambda log: replace(log, time=10.0 * log.time),
     'wrapped': lambda log: replace(
-        log, reference_heading=(log.reference_heading + 3.0) % (2.0 * np.pi)
-    ),
+        log, reference_heading=(log.reference_heading + 3.0) % (2.0 * np.pi)),
     'other motion': lambda log: replace(log, reference_heading=other_motion()),
     'tumbling': tumbling,
 }
-FAILED = {
-    'sense': 'sense',
-    'stamps in ms': 'time_unit',
-    'stamps ten times too slow': 'time_unit',
-    'wrapped': 'wrapped_heading',
-    'other motion': 'motion',
-    'tumbling': ('tilt', 'motion'),
-}
+FAILED = {'sense': 'sense', 'stamps in ms': 'time_unit', 'stamps ten times too slow': 'time_unit',
+          'wrapped': 'wrapped_heading', 'other motion': 'motion', 'tumbling': ('tilt', 'motion')}
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0 * DEGREE], ids=['exact', 'course'])
@@ -87,10 +76,8 @@ def test_what_keeps_gyro_and_reference_apart_is_the_only_finding(wrong, noise):
     assert (
         found.verdict == 'mismatched' and finding.remedy and failed[0] in FAILED.get(wrong, 'unit')
     ), (failed, finding.evidence)
-    assert (
-        found.figures()['gates'][-1]['passed'] is False
-        and found.figures()['findings'][0]['remedy'] == finding.remedy
-    )
+    assert (found.figures()['gates'][-1]['passed'] is False
+            and found.figures()['findings'][0]['remedy'] == finding.remedy)
     assert finding.remedy in ' '.join(' '.join(lines(found)).split())
 
 
@@ -104,8 +91,7 @@ def test_a_late_reference_passes_all_gates():
     assert all(
         gate.passed
         for gate in gates(
-            replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading))
-        )
+            replace(log, reference_heading=np.interp(TIME - 0.75, TIME, log.reference_heading)))
     )
 
 

@@ -35,10 +35,8 @@ def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 
     rate, begin = np.zeros(len(time)), 0.0
     while begin < duration:
         begin += generator.exponential(4.0)
-        length, size = (
-            generator.uniform(1.5, 5.0),
-            generator.choice([-1.0, 1.0]) * generator.uniform(0.1, 0.9),
-        )
+        length, size = (generator.uniform(1.5, 5.0),
+                        generator.choice([-1.0, 1.0]) * generator.uniform(0.1, 0.9))
         turns = (time >= begin) & (time < begin + length)
         rate[turns] += size * np.sin(np.pi * (time[turns] - begin) / length) ** 2
         begin += length
@@ -46,13 +44,11 @@ def drive(seed, duration=240.0, hidden=lambda time, rate, heading, temperature: 
     noise = 3e-4 * np.sqrt(RATE) * generator.standard_normal(len(time))
     output = (1.0 + SCALE) * rate + BIAS_TRUE + hidden(time, rate, heading, temperature) + noise
     wanders = lfilter(
-        [1.0], [1.0, -np.exp(-1.0 / (3.0 * RATE))], generator.standard_normal(len(time))
-    )
+        [1.0], [1.0, -np.exp(-1.0 / (3.0 * RATE))], generator.standard_normal(len(time)))
     slip = wanders * np.sqrt(2.0 / (3.0 * RATE)) * 0.4 * DEGREE * (1.0 + 2.0 * np.abs(rate))
     fixes = np.arange(0.0, duration, 0.2)
     course = np.interp(
-        fixes + DELAY, time, heading + slip
-    ) + 0.3 * DEGREE * generator.standard_normal(len(fixes))
+        fixes + DELAY, time, heading + slip) + 0.3 * DEGREE * generator.standard_normal(len(fixes))
     course = np.interp(time, fixes, course)
     for lost in generator.uniform(10.0, duration - 20.0, 3):
         course[(time > lost) & (time < lost + 5.0)] = np.nan
@@ -75,15 +71,13 @@ def test_a_course_brings_no_false_names_and_the_right_bias_scale_and_delay(seed)
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
     assert value(found.model, 'scale_factor_error') == pytest.approx(SCALE, abs=0.012)
     assert named['time_offset'].parameters['time_offset'].estimate == pytest.approx(
-        DELAY, abs=0.05
-    )
+        DELAY, abs=0.05)
     assert 'time_offset' not in {term.effect.name for term in found.model.terms}
 
 
 HIDDEN = {
     'heading_sensitivity': lambda time, rate, heading, temperature: 0.01 * np.sin(heading + 0.5),
-    'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0),
-}
+    'bias_temperature': lambda time, rate, heading, temperature: 0.002 * (temperature - 25.0)}
 
 
 @pytest.mark.parametrize('name', HIDDEN)
@@ -91,26 +85,19 @@ def test_a_large_effect_is_established_by_a_course_and_its_model_predicts_the_he
     found = diagnosed(drive(5, hidden=HIDDEN[name]))
     first = next(each for each in found.findings if each.effect not in ('time_offset',))
     assert name in (first.effect, *first.ambiguous_with) and first.status == 'established', lines(
-        found
-    )
-    assert (
-        sum(first.probability.values()) == pytest.approx(1.0, abs=0.05)
-        and first.share_of_heading_error is not None
-    )
+        found)
+    assert (sum(first.probability.values()) == pytest.approx(1.0, abs=0.05)
+            and first.share_of_heading_error is not None)
     assert found.gain.models['extended'] < 0.7 * found.gain.models['plain']
     assert first.effect in {term.effect.name for term in found.model.terms}
 
 
 def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
     found = diagnosed(
-        drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (time > 140.0))
-    )
+        drive(6, hidden=lambda time, rate, heading, temperature: 0.01 * (time > 140.0)))
     assert not {'bias_step', 'reference_slip'} & {term.effect.name for term in found.model.terms}
-    assert all(
-        each.status == 'suspected' and each.where
-        for each in found.findings
-        if each.effect in ('bias_step', 'reference_slip')
-    )
+    assert all(each.status == 'suspected' and each.where for each in found.findings
+               if each.effect in ('bias_step', 'reference_slip'))
 
 
 def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
@@ -118,8 +105,7 @@ def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
     right = diagnosed(log).model
     again = diagnosed(log, right)
     assert again.model is right and not {'bias', 'scale_factor_error'} & {
-        each.effect for each in again.findings
-    }
+        each.effect for each in again.findings}
     wrong = GyroModel((Term(BIAS, (BIAS_TRUE + 0.3 * DEGREE,)),))
     found = diagnosed(log, wrong)
     assert 'bias' in {each.effect for each in found.findings}
@@ -129,18 +115,12 @@ def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
 def test_the_answer_is_about_heading_and_is_told_in_all_files():
     found = diagnosed(drive(8))
     told = found.figures()
-    assert (
-        told['schema'].endswith('/2')
-        and told['reference']['kind'] == 'course'
-        and told['reference']['noise']['reference'] > 0.0
-    )
-    assert (
-        sum(told['heading_shares'].values()) == pytest.approx(1.0, abs=0.02)
-        and told['heading_shares']['bias'] > 0.5
-    )
+    assert (told['schema'].endswith('/2') and told['reference']['kind'] == 'course'
+            and told['reference']['noise']['reference'] > 0.0)
+    assert (sum(told['heading_shares'].values()) == pytest.approx(1.0, abs=0.02)
+            and told['heading_shares']['bias'] > 0.5)
     assert {'given', 'plain', 'extended'} <= set(told['gain']) and all(
-        gate['passed'] for gate in told['gates']
-    )
+        gate['passed'] for gate in told['gates'])
     assert 'course over ground' in ' '.join(lines(found)) and 'course over ground' in report(found)
 
 
@@ -150,8 +130,7 @@ def test_the_kind_of_a_reference_is_told_or_found():
     assert reference_of(log).kind == 'course' and limits(log, reference_of(log))
     assert reference_of(exact).kind == 'motion_capture' and not limits(exact, reference_of(exact))
     assert reference_of(exact, 'odometry').kind == 'odometry' and limits(
-        exact, reference_of(exact, 'odometry')
-    )
+        exact, reference_of(exact, 'odometry'))
     assert reference_of(replace(log, reference_rate=log.output)).kind == 'rate_command'
     assert reference_of(replace(log, reference_heading=None)).kind == 'rest'
 
