@@ -136,7 +136,7 @@ WILD = ['', ' ', 'nan', 'inf', '-inf', '1e999', '-1', '0', '1e-999', '9' * 5000,
         '--out', 'x' * 100_000]
 
 
-def test_wild_arguments_end_with_2_or_are_taken():
+def test_arbitrary_arguments_end_with_2_or_are_taken():
     """Each option of each verb with each wild value, as far as they are parsed; nothing is run."""
     parser = _parser()
     for verb, its in next(iter(parser._subparsers._group_actions)).choices.items():

@@ -242,7 +242,7 @@ def test_no_stream_leaves_a_tracker_with_something_that_is_no_number(samples, fa
 
 
 @pytest.mark.parametrize('place', ['sensitivity', 'mean', 'covariance'])
-def test_a_state_that_is_not_finite_is_said_and_built_anew_with_the_last_heading(place):
+def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_heading(place):
     tracker = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings())
     for index in range(500):
         tracker.add(INTERVAL * index, 0.3, np.array([-0.3, -1.0]))

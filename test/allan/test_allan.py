@@ -164,7 +164,7 @@ def test_white_noise_alone_shows_nothing_else():
 
 @pytest.mark.parametrize('numerator, denominator', [
     ([0.25, 0.5, 0.25], [1.0]), ([0.3], [1.0, -0.7])], ids=['mean of three', 'lag'])
-def test_a_filter_of_the_output_does_not_fool_the_angle_random_walk(numerator, denominator):
+def test_a_filter_of_the_output_does_not_bias_the_angle_random_walk(numerator, denominator):
     generator = np.random.default_rng(7)
     fits = [fit_noise(lfilter(numerator, denominator,
                               simulate_noise(WHITE, 50_000, INTERVAL, generator)), INTERVAL)
@@ -175,7 +175,7 @@ def test_a_filter_of_the_output_does_not_fool_the_angle_random_walk(numerator, d
     assert sum(fit.figures[symbol].value > 0.0 for fit in fits for symbol in 'BKQR') <= 1
 
 
-def test_a_line_that_the_gyro_picks_up_does_not_fool_the_angle_random_walk():
+def test_a_line_that_the_gyro_picks_up_does_not_bias_the_angle_random_walk():
     line = 0.01 * np.sin(2.0 * math.pi * 31.4 * stamps(100_000))
     fit = fit_noise(
         simulate_noise(WHITE, 100_000, INTERVAL, np.random.default_rng(8)) + line, INTERVAL)
@@ -312,7 +312,7 @@ def test_figures_want_noise_and_windows_without_a_gap():
                            np.random.default_rng(19).standard_normal(1000)), INTERVAL)
 
 
-def test_a_wild_sample_is_left_out_and_a_walking_bias_is_no_motion():
+def test_an_outlier_is_left_out_and_a_random_walk_of_the_bias_is_no_motion():
     rate = simulate_noise(Noise(1e-3, 3e-4, 3e-4), 50_000, INTERVAL, np.random.default_rng(16))
     rate[[700, 30_000]] += 0.5, -2.0
     record = even_record(stamps(50_000), rate)
@@ -415,7 +415,7 @@ def test_the_verb_draws_the_chart(log, tmp_path, ending, begin):
     assert (tmp_path / f'allan.{ending}').read_bytes().startswith(begin)
 
 
-def test_wrong_use_of_the_verb_is_said_before_the_work(log, capsys):
+def test_wrong_use_of_the_verb_is_reported_before_the_work(log, capsys):
     assert main(['allan', str(log), '--model', 'x.yaml']) == 2
     assert 'say with --out' in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:  # argparse

@@ -148,7 +148,7 @@ def test_self_calibrate_finds_what_was_simulated(run, log, tmp_path, method, tol
         0.002, rel=tolerance)
 
 
-def test_a_new_model_says_which_log_it_comes_from_and_a_given_one_what_it_said_before(
+def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(
         run, log, model, tmp_path):
     write_log(tmp_path / 'rest.csv',
               Log(output=np.random.default_rng(1).normal(size=2000), time=np.arange(2000) / 100.0))
@@ -220,7 +220,7 @@ def test_a_log_of_counts_wants_its_sensitivity(run, model, tmp_path):
         (7 * DEGREE - 0.002) / 0.9)
 
 
-def test_the_same_seed_gives_the_same_log_and_the_seed_is_said(run, tmp_path):
+def test_the_same_seed_gives_the_same_log_and_the_seed_is_reported(run, tmp_path):
     (tmp_path / 'model.yaml').write_text(NOISY_GYRO)
     words = ['simulate', '--model', tmp_path / 'model.yaml', '--motion', 'rest', '--json', '--out']
     seed = json.loads(run(*words, tmp_path / 'a.csv')[1])['seed']
@@ -298,7 +298,7 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
     assert capsys.readouterr().err.count('slipped; once more') == min(refusals, ATTEMPTS - 1)
 
 
-def test_rows_without_output_are_said_and_do_not_spoil_the_heading(run, model, tmp_path):
+def test_rows_without_output_are_reported_and_do_not_change_the_heading(run, model, tmp_path):
     # the bias, 0.002 rad/s
     rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]
     (tmp_path / 'log.csv').write_text(

@@ -137,7 +137,7 @@ def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
     (f'{LONG}.csv', 'file name too long'), (f'log.csv/{LONG}.csv', 'a directory|file exists'),
     ('log.csv/a.csv', 'a directory|file exists'),
     ('circle.csv', 'too many levels of symbolic links'), ('closed/a.csv', 'permission denied')])
-def test_what_cannot_be_opened_is_said_with_its_remedy(path, words, folder, run, monkeypatch):
+def test_what_cannot_be_opened_is_reported_with_its_remedy(path, words, folder, run, monkeypatch):
     (folder / 'circle.csv').symlink_to(folder / 'circle.csv')
     deny(monkeypatch, folder / 'closed')
     path = folder / path
@@ -292,7 +292,7 @@ STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
     ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
     ('', '', 'the file'),
 ])
-def test_a_calibration_that_is_not_used_is_told(model, calibration, hint, tmp_path):
+def test_a_calibration_that_is_not_used_is_reported(model, calibration, hint, tmp_path):
     """One that the model file itself has is kept then."""
     (tmp_path / 'model.yaml').write_text(model or 'effects: {}\n')
     (tmp_path / 'calibration.yaml').write_text(calibration)

@@ -213,7 +213,7 @@ def angles(link, rate=100.0):
     pytest.param(['--sample-rate', '100'], 2, 0.1, 100.0, marks=pytest.mark.evidence),
     pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
-def test_angles_at_another_rate_than_set_are_told(run, tmp_path, options, seconds, rate, factor):
+def test_angles_at_another_rate_than_set_are_reported(run, tmp_path, options, seconds, rate, factor):
     """Where nothing is to be told is tested in test_driver_report.py, without a port."""
     with angles(tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]
@@ -226,7 +226,7 @@ def test_angles_at_another_rate_than_set_are_told(run, tmp_path, options, second
                for note in log.notes), log.notes
 
 
-def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_told(run, tmp_path):
+def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_a_remark(run, tmp_path):
     """Which comes in time is tested in test_recorder.py, without a port."""
     samples = (Sample(0.1, 25.0 if number >= 4.5 * RATE else None, time=number / RATE)
                for number in range(10 ** 6))
@@ -238,7 +238,7 @@ def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_told(run, t
     assert 'temperature_degc came too late for a column of a log' in out
 
 
-def test_a_port_that_is_not_there_is_told_and_leaves_no_file(run, tmp_path):
+def test_a_port_that_is_not_there_is_reported_and_leaves_no_file(run, tmp_path):
     code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '1'))
     assert ((code, out) == (1, '') and 'nothing came within' in error
             and str(tmp_path / 'gyro') in error)
@@ -457,7 +457,7 @@ def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
             assert results[0][1].replace('a.csv', 'a.mcap') == results[1][1]
 
 
-def test_publishers_that_come_late_or_with_another_quality_are_heard(
+def test_publishers_that_come_late_or_with_another_quality_are_received(
         ros, record, wait_until, tmp_path):
     from rclpy.qos import DurabilityPolicy
     from std_msgs.msg import String
@@ -559,7 +559,7 @@ def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_
     rclpy.shutdown(context=context)
 
 
-def test_topics_that_nobody_publishes_are_told(ros_domain, record, tmp_path):
+def test_topics_that_nobody_publishes_are_reported(ros_domain, record, tmp_path):
     code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
     assert (code, out) == (1, '') and 'nothing came within' in error and 'ROS_DOMAIN_ID' in error
     assert not (tmp_path / 'a.csv').exists()
@@ -581,7 +581,7 @@ def test_a_driver_is_recorded_from_its_topics(start_node, ros, record, wait_unti
                 and (log.temperature == 25.0).all())
 
 
-def test_without_ros_the_way_out_is_said(run, tmp_path, monkeypatch):
+def test_without_ros_the_remedy_is_reported(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'gyro_calibration.ros.recorder_node', None)
     code, _, error = run('record', '--out', tmp_path / 'a.csv')
     assert code == 2 and 'topics need ROS 2' in error and 'record from --port' in error

@@ -130,7 +130,7 @@ def test_stamps_go_on_when_another_gyro_is_recognized():
     assert reading.connection.protocol is find('csv') and min(reading.steps) > 0.0
 
 
-def test_listening_ends_when_told_to():
+def test_listening_ends_on_request():
     stop = threading.Event()
     world = World(60.0)
     connection = Connection('/dev/gyro', on_change=lambda state: stop.set(), clock=world,
@@ -189,7 +189,7 @@ def test_waiting_doubles_up_to_its_limit_and_ends_with_samples():
     assert reading.connection.waited == pytest.approx(31.3 + 10.0, abs=0.2)
 
 
-def test_waiting_ends_when_told_to():
+def test_waiting_ends_on_request():
     stop = threading.Event()
     connection = Connection('/nonexistent/gyro', 'csv', on_change=lambda state: stop.set())
     assert list(connection.chunks(stop)) == [] and connection.state.name == 'failed'

@@ -138,14 +138,14 @@ def test_one_byte_again_and_again_is_no_format():
         assert recognize(bytes([byte]) * 8192).protocol is None, byte
 
 
-def test_nothing_and_little_are_said_to_be_that():
+def test_few_bytes_or_none_are_reported_as_such():
     assert recognize(b'').words == 'nothing came: check the power and the wires of the gyro'
     recognition = recognize(frames('kvh_1750', 1)[1])
     assert (recognition.protocol is None and recognition.frames == 1
             and 'listen longer' in recognition.words)
 
 
-def test_two_formats_at_once_are_said_to_be_ambiguous():
+def test_two_formats_at_once_are_reported_as_ambiguous():
     """Eleven frames of 8 bytes are as many bytes as eight frames of 11."""
     recognition = recognize(b''.join(frames('fizoptika', 11) + frames('witmotion', 8)))
     assert recognition.protocol is None and recognition.runner_up is not None
@@ -168,7 +168,7 @@ def test_lines_of_numbers_that_do_not_fit_the_columns_are_explained():
     assert recognize(b'17\r\n' * 5, Settings(columns=('gyro_dps',))).protocol is find('csv')
 
 
-def test_columns_that_do_not_fit_are_told_although_noise_at_another_baud_may_look_like_frames():
+def test_columns_that_do_not_fit_are_reported_although_another_baud_shows_some_frames():
     """At a wrong baud, text makes some E-Core frames; the baud that explains most is reported."""
     data = b''.join(b'%d,%f,3.5,4.25\n' % (10 * k, math.sin(k)) for k in range(100))
     wrong = [recognize(received(data, baud / find('csv').baud))

@@ -192,7 +192,7 @@ def test_other_programs_read_the_whole_pieces_of_a_recording_on_a_full_disk(tmp_
     assert len(read(tmp_path / 'a.mcap')) == 200
 
 
-def test_values_that_come_seldom_are_held_and_late_ones_are_told(tmp_path):
+def test_values_that_come_seldom_are_held_and_late_ones_are_reported(tmp_path):
     recorder = CsvRecorder(str(tmp_path / 'a.csv'), notes)
     for number in range(400):
         health = {10: {'supply_v': 5.0}, 200: {'supply_v': 4.9},
@@ -206,7 +206,7 @@ def test_values_that_come_seldom_are_held_and_late_ones_are_told(tmp_path):
 
 @pytest.mark.parametrize(('first', 'missed'),
                          [(2.0, set()), (4.0, {'reference_heading_rad', 'reference_rate_rad_s'})])
-def test_a_reference_that_comes_too_late_for_a_column_is_told(topic, first, missed):
+def test_a_reference_that_comes_too_late_for_a_column_is_reported(topic, first, missed):
     for number in range(600):
         time = 0.01 * number
         topic.send('/imu', topic.make.imu(time, time), time)
@@ -348,7 +348,7 @@ def test_bytes_that_are_no_message_are_counted(topic):
     ('/t', IMU, '--temperature-topic wants sensor_msgs/msg/Temperature'),
     ('/odom', TEMPERATURE, '--reference-topic wants nav_msgs/msg/Odometry, sensor_msgs/msg/Imu,'),
 ])
-def test_a_topic_of_another_kind_than_its_role_wants_is_refused_in_a_log_and_told_of_a_recording(
+def test_a_topic_of_another_kind_than_its_role_is_refused_in_a_log_and_counted_in_a_recording(
         topic, name, kind, wanted):
     message = Message(name, kind, BEGIN, bytes(1000))
     with pytest.raises(LogError, match=f'^{name} is {kind}; {wanted}'):

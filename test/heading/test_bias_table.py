@@ -74,7 +74,7 @@ def test_a_difference_is_better_known_than_without_a_table(asked):
             and np.mean(off ** 2) < np.mean(change ** 2) / 6.0)
 
 
-def test_outliers_are_held_back_and_said():
+def test_outliers_are_held_back_and_reported():
     generator, found, held, wrong, kept = np.random.default_rng(5), 0, 0, 0, 0
     for _ in range(15):
         history, table = simulate(generator, cubic(generator)), BiasTable(MODEL)
@@ -96,7 +96,7 @@ def test_an_empty_table_knows_nothing():
             and math.sqrt(changes[2][1]) == pytest.approx(10.0 * Prior().coefficient, rel=0.3))
 
 
-def test_a_single_run_at_one_temperature_teaches_the_offset_alone():
+def test_a_single_run_at_one_temperature_determines_the_offset_alone():
     table, empty = BiasTable(MODEL), BiasTable(MODEL)
     for number in range(20):
         assert not table.add(20.0, 1.0 * DEGREE, WHITE, 60.0 * number)
@@ -179,7 +179,7 @@ def test_many_jumps_and_runs_leave_a_table_that_works():
     assert np.isfinite(table.predict(generator.uniform(20.0, 27.0), DAY * (ENTRIES + 10))).all()
 
 
-def test_what_is_forgotten_is_the_oldest_of_the_fullest_bin():
+def test_the_oldest_entry_of_the_fullest_bin_is_dropped():
     table = BiasTable(MODEL)
     table.add(-10.0, 0.0, WHITE, 0.0)
     for run in range(ENTRIES + 20):
@@ -266,7 +266,7 @@ def test_a_fresh_calibration_is_used_as_it_is():
     (400 * DAY, 20.0, '400 days ago at 20.0 degC, and now it is 20.0 degC'),
     (60.0, 45.0, '1 minutes ago at 20.0 degC, and now it is 45.0'),
     (7 * 3600.0, None, '7 hours ago at a temperature that is not known')])
-def test_age_and_distance_are_said_where_they_matter(age, temperature, words):
+def test_age_and_distance_are_reported_where_they_matter(age, temperature, words):
     carried = carry(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
     assert words in carried.sentence and carried.variance > OWN ** 2 and carried.change == 0.0
 
@@ -369,7 +369,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize('damage', DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_damaged_file_is_told_in_one_sentence_and_kept(tmp_path, damage):
+def test_a_damaged_file_is_reported_in_one_sentence_and_kept(tmp_path, damage):
     path, content = tmp_path / 'table.yaml', damage(whole(tmp_path))
     path.write_bytes(content)
     table, said = read_bias_table(path, MODEL)

@@ -211,7 +211,7 @@ def test_straight_ways_that_pass_for_rests_do_not_make_a_noisy_gyro_sure_of_a_wr
 @pytest.mark.evidence
 @pytest.mark.parametrize('kind', ORACLE['DRIVES'])
 @pytest.mark.parametrize('gyro', ORACLE['GYROS'])
-def test_the_heading_is_near_that_of_who_is_told_the_rests(gyro, kind):
+def test_the_heading_is_near_that_by_known_rests(gyro, kind):
     """The aims of 1.25, 1.1 and 90 % are missed where rests are short or rare: 2.3, 1.9, 65 %."""
     (live, inside), (later, inside_later) = scores(gyro, kind, 10.0, 6)
     assert live < 2.5 and later < 2.2

@@ -107,7 +107,7 @@ def test_a_gyro_that_is_set_to_another_rate_loses_samples_for_a_while_only():
 # what they leave unknown
 
 @pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.1, 85)])
-def test_at_rest_the_noise_of_lost_samples_is_what_is_said(share, longest):
+def test_at_rest_the_noise_of_lost_samples_is_as_stated(share, longest):
     squares = []
     for seed in range(40):
         generator = np.random.default_rng(seed)
@@ -117,7 +117,7 @@ def test_at_rest_the_noise_of_lost_samples_is_what_is_said(share, longest):
 
 
 @pytest.mark.parametrize('share, longest', [(0.01, 1), (0.1, 1), (0.1, 20), (0.03, 85)])
-def test_what_may_have_been_turned_in_gaps_is_said_and_not_much_more(share, longest):
+def test_turns_in_gaps_are_in_the_stated_variance_and_not_much_more(share, longest):
     squares, said_squares = [], []
     for seed in range(24):
         generator = np.random.default_rng(seed)

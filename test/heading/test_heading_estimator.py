@@ -175,7 +175,7 @@ def test_a_drive_with_stops_stands_at_rest_and_stays_inside_what_it_says(seed):
     assert abs(gyro.error) < 4.0 * gyro.deviation < 4.0 * DEGREE
 
 
-def test_a_slow_turn_is_followed_with_wheels_and_the_slowest_that_shows_without_is_said():
+def test_a_slow_turn_is_followed_with_wheels_and_the_slowest_without_is_stated():
     turned = {}
     for wheels in (True, None):
         gyro = Gyro(begun()).go(60.0, wheels=False if wheels else None)
@@ -264,14 +264,14 @@ def test_a_gyro_that_was_without_power_may_have_another_bias():
             and abs(gyro.error) < 3.0 * gyro.deviation)
 
 
-def test_a_rest_mends_an_old_calibration_and_it_is_no_longer_said():
+def test_a_rest_corrects_an_old_calibration_and_ends_the_remark():
     gyro = Gyro(begun(now=NOW + 1e7), now=NOW + 1e7)
     gyro.go(INTERVAL)
     assert gyro.live.sentence
     assert not gyro.go(20.0).live.sentence
 
 
-def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_doubt_of_it():
+def test_a_gyro_that_compensates_its_temperature_by_itself_has_no_variance_by_it():
     none = Assumptions(bias_temperature_coefficient=0.0)
     table = BiasTable(MODEL, Prior(coefficient=0.0))
     gyro = Gyro(begun(table=table, assumptions=none)).go(40.0).go(10.0, 0.3, (25.0, 45.0)).go(
@@ -396,7 +396,7 @@ def test_the_last_stretch_of_a_run_that_ends_at_rest_is_not_lost():
     assert len(gyro.live.table.entries) == 1
 
 
-def test_a_rest_in_which_the_robot_turned_slowly_does_not_teach_the_table():
+def test_a_rest_in_which_the_robot_turned_slowly_does_not_enter_the_table():
     table = BiasTable(MODEL)
     gyro = Gyro(begun(table=table)).go(40.0, wheels=False)
     entries = list(table.entries)
@@ -408,7 +408,7 @@ def test_a_rest_in_which_the_robot_turned_slowly_does_not_teach_the_table():
 
 
 @pytest.mark.parametrize('rested', [12.0, 25.0])
-def test_a_rest_that_is_judged_when_it_is_warmer_teaches_the_table_all_the_same(rested):
+def test_a_rest_that_is_decided_on_when_it_is_warmer_enters_the_table_all_the_same(rested):
     gyro = Gyro(begun(temperature=25.0), coefficient=0.02 * DEGREE)
     gyro.live.learn = lambda now: ''
     gyro.go(rested).go(5.0, 0.3, temperature=35.0).go(8.0, temperature=35.0).go(

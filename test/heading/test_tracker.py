@@ -173,7 +173,7 @@ def test_what_was_no_rest_is_not_deleted():
     assert not tracker.resting and abs(tracker.deleted) < 0.01 * DEGREE
 
 
-def test_a_rest_teaches_the_bias_as_well_as_it_says():
+def test_a_rest_determines_the_bias_as_well_as_stated():
     errors = []
     for seed in range(40):
         generator = np.random.default_rng(seed)
@@ -297,7 +297,7 @@ def test_a_gap_and_a_jump_of_the_clock_leave_the_heading_where_it_was():
 
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5)], ids=['flicker', 'walk'])
 @pytest.mark.parametrize('later', [0.05, 0.02])
-def test_over_a_long_gap_the_heading_stands_whatever_rests_have_taught_or_teach_later(
+def test_over_a_long_gap_the_heading_stands_whatever_the_bias_estimate(
         noise, later):
     tracker, generator, still = (HeadingTracker(noise, KNOWN, Settings(), 3600.0),
                                  np.random.default_rng(11), np.array([0.0, -1.0]))
@@ -317,7 +317,7 @@ def test_over_a_long_gap_the_heading_stands_whatever_rests_have_taught_or_teach_
     assert math.sqrt(variances[1] - variances[0]) == pytest.approx(0.05 * 600.0 * DEGREE, rel=0.01)
 
 
-def test_the_first_rate_after_a_gap_or_a_jump_back_is_as_rests_have_taught():
+def test_the_first_rate_after_a_gap_or_a_jump_back_is_corrected_by_the_bias_estimate():
     tracker, generator = (HeadingTracker(XV3500, np.diag([1e-6, (0.5 * DEGREE) ** 2]), Settings()),
                           np.random.default_rng(12))
     for index, true in enumerate([0.0] * 1200 + [0.2] * 200):

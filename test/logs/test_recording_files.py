@@ -274,7 +274,7 @@ def test_zeros_at_the_end_are_a_tear(make, tmp_path):
     assert len(log) == 500 and any('is torn after' in note for note in log.notes)
 
 
-def test_a_damaged_chunk_is_left_out_and_told(tmp_path):
+def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
     write_chunks(tmp_path / 'a.mcap', 'ZSTD', 2000)
     data = bytearray((tmp_path / 'a.mcap').read_bytes())
     middle = data.index(b'zstd', len(data) // 3) + 100
@@ -453,7 +453,7 @@ def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     np.testing.assert_array_equal(read_recording(path, Topics(reference='imu/data')).output, rate)
 
 
-def test_topics_that_are_not_there_or_of_another_kind_are_told(make, tmp_path, turning):
+def test_topics_that_are_not_there_or_of_another_kind_are_reported(make, tmp_path, turning):
     time, rate, _ = turning
     path = write(tmp_path / 'bag',
                  {'/imu': gyro(make, time, rate), '/t': [(0.0, make.temperature(0.0, 20.0))]})
@@ -491,7 +491,7 @@ def test_times_are_those_of_the_headers(make, tmp_path):
 
 
 @pytest.mark.parametrize('stamp', [None, 7.0], ids=['zero', 'always the same'])
-def test_without_stamps_the_times_of_receiving_are_taken_and_told(make, tmp_path, stamp):
+def test_without_stamps_the_times_of_receiving_are_taken_and_reported(make, tmp_path, stamp):
     time = np.arange(300) / RATE
     topics = {'imu': [(at, make.imu(stamp, at)) for at in time],
               'odom': [(at, make.odometry(at, at, 1.0)) for at in time]}
@@ -502,7 +502,7 @@ def test_without_stamps_the_times_of_receiving_are_taken_and_told(make, tmp_path
     assert any(f'time_s from {BEGIN // 10 ** 9}.{DELAY:09d} s' in note for note in log.notes)
 
 
-def test_doubled_samples_are_left_out_and_told(make, tmp_path):
+def test_doubled_samples_are_left_out_and_reported(make, tmp_path):
     time = np.arange(300) / RATE
     topics = {'imu': sorted(gyro(make, time, time) + gyro(make, time[100:200], time[100:200]),
                             key=lambda each: each[0])}
@@ -544,7 +544,7 @@ def test_a_slow_temperature_lies_on_the_line_between_readings_and_is_held_at_the
     assert not any('no temperature came' in note for note in log.notes)
 
 
-def test_a_long_time_without_temperature_is_told_and_another_time_is_not_used(make, tmp_path):
+def test_a_long_time_without_temperature_is_reported_and_another_time_is_not_used(make, tmp_path):
     time = np.arange(0.0, 100.0, 0.1)
     some = [(at, make.temperature(at, 20.0)) for at in range(10)]
     log = read_recording(write(tmp_path / 'bag', {'imu': gyro(make, time, time), 't': some}))

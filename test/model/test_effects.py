@@ -86,7 +86,7 @@ def around(time):
             'supply': 5.0 + 0.3 * generator.standard_normal(len(time)), 'heading': 0.4 * time}
 
 
-def test_every_effect_is_recovered_or_said_to_be_lost():
+def test_every_effect_is_recovered_or_declared_lost():
     recovered = {name.partition(',')[0] for name in GYROS}
     assert (recovered | {effect.name for effect in CATALOGUE.values() if effect.undone}
             >= set(CATALOGUE) | {'rate_temperature_polynomial'})
@@ -208,7 +208,7 @@ def test_the_sine_response_is_the_sine_of_the_sagnac_phase():
     assert model.output(1.2, 25.0) == pytest.approx(math.sin(0.5 * 1.2) / 0.5, abs=1e-15)
 
 
-def test_looking_at_channels_is_honest():
+def test_an_effect_depends_on_no_other_channels_than_it_names():
     effects = [*CATALOGUE.values(), POLYNOMIAL, rate_temperature_polynomial(3, 0)]
     base = {'rate': 0.3, 'output': 0.4, 'temperature': 30.0, 'time': 0.2, 'specific_force': 1.0,
             'supply': 4.0, 'heading': 0.3, 'lagged': lambda channel, time_constant: 2.0,

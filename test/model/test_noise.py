@@ -65,7 +65,7 @@ def test_a_random_walk_grows_with_the_square_root_of_time(size):
 @pytest.mark.parametrize('noise', [Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-5)],
                          ids=['flicker', 'walk'])
 @pytest.mark.parametrize('apart', [3, 20])
-def test_means_wander_as_foretold(noise, apart):
+def test_means_wander_as_predicted(noise, apart):
     generator, duration, size = np.random.default_rng(5), 2.0, 200
     squares = []
     for _ in range(12):
@@ -108,7 +108,7 @@ def test_the_configuration_of_the_xv3500_holds_its_figures():
 @pytest.mark.parametrize('noise', [
     Noise(7e-4), Noise(bias_instability=1e-4), Noise(rate_random_walk=1e-4)
 ], ids=['angle random walk', 'bias instability', 'rate random walk'])
-def test_the_heading_varies_as_foretold(noise):
+def test_the_heading_varies_as_predicted(noise):
     """Four processes a decade apart make flicker to 10 %; white noise has no mean before."""
     generator, runs, interval, ends = np.random.default_rng(3), 1500, 0.5, []
     known, count = round(CALIBRATED / interval), 400
