@@ -102,7 +102,7 @@ def test_three_speeds_of_a_record_player_are_three_blocks():
     assert list(from_table(table([33.3, 45.0, 78.0])).sweep) == [0, 1, 2]
 
 
-def test_rows_without_output_or_reference_are_left_out_and_said():
+def test_rows_without_output_or_reference_are_left_out_and_reported():
     log = table([10, 20, math.nan, 40, 50], temperature=np.arange(5.0))
     found = from_table(replace(log, output=np.where(np.arange(5) == 3, np.nan, log.output)))
     assert found.place == ('row 1', 'row 2', 'row 5')
@@ -223,7 +223,7 @@ def test_slow_samples_are_enough(every, generator):
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
-def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_said(
+def test_a_reference_that_is_slower_than_the_gyro_is_enough_and_only_true_losses_are_reported(
         reference, generator):
     log = run(generator, **references(generator)[reference])
     quantity = 'reference_rate' if reference == 'rate' else 'reference_heading'
@@ -242,7 +242,7 @@ def test_a_gyro_that_runs_the_other_way_is_averaged_as_well(generator):
 
 
 @pytest.mark.parametrize('reference', ['rate', 'fine encoder'])
-def test_outliers_repeated_and_lost_samples_are_said_and_left_out(reference, generator):
+def test_outliers_repeated_and_lost_samples_are_reported_and_left_out(reference, generator):
     log = run(generator, **references(generator)[reference])
     output, given = log.output.copy(), next(iter(references(generator)[reference].values())).copy()
     output[[500, 9000, 9001]] += 500.0 * DEGREE
@@ -261,7 +261,7 @@ def test_outliers_repeated_and_lost_samples_are_said_and_left_out(reference, gen
     assert 'samples missing within the dwells: 7, after 299.99 s' in said
 
 
-def test_nothing_is_said_of_a_good_log(generator):
+def test_a_good_log_has_no_remarks(generator):
     said = [remark for _ in range(10)
             for remark in find_dwells(run(generator)).remarks if 'after each ramp' not in remark]
     assert not said

@@ -123,7 +123,7 @@ def test_values_and_covariance_are_those_of_plain_least_squares_where_dwells_sca
                                covariance / np.outer(sizes, sizes), atol=1e-5)
 
 
-def test_told_deviations_weigh_the_dwells():
+def test_given_deviations_weigh_the_dwells():
     table = measured(LINEAR, sweeps=3, told=True)
     fit = fit_effects(table, (BIAS, SCALE_FACTOR_ERROR), alike(table, 0.0))
     (scale, bias) = np.polyfit(table.rate, table.output - table.rate, 1, w=1.0 / table.deviation)
@@ -272,7 +272,7 @@ def test_bins_hold_all_dwells_that_were_fitted_and_know_what_sweeps_share():
             > fit.scatter.dwell / 2.0)
 
 
-def test_rates_beyond_the_top_of_a_sine_are_said():
+def test_rates_beyond_the_top_of_a_sine_are_reported():
     beyond, within = (
         fit_effects(
             measured((*LINEAR, Term(SINE_RESPONSE, (0.25, 1.0))), fastest=fastest * DEGREE),

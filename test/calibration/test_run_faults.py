@@ -84,7 +84,7 @@ def test_the_goodness_of_fit_has_the_probability_that_it_says(runs):
     assert np.mean(probabilities) == pytest.approx(0.5, abs=4.0 / math.sqrt(12.0 * runs))
 
 
-def test_noise_beyond_the_models_is_said_and_more_of_it_refused():
+def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
     goodness = self_calibrate(TIME, output(level=3.0), CALIBRATION, noise=XV3500.noise).goodness
     assert goodness.probability < UNLIKELY and goodness.noise_ratio == pytest.approx(3.0, rel=0.4)
     assert 'more than the noise explains' in str(goodness)
@@ -93,14 +93,14 @@ def test_noise_beyond_the_models_is_said_and_more_of_it_refused():
                        limits=Limits(scale_standard_deviation=1.0))
 
 
-def test_an_early_end_is_told_by_when():
+def test_an_early_end_is_reported_by_when():
     motion = turns([(1, 0), (4, 45), (1, 0), (2, -45), (20, 0)])
     with pytest.raises(DataRefused,
                        match=r'stopped at about (7\.[5-9]|8\.[0-5]) s of the profile\'s 20\.0 s'):
         self_calibrate(TIME, output(motion=motion), CALIBRATION, noise=XV3500.noise)
 
 
-def test_a_robot_that_begins_too_late_is_told_by_how_much():
+def test_a_robot_that_begins_too_late_is_reported_by_how_much():
     time = np.arange(2301) / 100.0
     with pytest.raises(DataRefused, match=r'began (2\.4|2\.5|2\.6) s after the profile'):
         self_calibrate(time, output(time=time - 2.5), CALIBRATION, noise=XV3500.noise)
@@ -133,7 +133,7 @@ LONG_RAMPS = from_rates(np.array([0.0, 2.0, 7.0, 8.0, 18.0, 19.0, 24.0, 26.0]),
 
 
 @pytest.mark.parametrize('motion', [CALIBRATION, LONG_RAMPS], ids=['short ramps', 'long ramps'])
-def test_coarse_codes_are_no_limit(motion):
+def test_coarse_quantization_is_no_saturation(motion):
     code, time = 0.2 * DEGREE, np.arange(0.0, motion.duration, 0.01)
     fit = self_calibrate(
         time, np.round(((1 + S) * motion.rate_at(time - 0.1) + B) / code) * code, motion)

@@ -104,7 +104,7 @@ def test_what_the_gyro_is_decides_only_where_the_data_do_not(technology, wide):
 
 
 @pytest.mark.parametrize('runs', [2, pytest.param(12, marks=pytest.mark.evidence)])
-def test_the_rate_that_is_said_to_part_look_alikes_parts_them(runs):
+def test_the_rate_that_is_proposed_distinguishes_confounders(runs):
     generator, sigmas = np.random.default_rng(4), []
     truth = GyroModel((*LINEAR, TRUTH['sine_response']))
     for _ in range(runs):
@@ -147,7 +147,7 @@ def test_a_slope_that_dwells_determine_worse_than_a_data_sheet_is_left_out():
     assert names(select_effects(measured(Table(dwell=10.0 * DEGREE), LINEAR))).isdisjoint(SLOPES)
 
 
-def test_of_look_alikes_that_fit_alike_the_bounded_one_is_taken_where_nobody_says_what_it_is():
+def test_of_confounders_that_fit_alike_the_bounded_one_is_taken_by_default():
     generator = np.random.default_rng(6)
     for _ in range(2):
         fit = select_effects(WANDERING.measure(GyroModel((*LINEAR, TRUTH['sine_response'])),
@@ -162,7 +162,7 @@ def test_on_the_recorded_table_the_default_predicts_rates_beyond_those_it_saw(da
     assert RATE_TABLE['beyond'](RATE_TABLE['chosen'](technology), dwells) < 0.085 * DEGREE
 
 
-def test_on_the_recorded_table_sine_and_cubic_are_hardly_parted_and_the_rates_that_would_are_said(
+def test_on_the_recorded_table_sine_and_cubic_are_hardly_distinguished_and_a_rate_is_proposed(
         data):
     dwells = RATE_TABLE['table'](data)
     selection = select_effects(dwells, 'open_loop_fog')

@@ -172,7 +172,7 @@ def test_the_likelihood_comes_near_the_cramer_rao_bound(reference, runs):
 
 
 @each_reference
-def test_honest_runs_are_not_refused(reference, runs):
+def test_good_runs_are_not_refused(reference, runs):
     assert honest(reference, runs)[2] <= 1
 
 
@@ -335,7 +335,7 @@ def test_a_bias_is_not_taken_in_motion(true, reason):
         calibrate_bias(TIME, run(0, true), noise=XV3500)
 
 
-def test_an_honest_rest_is_not_refused():
+def test_a_good_rest_is_not_refused():
     flicker = Noise(XV3500.angle_random_walk, 100 * DEGREE / 3600)
     rests = (simulate_noise(flicker, len(TIME), 0.01, np.random.default_rng(seed))
              for seed in range(200))

@@ -175,7 +175,7 @@ def test_a_single_sweep_is_predicted_dwell_by_dwell():
             == pytest.approx(found.rate, abs=1e-6))
 
 
-def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_said():
+def test_what_the_other_sweeps_do_not_determine_has_no_error_and_it_is_reported():
     found = table([0, 20, -20, 0, 0, 0], [0.1, 0.3, -0.1, 0.1001, 0.1, 0.0999],
                   sweep=[0, 0, 0, 1, 1, 1])
     rate = predicted_rates(fit_effects(found, (BIAS, SCALE_FACTOR_ERROR)))
@@ -242,7 +242,7 @@ def test_the_data_hold_every_turn_in_si(run, log, model):
             == sum(each['turns'] for each in answer['by_temperature']) == 48)
 
 
-def test_turns_beyond_the_range_of_the_model_are_said(run, log, model):
+def test_turns_beyond_the_range_of_the_model_are_reported(run, log, model):
     code, text, _ = run(log, '--model', model)
     assert code == 0 and '24 of 52 dwells are beyond the calibrated rates' in text
     assert '26 of 52 dwells are outside the calibrated temperatures' in text
@@ -252,7 +252,7 @@ def test_turns_beyond_the_range_of_the_model_are_said(run, log, model):
     'origin, said', [('{}', 'if it was fitted to this log'),
                      ('{files: [{name: table.csv, sha256: THIS}]}', 'it was fitted to this log'),
                      ('{files: [{name: table.csv, sha256: 00ff}]}', '')])
-def test_a_model_that_was_fitted_to_the_log_is_told_from_one_that_was_not(
+def test_a_model_that_was_fitted_to_the_log_is_distinguished_from_others(
         run, log, model, origin, said):
     digest = hashlib.sha256(log.read_bytes()).hexdigest()
     model.write_text(model.read_text() + f'\norigin: {origin.replace("THIS", digest)}')

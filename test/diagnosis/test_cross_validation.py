@@ -41,7 +41,7 @@ def blocks(log, length=60.0):
 # beside a model
 
 @pytest.mark.parametrize('bias, scale', [(0.02, 0.0), (0.0, 0.03), (0.02, 0.03)])
-def test_what_a_right_bias_and_scale_factor_win_is_measured_from_the_model_as_it_was_given(
+def test_the_improvement_by_a_right_bias_and_scale_factor_is_measured_from_the_given_model(
         bias, scale):
     log = drive(np.random.default_rng(1), bias=bias, scale=scale)
     model = GyroModel((Term(BIAS, (0.0,)), Term(SCALE_FACTOR_ERROR, (0.0,))),
@@ -104,7 +104,7 @@ def test_one_part_has_no_interval_and_is_not_called_worse():
 @pytest.mark.parametrize('parts', [2, 3, 5, 8])
 @pytest.mark.parametrize('shared', [0.0, 0.7, 1.0],
                          ids=['all is won', 'some is won', 'nothing is won'])
-def test_intervals_of_what_is_won_hold_the_truth_for_few_parts(parts, shared):
+def test_intervals_of_the_improvement_hold_the_truth_for_few_parts(parts, shared):
     generator, runs = np.random.default_rng(8), 2000
     inside = 0
     for _ in range(runs):

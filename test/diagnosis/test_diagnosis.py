@@ -140,7 +140,7 @@ def test_where_nothing_is_hidden_nothing_is_found(seed, reference):
     lambda name: name in ('third_harmonic_of_heading', 'bias_pulse'),
     ('third_harmonic_of_heading',), ('resonance_at_a_speed',), ('bias_pulse',),
     ('supply_times_rate',)))
-def test_what_the_catalogue_does_not_have_is_said_to_be_unexplained(name):
+def test_what_the_catalogue_does_not_have_is_reported_as_unexplained(name):
     log, = hidden_in([name], 5.0, list(OUTSIDE).index(name), reference=REFERENCES[0])
     found = diagnosis_of([log], np.random.default_rng(0))
     assert found.verdict == 'unexplained' and judged_diagnosis(log, found).right, told(log, found)
@@ -271,7 +271,7 @@ def test_an_effect_of_the_motion_is_found_in_several_logs_together():
 # against a model
 
 @pytest.mark.parametrize('factor', [0.7, 1.5])
-def test_a_model_of_other_noise_is_told_so(factor):
+def test_a_model_of_other_noise_is_reported(factor):
     log, = hidden_in([], 0.0, 4, 'white', REFERENCES[0])
     model = model_of(log)
     other = replace(model, noise=replace(model.noise,

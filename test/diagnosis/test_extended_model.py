@@ -131,7 +131,7 @@ def test_what_does_not_make_one_effect_with_that_of_the_model_is_left_out(name, 
     assert not left_out(GyroModel(), outcome)
 
 
-def test_a_second_tone_is_not_said_to_be_in_the_model():
+def test_a_second_tone_is_not_reported_as_in_the_model():
     slow, fast = term('interference_tone', 1.7, 1e-3, 0.0), term('interference_tone', 3.1, 1e-3,
                                                                  0.0)
     model = replace(MODEL, terms=(*LINEAR, slow), covariance=None)

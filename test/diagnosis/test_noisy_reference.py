@@ -100,7 +100,7 @@ def test_a_step_of_the_bias_that_happens_once_is_in_no_model():
                if each.effect in ('bias_step', 'reference_slip'))
 
 
-def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
+def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_reported():
     log = drive(7)
     right = diagnosed(log).model
     again = diagnosed(log, right)
@@ -112,7 +112,7 @@ def test_a_model_that_holds_is_left_as_it_is_and_one_that_does_not_is_told_so():
     assert value(found.model, 'bias') == pytest.approx(BIAS_TRUE, abs=0.03 * DEGREE)
 
 
-def test_the_answer_is_about_heading_and_is_told_in_all_files():
+def test_the_answer_is_about_heading_and_is_reported_in_all_files():
     found = diagnosed(drive(8))
     told = found.figures()
     assert (told['schema'].endswith('/2') and told['reference']['kind'] == 'course'
@@ -124,7 +124,7 @@ def test_the_answer_is_about_heading_and_is_told_in_all_files():
     assert 'course over ground' in ' '.join(lines(found)) and 'course over ground' in report(found)
 
 
-def test_the_kind_of_a_reference_is_told_or_found():
+def test_the_kind_of_a_reference_is_given_or_found():
     log = drive(9)
     exact = replace(log, reference_heading=np.cumsum(log.output) / RATE)
     assert reference_of(log).kind == 'course' and limits(log, reference_of(log))

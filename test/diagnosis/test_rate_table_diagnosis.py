@@ -218,7 +218,7 @@ def test_an_extension_by_a_table_holds_at_its_temperatures_and_says_what_came_be
     assert found.origin['before'] == [{'date': '2025'}]
 
 
-def test_what_dwells_cannot_test_of_a_model_is_left_and_said(without_gain):
+def test_what_dwells_cannot_test_of_a_model_is_left_and_reported(without_gain):
     model = GyroModel((*LINEAR, Term(CATALOGUE['time_offset'], (0.02,))))
     found = diagnosed(Table(), gyro('cubic_nonlinearity', -0.01), np.random.default_rng(11), model)
     assert (any('time_offset' in remark for remark in found.remarks)
@@ -253,7 +253,7 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 
 
-def test_wild_dwells_and_wrong_units_are_said_and_not_fitted():
+def test_outlying_dwells_and_wrong_units_are_reported_and_not_fitted():
     generator = np.random.default_rng(13)
     table = Table().measure(GyroModel(LINEAR), generator)
     wild = table.output + np.where(np.arange(len(table)) == 50, 1.0 * DEGREE, 0.0)
@@ -288,7 +288,7 @@ def test_tables_without_temperature_say_what_they_cannot_show():
                                                    'unit_error'} == set(diagnosis.CAUSES)
 
 
-def test_a_table_with_columns_that_are_not_looked_at_is_not_told_that_it_has_none(without_gain):
+def test_columns_of_a_table_that_are_not_used_are_not_reported_as_missing(without_gain):
     table = Table().measure(GyroModel(LINEAR), np.random.default_rng(20))
     steady = np.full(len(table), 5.0)
     log = Log(output=table.output, reference_rate=table.rate, temperature=table.temperature,

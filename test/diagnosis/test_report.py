@@ -291,7 +291,7 @@ def test_a_page_for_a_million_samples_is_small_and_keeps_the_extremes():
 
 # the words
 
-def test_a_set_is_named_with_the_experiment_that_parts_it():
+def test_a_set_is_named_with_the_experiment_that_distinguishes_it():
     text = ' '.join(' '.join(lines(extended())).split())
     assert 'bias temperature or rate ramp, which these data cannot distinguish' in text
     assert 'To distinguish them: heat and cool the gyro within one log.' in text
@@ -340,7 +340,7 @@ def test_noise_is_in_the_units_of_data_sheets():
 @pytest.mark.parametrize('probability, words',
                          [(0.0, 'below 1 in 10 000'), (1 / 250, '1 in 250'), (0.3, '30 %'),
                           (np.nan, 'not known')])
-def test_a_chance_is_said_in_words(probability, words):
+def test_a_chance_is_reported_in_words(probability, words):
     assert chance(probability) == words
 
 

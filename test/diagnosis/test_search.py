@@ -71,7 +71,7 @@ def _both():
     return {each.effect: each for each in diagnose([log], np.random.default_rng(0)).findings}
 
 
-def test_a_set_is_told_beside_a_cause_of_many_values(both):
+def test_a_set_is_reported_beside_a_cause_of_many_values(both):
     drift = next(each for name, each in both.items() if name != 'interference_tone')
     assert {'rate_ramp', 'bias_temperature'} <= {drift.effect, *drift.ambiguous_with}, both
 

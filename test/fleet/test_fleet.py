@@ -139,7 +139,7 @@ def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
 
 # the verb
 
-def test_logs_that_are_no_evidence_are_told_and_the_others_done(tmp_path, capsys):
+def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, capsys):
     logs = tmp_path / 'logs'
     for unit, seed in ((1, 0), (2, 1)):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))

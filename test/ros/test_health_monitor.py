@@ -47,7 +47,7 @@ def examined(outputs, noise, false_alarms, step=0.0):
 @pytest.mark.parametrize('runs', [30, pytest.param(100, marks=pytest.mark.evidence)])
 @pytest.mark.parametrize('noise', [MEMS, FOG, Noise(1e-4)], ids=['MEMS', 'FOG', 'white'])
 @pytest.mark.parametrize('step', [0.0, 1e-4, 3e-3], ids=['fine', 'coarse', 'very coarse'])
-def test_single_stretches_alarm_in_vain_no_more_often_than_stated(noise, step, runs):
+def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, step, runs):
     """State 40 alarms an hour, so that some occur; they correlate within a run, not beyond it."""
     stated, minutes, generator, alarms, rests = 40.0, 6.0, np.random.default_rng(11), [], []
     for _ in range(runs):
@@ -161,7 +161,7 @@ def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged
     assert not check.examined and not check.noise_alarm
 
 
-def test_a_gyro_that_died_is_said_once_its_codes_are_known():
+def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
     outputs = stretches(MEMS, 0.1, np.random.default_rng(19))
     check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:2])
     fed(check, np.zeros(2500), begin=100.0)
@@ -181,7 +181,7 @@ def test_without_noise_figures_there_is_nothing_to_check():
             and HealthMonitor(MEMS, 0.001).works)
 
 
-def test_a_calibration_that_changed_by_more_than_chance_is_said_in_vain_as_often_as_stated():
+def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
     generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
     covariance, said, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
     wander = math.sqrt(MEMS.wander(age, STRETCH))

@@ -103,7 +103,7 @@ class TestGraph(unittest.TestCase):
         assert (port.string_value, frame.string_value) == ('/nonexistent/gyro', 'gyro_link')
         assert simulated.bool_value is False
 
-    def test_the_topics_of_a_shared_base_are_heard(self):
+    def test_the_topics_of_a_shared_base_are_received(self):
         for topic in ('/base/odom', '/base/cmd_vel'):
             assert self.spin_until(lambda: self.node.count_subscribers(topic)), topic  # noqa: B023
 

@@ -67,7 +67,7 @@ def test_the_table_is_written_seldom_and_only_if_it_learned_something(remember, 
     assert memory.written == NOW + 1.1 * INTERVAL
 
 
-def test_a_damaged_table_is_told_and_kept(remember, tmp_path):
+def test_a_damaged_table_is_reported_and_kept(remember, tmp_path):
     memory = remember(biases='entries: [')
     assert 'cannot be read' in memory.table_hint
     taught(memory)
@@ -76,7 +76,7 @@ def test_a_damaged_table_is_told_and_kept(remember, tmp_path):
             and 'is now in' in memory.table_hint)
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_and_not_tried_each_second(tmp_path):
+def test_a_folder_that_cannot_be_written_to_is_reported_and_not_tried_each_second(tmp_path):
     (tmp_path / 'file').write_text('')
     memory = StateStore('', tmp_path / 'calibration.yaml',
                         tmp_path / 'file' / 'biases.yaml', Prior())
@@ -113,7 +113,7 @@ def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path)
     assert not (tmp_path / 'biases.yaml').exists()
 
 
-def test_what_another_node_writes_to_the_same_file_is_told_until_this_one_writes_again(remember):
+def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_writes(remember):
     first, second = remember(), remember()
     first.look()
     assert not first.shared_hint
