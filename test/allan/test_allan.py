@@ -13,6 +13,7 @@
 import json
 import math
 
+from chance import fewest, most
 from gyro_calibration.allan import allan_deviation, even_record, fit_noise, PARTS
 from gyro_calibration.cli.main import main
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log, read_log, write_log
@@ -130,8 +131,8 @@ def test_what_is_there_is_seen_and_what_is_not_there_is_not(case):
 
 def test_the_bounds_hold_in_95_of_100_records(case):
     for symbol, (truth, records) in case.items():
-        held = np.mean([figure.lower <= truth <= figure.upper for figure in records])
-        assert held >= 0.95 - 4.0 * math.sqrt(0.05 * 0.95 / RUNS), (symbol, held)
+        held = sum(figure.lower <= truth <= figure.upper for figure in records)
+        assert held >= fewest(RUNS, 0.95), (symbol, held)
 
 
 @pytest.mark.parametrize('walk, runs', [
@@ -140,8 +141,8 @@ def test_the_bounds_hold_where_flicker_and_random_walk_hide_each_other(walk, run
     truth = Noise(1e-3, 3e-4, walk)
     found = figures(truth, runs, 11, samples=200_000)
     for symbol, true in zip('NBK', vars(truth).values()):
-        held = np.mean([figure.lower <= true <= figure.upper for figure in found[symbol]])
-        assert held >= 0.95 - 4.0 * math.sqrt(0.05 * 0.95 / runs), (symbol, held)
+        held = sum(figure.lower <= true <= figure.upper for figure in found[symbol])
+        assert held >= fewest(runs, 0.95), (symbol, held)
 
 
 def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
@@ -155,10 +156,10 @@ def test_a_standard_deviation_is_the_scatter_of_its_figure(case):
 
 
 def test_white_noise_alone_shows_nothing_else():
-    """At most 5 % of records show what is not there: of 25, with four times the scatter, 5."""
+    """At most 5 % of records show what is not there."""
     found = figures(WHITE, 25, 5, samples=3000)
     false = np.any([[figure.value > 0.0 for figure in found[symbol]] for symbol in 'BKQR'], axis=0)
-    assert false.sum() <= 5
+    assert false.sum() <= most(25, 0.05)
     assert all(figure.value > 0.0 for figure in found['N'])
 
 

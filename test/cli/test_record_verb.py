@@ -213,7 +213,7 @@ def angles(link, rate=100.0):
     pytest.param(['--sample-rate', '100'], 2, 0.1, 100.0, marks=pytest.mark.evidence),
     pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
-def test_angles_at_another_rate_than_set_are_reported(run, tmp_path, options, seconds, rate, factor):
+def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, rate, factor):
     """Where nothing is to be told is tested in test_driver_report.py, without a port."""
     with angles(tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]

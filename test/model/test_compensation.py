@@ -154,7 +154,7 @@ def test_the_sensitivity_is_the_derivative_of_the_rate(name, calibration):
 @pytest.mark.parametrize('calibration', [None, CALIBRATION],
                          ids=['model alone', 'self-calibrated'])
 @pytest.mark.parametrize('name', UNCERTAIN)
-@pytest.mark.parametrize('runs', [400, pytest.param(2000, marks=pytest.mark.evidence)])
+@pytest.mark.parametrize('runs', [200, pytest.param(2000, marks=pytest.mark.evidence)])
 def test_the_standard_deviations_are_those_of_models_drawn_from_the_covariance(
         name, calibration, runs):
     """At 1.5 rad/s (k w = 0.9) a value of the sine response counts 1.6 times what it adds."""

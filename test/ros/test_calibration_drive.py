@@ -590,10 +590,3 @@ def test_calibrate_bias_refuses_a_gyro_that_is_moved(tmp_path):
     rig.go(20.0, lambda: rig.ended)
     success, message = rig.session.conclude()
     assert not success and 'was moved' in message
-
-
-def test_without_permission_a_calibration_commands_nothing(tmp_path):
-    rig = rested(tmp_path)
-    rig.begin()
-    rig.go(10.0)
-    assert not rig.commands and not rig.session.drives
