@@ -14,8 +14,6 @@ import io
 
 from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.logs.cdr import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
-from gyro_calibration.logs.recording import read_recording
-import numpy as np
 import pytest
 
 NOTES = {'recorded by': 'a test', 'gyro': '12°'}
@@ -66,9 +64,3 @@ def test_the_library_mcap_reads_all_from_the_beginning_to_the_end(recording):
     times = [message.log_time for _, channel, message in reader.iter_messages()
              if channel.topic == '/imu/temperature']
     assert times == TIMES[::10]
-
-
-def test_the_project_reads_its_own(recording):
-    log = read_recording(recording)
-    assert len(log.output) == 300
-    np.testing.assert_allclose(log.output, 0.001 * np.arange(300))

@@ -10,7 +10,7 @@
 
 """A simulated log is what the model says of the motion, and says so itself."""
 
-from gyro_calibration.logs.log import read_log, write_log
+from gyro_calibration.logs.log import read_log
 from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
@@ -52,12 +52,6 @@ def test_the_noise_is_that_of_the_model():
                     simulate(GYRO, ROBOT, 100.0, np.random.default_rng(0)))
     noise = noisy.output - quiet.output
     assert noise.std() == pytest.approx(7e-4 / np.sqrt(0.01), rel=4.0 / np.sqrt(2 * len(noise)))
-
-
-def test_a_simulated_log_is_a_log(tmp_path):
-    log = simulate(GYRO, CALIBRATION, 20.0, np.random.default_rng(0))
-    write_log(tmp_path / 'log.csv', log)
-    assert np.array_equal(read_log(tmp_path / 'log.csv').output, log.output)
 
 
 def test_a_log_is_replayed_with_its_motion_and_surroundings():
