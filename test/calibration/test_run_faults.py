@@ -33,7 +33,6 @@ from gyro_calibration.calibration.self_calibration import (
     self_calibrate,
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns
-from gyro_calibration.cli.main import main
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
@@ -315,13 +314,7 @@ def write_log(path, time, rate, name='gyro_rad_s'):
     return path
 
 
-def answer(capsys, *words):
-    code = main([str(word) for word in words])
-    shown = capsys.readouterr()
-    return code, shown.out, shown.err
-
-
-def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, capsys):
+def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, run):
     write_model(tmp_path / 'model.yaml', GyroModel(noise=XV3500.noise))
     profile = tmp_path / 'profile.csv'
     profile.write_text('time_s,rate_rad_s\n'
@@ -330,7 +323,7 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, caps
     log = write_log(tmp_path / 'log.csv', time, output(0, time=time))
     words = ('self-calibrate', log, '--profile', profile, '--model', tmp_path / 'model.yaml',
              '--reference-scale-deviation', '0.5')
-    code, text, _ = answer(capsys, *words, '--json')
+    code, text, _ = run(*words, '--json')
     found = json.loads(text)
     assert (code == 0 and found['scale_factor_error_standard_deviation'] == pytest.approx(
         0.0052, abs=0.0003))
@@ -339,33 +332,33 @@ def test_the_verb_says_all_that_the_fit_found_and_checks_the_rest(tmp_path, caps
     assert (found['time_offset_standard_deviation_s'] < 0.01 and 0.0 < found['probability'] < 1.0
             and found['noise_ratio'] < 2.0)
     assert found['start_heading_rad'] is None
-    said = answer(capsys, *words)[1]
+    said = run(*words)[1]
     assert 'chi-square' in said and 'At rest after the run' in said and '+-' in said
     spoiled = write_log(tmp_path / 'spoiled.csv', time,
                         output(0, time=time) + np.where(time > 20.5, 0.5 * DEGREE, 0.0))
-    code, _, error = answer(capsys, 'self-calibrate', spoiled, *words[2:])
+    code, _, error = run('self-calibrate', spoiled, *words[2:])
     assert code == 1 and 'after the run, at rest' in error and error.count('\n') == 1
 
 
-def test_the_verb_calibrates_by_turns(tmp_path, capsys):
+def test_the_verb_calibrates_by_turns(tmp_path, run):
     log = write_log(tmp_path / 'turns.csv', *turned(5))
-    code, text, _ = answer(capsys, 'self-calibrate', log, '--turns', '5', '--marking', '2',
-                           '--out', tmp_path / 'new.yaml', '--json')
+    code, text, _ = run('self-calibrate', log, '--turns', '5', '--marking', '2',
+                        '--out', tmp_path / 'new.yaml', '--json')
     found = json.loads(text)
     assert code == 0 and found['turns'] == 5 and found['method'] == 'turns'
     assert (abs(found['scale_factor_error'] - S)
             < 3.0 * found['scale_factor_error_standard_deviation'] < 0.006)
-    code, text, _ = answer(capsys, 'self-calibrate', write_log(tmp_path / 'two.csv', *turned(-2)),
-                           '--turns', 'nearest')
+    code, text, _ = run('self-calibrate', write_log(tmp_path / 'two.csv', *turned(-2)),
+                        '--turns', 'nearest')
     assert code == 0 and '2 whole turns clockwise' in text
 
 
 @pytest.mark.parametrize('words, said',
                          [(['--turns', '3', '--profile', 'p.csv'], 'were both given'),
                           (['--marking', '2'], 'leave it out')])
-def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, capsys, words, said):
-    code, _, error = answer(capsys, 'self-calibrate',
-                            write_log(tmp_path / 'log.csv', *turned(1)), *words)
+def test_the_verb_refuses_options_that_exclude_each_other(tmp_path, run, words, said):
+    code, _, error = run('self-calibrate',
+                         write_log(tmp_path / 'log.csv', *turned(1)), *words)
     assert code == 2 and said in error
 
 

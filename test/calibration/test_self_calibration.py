@@ -95,13 +95,6 @@ def test_the_likelihood_needs_no_common_rate_and_no_common_start(gyro, reference
     assert fit.time_offset == pytest.approx(offset, abs=1e-5)
 
 
-def test_equation_8_as_printed_returns_its_unknowns_swapped():
-    true = MOVE.rate_at(MOVE_TIME)
-    printed = np.array([[MOVE_RATE.sum(), MOVE_RATE @ MOVE_RATE], [len(true), MOVE_RATE.sum()]])
-    first, second = np.linalg.solve(printed, [true @ MOVE_RATE, true.sum()])
-    assert (round(second, 3), round(first, 3)) == (1.111, -0.111)  # s_bar, b_bar
-
-
 STEP = 0.088 * DEGREE
 FEW, MANY = 20, 300
 each_reference = pytest.mark.parametrize('reference, runs', [

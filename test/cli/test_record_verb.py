@@ -459,6 +459,7 @@ def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
 
 def test_publishers_that_come_late_or_with_another_quality_are_received(
         ros, record, wait_until, tmp_path):
+    from gyro_calibration.ros.runner import SENSOR_QOS
     from rclpy.qos import DurabilityPolicy
     from std_msgs.msg import String
     robot = Robot(ros)
@@ -471,7 +472,7 @@ def test_publishers_that_come_late_or_with_another_quality_are_received(
     robot.offer('imu/data_raw')
     wait_until(robot.is_heard, what='the recorder')
     robot.drive(0.0, 4.0)
-    robot.offer('pose', quality=ros_quality())  # best effort
+    robot.offer('pose', quality=SENSOR_QOS)  # best effort
     wait_until(robot.is_heard, what='the recorder')
     robot.drive(4.0, 6.0)
     wait_until(lambda: holds(tmp_path / 'a.mcap', 490), what='the last piece')
@@ -482,11 +483,6 @@ def test_publishers_that_come_late_or_with_another_quality_are_received(
     known = np.isfinite(log.reference_heading)
     assert known.any() and not known[log.time < 3.9].any()
     assert b'said before anybody listened' in b''.join(_messages(tmp_path / 'a.mcap', '/note'))
-
-
-def ros_quality():
-    from gyro_calibration.ros.runner import SENSOR_QOS
-    return SENSOR_QOS
 
 
 def _messages(path, topic):

@@ -27,6 +27,7 @@ import pytest
 
 try:
     from diagnostic_msgs.msg import DiagnosticArray
+    from gyro_calibration.ros.runner import SENSOR_QOS
     from sensor_msgs.msg import Imu
 except ImportError:
     pass  # the fixture `ros` skips every test that needs them, and says why
@@ -68,7 +69,7 @@ class Heard:
         self.numbers, self.headings, self.variances, self.arrivals, self._wait_until = (
             [], [], [], [], wait_until)
         self.reports = ros.collect(DiagnosticArray, f'{namespace}diagnostics', 10)
-        ros.node.create_subscription(Imu, f'{namespace}imu/data', self._take, _quality())
+        ros.node.create_subscription(Imu, f'{namespace}imu/data', self._take, SENSOR_QOS)
 
     def _take(self, message):
         self.numbers.append(round((message.angular_velocity.z - FIRST) / STEP))
@@ -107,11 +108,6 @@ class Heard:
                        for text in (status.message,
                                     *(f'{pair.key}: {pair.value}' for pair in status.values)))
         self._wait_until(said, what=words)
-
-
-def _quality():
-    from gyro_calibration.ros.runner import SENSOR_QOS
-    return SENSOR_QOS
 
 
 @pytest.fixture
