@@ -286,6 +286,9 @@ def test_a_gyro_that_is_cut_off_in_a_frame_is_silent_and_stays_known():
 
 
 def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
+    world = World(5.0)
+    world.gyro('csv')
+    assert Reading(world, 'csv').connection.longest_gap == 0.0
     world = World(20.0)
     world.gyro('csv')
     world.at(8.0, world.unplug)
@@ -294,12 +297,6 @@ def test_a_pause_is_in_the_stamps_but_counts_as_no_loss():
     # tried at 8, 8.1, 8.3, 8.7, 9.5
     assert reading.connection.longest_gap == max(reading.steps) == pytest.approx(1.5, abs=0.2)
     assert reading.connection.counts().lost_samples == 0
-
-
-def test_without_a_gap_there_is_no_longest():
-    world = World(5.0)
-    world.gyro('csv')
-    assert Reading(world, 'csv').connection.longest_gap == 0.0
 
 
 def test_lost_samples_are_counted_from_the_sequence_and_left_out_of_the_stamps():

@@ -43,14 +43,12 @@ def test_a_mean_has_the_mean_time_of_its_samples():
     assert [mean.size for mean in [*complete, *rest]] == [10, 10, 5]
 
 
-def test_a_gap_makes_a_group_smaller_and_not_longer():
-    complete, rest = means(10, [*range(4), *range(50, 60)])
-    assert [mean.size for mean in [*complete, *rest]] == [4, 10]
-
-
-def test_stamps_that_are_set_back_end_a_group():
-    complete, rest = means(10, [100, 101, 50, 51])
-    assert [mean.size for mean in [*complete, *rest]] == [2, 2]
+@pytest.mark.parametrize('numbers, sizes', [([*range(4), *range(50, 60)], [4, 10]),
+                                            ([100, 101, 50, 51], [2, 2])],
+                         ids=['a gap', 'stamps that are set back'])
+def test_a_jump_of_the_stamps_ends_a_group(numbers, sizes):
+    complete, rest = means(10, numbers)
+    assert [mean.size for mean in [*complete, *rest]] == sizes
 
 
 def test_a_group_that_has_begun_is_given_once():
