@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 import errno
 import fcntl
+import hashlib
 import os
 from pathlib import Path
 import re
@@ -118,6 +119,16 @@ def opened(path: str | Path, pipes: bool = False) -> BinaryIO:
     except BaseException:
         os.close(handle)
         raise
+
+
+def digest(*paths: str | Path) -> str:
+    """Return the SHA-256 of the content of regular files, one after the other."""
+    found = hashlib.sha256()
+    for path in paths:
+        with opened(path) as file:
+            while piece := file.read(1 << 20):
+                found.update(piece)
+    return found.hexdigest()
 
 
 def _refuse_kind(path: str | Path, mode: int, pipes: bool = False) -> None:

@@ -30,7 +30,7 @@ from gyro_calibration.diagnosis.gates import rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
-from gyro_calibration.files import InputError, opened, plain, reason, write_atomically
+from gyro_calibration.files import digest, InputError, plain, reason, write_atomically
 from gyro_calibration.fleet.slow_effects import rest_bias, slow_effects
 from gyro_calibration.fleet.table import described, Entry
 from gyro_calibration.logs.log import DataRefused, Log, read_log
@@ -97,7 +97,7 @@ def done(task: Task) -> dict[str, Any]:
     """
     try:
         entry = described(task.entry, task.named).with_missing({'type': task.usual_type})
-        content = _digest(task.entry.log)
+        content = digest(*files_of(task.entry.log))
         key = _key(task, entry, content)
         kept = _kept(task.record, key)
         if kept is not None:
@@ -122,15 +122,6 @@ def _why(error: Exception, path: str) -> str:
     if isinstance(error, InputError):
         return str(error).removeprefix(f'{plain(path)}: ')
     return reason(error)
-
-
-def _digest(path: str) -> str:
-    found = hashlib.sha256()
-    for each in files_of(path):
-        with opened(each) as file:
-            while piece := file.read(1 << 20):
-                found.update(piece)
-    return found.hexdigest()
 
 
 def _key(task: Task, entry: Entry, content: str) -> str:
