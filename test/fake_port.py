@@ -130,7 +130,7 @@ class _Port:
             self._world.sleep(STEP)
         if not self._world.plugged:
             self.close()
-            raise PortError(f'lost {self.path}: the device is gone')
+            raise PortError(f'lost {self.path}: the device was disconnected')
         data, self.data = self.data, b''
         return data
 

@@ -226,7 +226,7 @@ def test_the_policy_allows_a_recording_exactly_what_it_takes(ros, wait_until):
     node = RecorderNode([*_TOPICS.values(), 'odom'], False, print, context)
 
     def has_all():
-        node.look()
+        node.poll()
         return not node.missing and really(ros.node, node.get_name(), '/') == allowed('record')
     try:
         wait_until(has_all, what='all of it')

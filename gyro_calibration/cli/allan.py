@@ -58,8 +58,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser)
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
                         help='draw the chart, .png or .svg')
-    parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model that the '
-                        'figures are put in; default: a new one')
+    parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
+                        'noise figures to; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with these noise figures')
     return parser
@@ -83,8 +83,8 @@ def _allan(given: argparse.Namespace) -> Answer:
                                        noise_bounds=fit.noise_bounds))
     written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
     if given.out:
-        written.insert(0, 'The model gets the flicker as its bias instability, '
-                       'for it adds N and K to it.')
+        written.insert(0, 'The bias instability of the model is that of the fit of all parts, '
+                       'since the model adds N and K to it.')
     return Answer('\n'.join([*lines(record, chart, fit), *written]),
                   _data(given, record, chart, fit))
 
@@ -92,8 +92,7 @@ def _allan(given: argparse.Namespace) -> Answer:
 def _check(given: argparse.Namespace) -> None:
     """Refuse what cannot work before the work is done."""
     if given.model and not given.out:
-        raise UsageError('--model says which model the figures are put in; '
-                         'say with --out where to write it')
+        raise UsageError('--model was given without --out; give the file to write with --out')
 
 
 def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
@@ -101,9 +100,9 @@ def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
     lost = int(np.isnan(record.rate).sum())
     return [f'{len(record.rate) - lost} samples, one every {1000 * record.interval:.5g} ms, '
             f'{len(record.rate) * record.interval:.5g} s at rest.', *record.remarks,
-            _said_of_floor(chart, fit),
+            _floor_line(chart, fit),
             *(_line(symbol, figure) for symbol, figure in fit.figures.items()),
-            _said_of_fit(fit)]
+            _fit_line(fit)]
 
 
 def _line(symbol: str, figure: Figure) -> str:
@@ -133,7 +132,7 @@ def _words(figure: Figure) -> str:
     return figure.part.name.replace('_', ' ')
 
 
-def _said_of_floor(chart: AllanChart, fit: NoiseFit) -> str:
+def _floor_line(chart: AllanChart, fit: NoiseFit) -> str:
     unit, factor = UNITS['B']
     floor = chart.floor
     value, lower, upper = floor.bias_instability
@@ -144,19 +143,19 @@ def _said_of_floor(chart: AllanChart, fit: NoiseFit) -> str:
                 f'to {upper * factor:.4g} ({value:.4g} rad/s): {where}.')
     return (f'Bias instability B: below {upper * factor:.4g} {unit} ({upper:.3g} rad/s): {where}, '
             'and the deviation still falls at the end of the chart; '
-            'record longer to reach the floor.')
+            'record longer to reach its minimum.')
 
 
-def _said_of_fit(fit: NoiseFit) -> str:
+def _fit_line(fit: NoiseFit) -> str:
     text = f'The figures describe averaging times from {fit.shortest:.3g} to {fit.longest:.4g} s'
     if fit.shortest > fit.chart.time[0]:
-        text += '; shorter ones are bent by the filters of the gyro, or by what it picks up'
+        text += '; shorter ones are affected by filters or interference in the gyro'
     if fit.misfit:
         text += (f'; they leave up to {100 * fit.misfit:.0f} % of the Allan deviation '
-                 'unexplained, which the intervals allow for')
+                 'unexplained, which the intervals include')
     if fit.alternatives:
         others = ' or '.join(' + '.join(each) for each in fit.alternatives)
-        text += f'; {others} would describe them nearly as well, and a longer record would tell'
+        text += f'; {others} fit nearly as well, and a longer record would distinguish them'
     return f'{text}.'
 
 

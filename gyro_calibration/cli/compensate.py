@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb compensate: rates, and for samples in time the heading, beside those of a log."""
+"""The verb compensate: add compensated rates, and for samples in time the heading, to a log."""
 
 from __future__ import annotations
 
@@ -57,22 +57,23 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--model', required=True, metavar='MODEL.yaml')
     parser.add_argument('--out', required=True, metavar='OUT.csv', help='.csv or .csv.gz')
     parser.add_argument('--threshold', type=not_negative, default=0.0, metavar='DPS',
-                        help='a robot that turns slower stands, as 0.3 in the node; '
+                        help='rates below it are set to 0, as below 0.3 in the node; '
                         'default: 0, off')
     parser.add_argument('--window', type=not_negative, default=0.2, metavar='S',
-                        help='of the threshold filter; 0 is single samples')
-    parser.add_argument('--rest', action='store_true', help='look for rests, as the node does: '
-                        'the heading stands there, and the bias is learned')
+                        help='averaging time of the threshold filter; 0: single samples; '
+                        'default: %(default)g')
+    parser.add_argument('--rest', action='store_true', help='detect standstill, as the node does: '
+                        'the heading is held there, and the bias is estimated')
     parser.add_argument('--hindsight', action='store_true',
-                        help='alike, and let all that came later speak too')
+                        help='as --rest, and smooth the heading by all later samples')
     return parser
 
 
 def _compensate(given: argparse.Namespace) -> Answer:
     model, found = read_model(given.model), _Found()
     if (given.rest or given.hindsight) and (given.threshold or not model.noise.angle_random_walk):
-        raise UsageError('--rest and --hindsight go without --threshold, and with an angle '
-                         'random walk in the model, which allan finds')
+        raise UsageError('--rest and --hindsight need no --threshold and a model with an angle '
+                         'random walk; run allan to add it to the model')
     write_log_blocks(given.out, _compensated(given, model, found))
     return _answer(given, model, found)
 
@@ -80,16 +81,16 @@ def _compensate(given: argparse.Namespace) -> Answer:
 #: Other inputs of effects: quantity of a log -> channel, and the sentence where the log lacks it.
 _WORDS = {
     'specific_force': ('specific_force',
-                       'The log holds no specific force: it was taken for zero.'),
-    'supply': ('supply', 'The log holds no supply voltage: its effect was left out.'),
-    'reference_heading': ('heading', 'The log holds no reference heading: '
-                          'the one found here was taken, from zero on.'),
+                       'The log has no specific force: 0 m/s² was assumed.'),
+    'supply': ('supply', 'The log has no supply voltage: its effect was left out.'),
+    'reference_heading': ('heading', 'The log has no reference heading: '
+                          'the compensated heading was used, from 0 on.'),
 }
 
 
 @dataclass
 class _Found:
-    """What there was in the blocks so far; heading and deviation are the last ones, rad."""
+    """Counts over the blocks so far; heading and deviation are the last ones, rad."""
 
     rows: int = 0
     rows_without_output: int = 0
@@ -140,7 +141,7 @@ def _compensated(given: argparse.Namespace, model: GyroModel,
         found.add(piece)
         yield piece.log, piece.rows()
     if found.rows == found.rows_without_output:
-        raise DataRefused(f'{given.log}: no output of the gyro is a number; record again')
+        raise DataRefused(f'{given.log}: no gyro output is finite; record again')
     if found.rows == found.rows_without_output + found.refused_samples:
         raise DataRefused(f'{given.log}: {none_plausible(model)}')
 
@@ -165,9 +166,8 @@ def _refuse_infinite(file: str, piece: Piece) -> None:
             output = float(np.asarray(piece.log.output)[piece.known][row])
             at = '' if piece.log.time is None else f' at {piece.log.time[piece.known][row]:g} s'
             raise DataRefused(
-                f'{file}: {name} is no finite number from an output of {output:g} rad/s{at} '
-                'on; remove the sample if no gyro says that, or see whether columns, units and '
-                'the model are right')
+                f'{file}: {name} is not finite for an output of {output:g} rad/s{at}; '
+                'remove the sample, or check columns, units and the model')
 
 
 def pieces(logs: Iterable[Log], model: GyroModel, threshold: Threshold,
@@ -211,8 +211,8 @@ def followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Iterator
 def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
     known = np.abs(np.asarray(log.output)) <= model.rate_limit
     if log.time is None or known.sum() < 2:
-        raise DataRefused(f'{name}: rests show in samples over time; '
-                          'give a log with time_s, or say --rate')
+        raise DataRefused(f'{name}: standstill detection needs two or more samples with a time; '
+                          'give a log with time_s, or --rate')
     if log.temperature is not None and not plausible(model, log).any():
         raise DataRefused(f'{name}: {none_plausible(model)}')
     rows = rows_of(log, known)
@@ -225,7 +225,8 @@ def _followed(log: Log, model: GyroModel, hindsight: bool, name: str) -> Piece:
     heading, variance, rate, rate_variance, resting, corrected, clipped, beyond = found.T
     if hindsight:
         if not np.isfinite(found).all():
-            raise DataRefused(f'{name}: the variance of the heading is beyond all numbers')
+            raise DataRefused(f'{name}: the variance of the heading is not finite; '
+                              'check columns, units and the model')
         heading, variance, resting = in_hindsight(estimator.tracker, time, corrected)
     return Piece(log, known, {
         'rate_rad_s': rate, 'heading_rad': heading, 'heading_std_rad': np.sqrt(variance),
@@ -241,8 +242,7 @@ def _begun(model: GyroModel, log: Log, keep: bool) -> tuple[HeadingEstimator, fl
     """
     Return what follows the log, and the date of time 0, s since 1970.
 
-    Stamps that are no dates do not tell how old a calibration is: it is taken for one that was
-    made just before.
+    Where stamps are no dates, the age of a calibration is unknown, and 0 is assumed.
 
     """
     assert log.time is not None
@@ -286,7 +286,7 @@ _TRUE_TIME, _MOVED = 'true_time', ('rate_rad_s', 'heading_rad', 'heading_std_rad
 
 
 def _on_stamps(pieces: Iterator[Piece]) -> Iterator[Piece]:
-    """Bring columns of moved stamps back to the stamps of the rows; the blocks beside help."""
+    """Interpolate columns of moved stamps at the stamps of the rows, with neighbouring blocks."""
     before: Piece | None = None
     here = next(pieces, None)
     while here is not None:
@@ -320,13 +320,13 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
     heading, deviation, _ = (data.pop(name) for name in ('heading', 'deviation', 'unknown'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
-        # A deviation of zero only shows that the model says nothing of noise and covariance.
+        # A deviation of zero only shows that the model has neither noise nor covariance.
         sure = deviation if deviation > 0.0 else None
         data.update(heading_rad=heading, heading_std_rad=sure)
         known = '' if sure is None else f' +- {sure / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
     if not found.temperature_known:
-        lines.append('The log holds no temperature: '
+        lines.append('The log has no temperature: '
                      'the model was used at its reference temperature.')
     lines += [words for quantity, (channel, words) in _WORDS.items()
               if quantity in found.unknown and model.looks_at(channel)]
@@ -335,15 +335,15 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
     for name, words in (
             ('rows_without_output',
              'rows have no output of the gyro; the heading is integrated across them.'),
-            ('refused_samples', 'rows are not used: no such gyro reports that rate or '
-             'temperature; they count as lost.'),
-            ('lost_samples', 'samples are lost; the heading goes on over the true intervals, '
-             'and the deviation allows for it.'),
+            ('refused_samples', 'rows have an implausible rate or temperature and are not used; '
+             'they count as lost.'),
+            ('lost_samples', 'samples are lost; the heading is integrated over the gaps, and its '
+             'standard deviation includes them.'),
             ('temperature_clipped',
              'rows are outside the calibrated temperatures; the correction is extrapolated, and '
-             'the standard deviation grows.'),
+             'the standard deviation increases.'),
             ('beyond_range', 'rows are beyond the calibrated rates; the correction is '
-             'extrapolated, or held where no rate explains the output.')):
+             'extrapolated, or held where the model has no rate for the output.')):
         if data[name]:
             lines.append(f'{data[name]} {words}')
     return Answer('\n'.join(lines), data)

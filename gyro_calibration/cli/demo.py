@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb demo: the whole graph on this machine."""
+"""The verb demo: all nodes on this machine, with an emulated gyro."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'demo', _demo, 'emulated gyro, driver, compensation, self-calibration '
                   'and a drive, on this machine', '--out demo')
     parser.add_argument('--out', default='demo', metavar='DIR',
-                        help='where picture, table and log go; default: %(default)s')
-    parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
+                        help='folder for picture, table and log; default: %(default)s')
+    parser.add_argument('--seed', type=whole, help='seed of the noise; default: random')
     return parser
 
 

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-The demonstration: the whole graph on this machine, with a robot that exists in this file alone.
+The demonstration: all nodes on this machine, with a simulated robot.
 
 The robot follows ``cmd_vel``. Its gyro is emulated on a pseudo-terminal and reports the true
 motion of the robot; driver and compensation run as processes of their own, as on a robot. The
@@ -54,7 +54,7 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 
 PROTOCOL = 'kvh_dsp3000'
-NAMESPACE = 'gyro_calibration_demo'  # so that no robot hears these commands
+NAMESPACE = 'gyro_calibration_demo'  # keeps the commands from robots
 INTERVAL = 0.01  # s between samples
 ACCELERATION = 3.0  # rad/s², what the robot's wheels can do
 ATTEMPTS = 3  # to calibrate
@@ -71,7 +71,7 @@ class Demonstration:
 
 
 class Refused(OSError):
-    """A service says no."""
+    """A service refused a call."""
 
 
 @dataclass
@@ -94,7 +94,7 @@ class Robot:
     commands: deque[tuple[float, float]] = field(default_factory=deque)
     truth: list[tuple[float, float]] = field(default_factory=list)
 
-    def obey(self, message: Twist) -> None:
+    def set_rate(self, message: Twist) -> None:
         """Turn from now on as commanded."""
         self.commands.append((time.monotonic(), message.angular.z))
 
@@ -116,7 +116,7 @@ class Robot:
 
 class Client:
     """
-    What hears and calls the nodes, spinning in a thread of its own.
+    Subscribes to the nodes and calls their services, spinning in a thread of its own.
 
     Attributes
     ----------
@@ -126,13 +126,13 @@ class Client:
     """
 
     def __init__(self, robot: Robot):
-        """Subscribe; the robot hears ``cmd_vel`` from now on."""
+        """Subscribe; the robot receives ``cmd_vel`` from now on."""
         self.raw: list[tuple[float, float]] = []
         self.headings: list[tuple[float, float]] = []
         self._node = rclpy.create_node('demonstration', namespace=NAMESPACE)
-        self._node.create_subscription(Imu, 'imu/data_raw', self._hear_raw, SENSOR_QOS)
-        self._node.create_subscription(Imu, 'imu/data', self._hear_heading, SENSOR_QOS)
-        self._node.create_subscription(Twist, 'cmd_vel', robot.obey, 10)
+        self._node.create_subscription(Imu, 'imu/data_raw', self._add_raw, SENSOR_QOS)
+        self._node.create_subscription(Imu, 'imu/data', self._add_heading, SENSOR_QOS)
+        self._node.create_subscription(Twist, 'cmd_vel', robot.set_rate, 10)
         self._velocity = self._node.create_publisher(Twist, 'cmd_vel', 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -140,10 +140,10 @@ class Client:
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
 
-    def _hear_raw(self, message: Imu) -> None:
+    def _add_raw(self, message: Imu) -> None:
         self.raw.append((_seconds(message), message.angular_velocity.z))
 
-    def _hear_heading(self, message: Imu) -> None:
+    def _add_heading(self, message: Imu) -> None:
         self.headings.append((_seconds(message), _yaw(message)))
 
     def _spin(self) -> None:
@@ -341,7 +341,7 @@ def _evaluate(out: Path, robot: Robot, client: Client, begin: float, seed: int) 
 
 
 def _table(errors: dict[str, Array]) -> str:
-    """Return the table as Markdown, beside that of Hong and Park."""
+    """Return the table as Markdown, with the values of Hong and Park."""
     lines = ['| heading | mean error | standard deviation | off pure integration '
              '| Hong and Park, table 1 |', '|---|---|---|---|---|']
     pure, published = errors['pure integration'].mean(), TABLE_1['pure integration'][0]

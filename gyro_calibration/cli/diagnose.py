@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb diagnose: what a simulation gets wrong, why, the extended model, and what it wins."""
+"""The verb diagnose: the error of a simulation, its cause, the extended model and the gain."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ _SHARES = {'gates': 5, 'data quality': 4, 'replay': 1, 'search': 70, 'sets': 1, 
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'diagnose', _diagnose, 'say what a simulation gets wrong, name the '
+    parser = verb(verbs, 'diagnose', _diagnose, 'measure the error of a simulation, name the '
                   'cause, extend the model, measure the gain',
                   'drive.csv --model gyro.yaml --out diagnosis')
     add_log(parser, nargs='+')
     parser.add_argument('--model', metavar='MODEL.yaml', help='of the simulation; default: an '
                         'ideal gyro with the bias and scale factor error that fit the logs best')
     parser.add_argument('--reference-kind', choices=KINDS,
-                        help='what the reference is; default: as the log shows it')
+                        help='kind of the reference; default: detected from the log')
     parser.add_argument('--out', metavar='DIR', help='folder for diagnosis.json, report.html and '
                         'model.yaml, the extended model')
     parser.add_argument('--seed', type=whole, default=0, metavar='N',
-                        help='of what is drawn to learn what chance shows; default: 0')
+                        help='seed of the random draws of significance tests; default: 0')
     return parser
 
 
@@ -81,12 +81,12 @@ def _read(given: argparse.Namespace, path: str) -> Log:
 
 
 def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | None) -> Diagnosis:
-    """Diagnose logs in time, or a rate table, and say what the extended model comes from."""
+    """Diagnose logs in time, or a rate table; the extended model gets its origin."""
     generator = np.random.default_rng(given.seed)
     if any(log.time is None for log in logs):
         if len(logs) > 1:
-            raise UsageError(f'{len(logs)} logs, and one without time_s; give rate tables one by '
-                             'one, or say with --rate how samples came')
+            raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate '
+                             'table alone, or give the sample rate in Hz with --rate')
         found = diagnose_table(logs[0], None if model is None else calibrated(model))
     else:
         with tqdm(total=sum(_SHARES.values()), bar_format='{desc:12} |{bar}| {percentage:.0f} %',
@@ -115,8 +115,8 @@ def _written(folder: str, found: Diagnosis) -> list[str]:
                'report.html': report(found), 'model.yaml': model_text(found.model)}
     for name in content:
         if (Path(folder) / name).is_dir():
-            raise IsADirectoryError(f'{Path(folder) / name} is a folder, where a file is to be '
-                                    'written; move it away')
+            raise IsADirectoryError(f'{Path(folder) / name} is a folder, but must be a file; '
+                                    'move it away')
     for name, text in content.items():
         write_atomically(Path(folder) / name, text.encode())
     return [f'Written to {folder}: {", ".join(content)}.']

@@ -41,27 +41,28 @@ import numpy as np
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
-    parser = verb(verbs, 'emulate', _emulate, 'be a gyro on a pseudo-terminal, from a model and '
-                  'a motion or from a log; prints its path',
+    parser = verb(verbs, 'emulate', _emulate, 'emulate a gyro on a pseudo-terminal, from a model '
+                  'and a motion or from a log; prints its path',
                   '--protocol kvh_dsp3000 --model model.yaml --motion robot --link /tmp/gyro')
     parser.add_argument('--protocol', required=True, metavar='NAME',
                         help=f'one of {", ".join(PROTOCOLS)}')
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument('--log', metavar='LOG', help='send a recording')
-    source.add_argument('--model', metavar='MODEL.yaml', help='send what a simulated gyro says')
+    source.add_argument('--model', metavar='MODEL.yaml', help='send samples of a simulated gyro')
     add_motion(parser, default='rest')
-    parser.add_argument('--rate', type=positive, metavar='HZ', help='the log was taken at this '
-                        'rate; for logs without a usable time_s')
+    parser.add_argument('--rate', type=positive, metavar='HZ',
+                        help='sample rate, for logs without a usable time_s')
     parser.add_argument('--sensitivity', type=positive, metavar='DPS',
-                        help='deg/s a count of the wire format; default: its own')
+                        help='deg/s per count of the wire format; default: that of the protocol')
     parser.add_argument('--columns', default='time_s,gyro_dps,temperature_degc',
-                        help='of the protocol csv; default: %(default)s')
+                        help='columns of the protocol csv; default: %(default)s')
     parser.add_argument('--link', metavar='PATH',
-                        help='a link to the pseudo-terminal, whose own name changes')
-    parser.add_argument('--speed', type=positive, default=1.0, help='times real time; default: 1')
+                        help='symbolic link to the pseudo-terminal, whose own name varies')
+    parser.add_argument('--speed', type=positive, default=1.0,
+                        help='factor to real time; default: 1')
     parser.add_argument('--wait', action='store_true',
-                        help='begin when a program has opened the port')
-    parser.add_argument('--repeat', action='store_true', help='begin again at the end')
+                        help='start when a program has opened the port')
+    parser.add_argument('--repeat', action='store_true', help='start again at the end')
     add_topics(parser)
     _add_line(parser)
     parser.set_defaults(**AS_IT_IS)
@@ -70,29 +71,30 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 def _add_line(parser: argparse.ArgumentParser) -> None:
     line = parser.add_argument_group(
-        'a bad line', 'P is a probability from 0 to 1; --seed says what it strikes')
+        'faults of the line', 'P is a probability from 0 to 1; --seed selects what is hit')
     line.add_argument('--lose-samples', type=float, default=0.0, metavar='P',
                       help='a sample is never sent')
     line.add_argument('--invalid-samples', type=float, default=0.0, metavar='P',
-                      help='the gyro does not stand by a sample')
+                      help='the gyro marks a sample as invalid')
     line.add_argument('--lose', type=float, default=0.0, metavar='P', help='a byte is lost')
-    line.add_argument('--double', type=float, default=0.0, metavar='P', help='a byte comes twice')
+    line.add_argument('--double', type=float, default=0.0, metavar='P',
+                      help='a byte is sent twice')
     line.add_argument('--flip', type=float, default=0.0, metavar='P',
                       help='a bit of a byte is flipped')
     line.add_argument('--burst', type=float, default=0.0, metavar='MS',
-                      help='bytes come together each so many ms; USB adapters: 16')
+                      help='interval at which bytes are delivered, ms; USB adapters: 16')
     line.add_argument('--piece', type=int, default=0, metavar='BYTES',
-                      help='bytes come in pieces of so many, at the pace of the line')
+                      help='bytes delivered at once, at the speed of the line')
 
 
 def _emulate(given: argparse.Namespace) -> None:
-    """Print the path at once, since the answer of this verb is what goes on until it ends."""
+    """Print the path at once, since this verb sends until it ends."""
     (protocol, settings), faults = _wire(given), _faults(given)
     log = read(given) if given.log else simulated(given)[0]
     time, output = time_of(given, log), output_of(given, log)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
-                          'have an output; send a log with two or more')
+                          'have an output; give a log with two or more')
     samples = _samples(time, output, log.temperature, given.repeat)
     generator = np.random.default_rng(secrets.randbits(32) if given.seed is None else given.seed)
     emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults,

@@ -30,11 +30,11 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='sdf: noise of an <imu> of Gazebo; isaac: noise of an observation '
                         'of Isaac Lab; mujoco: a <gyro> sensor of MuJoCo')
     parser.add_argument('--sample-rate', type=positive, default=100.0, metavar='HZ',
-                        help='of the simulated gyro; default: 100')
+                        help='sample rate of the simulated gyro; default: 100')
     parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
     parser.add_argument('--span', type=positive, default=3600.0, metavar='S',
-                        help='the bias wanders as modelled up to this time; default: 3600')
+                        help='longest time over which the bias drifts as modelled; default: 3600')
     parser.add_argument('--out', metavar='FILE', help='default: the text is printed')
     return parser
 
@@ -42,7 +42,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _export(given: argparse.Namespace) -> Answer:
     model = read_model(given.model)
     if given.span * given.sample_rate < 2.0:
-        raise UsageError(f'--span {given.span:g} is shorter than two samples; give a longer one')
+        raise UsageError(f'--span {given.span:g} is shorter than two samples; give at least '
+                         f'{2.0 / given.sample_rate:g} s')
     temperature = (model.reference_temperature if given.temperature is None
                    else given.temperature)
     held, error = figures(model, given.sample_rate, temperature, given.span)
@@ -54,8 +55,8 @@ def _export(given: argparse.Namespace) -> Answer:
     write_atomically(given.out, text.encode())
     lines = [f'written to {given.out}.']
     if held.wander.density and given.to == 'sdf':
-        lines.append('One Gauss-Markov process stands for the wander of the bias: the Allan '
-                     f'deviation is right to {100.0 * error:.0f} % up to {given.span:g} s.')
+        lines.append('One Gauss-Markov process replaces the drift of the bias: the Allan '
+                     f'deviation is accurate to {100.0 * error:.0f} % up to {given.span:g} s.')
     if left_out:
         lines += [f'{given.to} does not hold:', *(f'  {each}' for each in left_out)]
     return Answer('\n'.join(lines), data)

@@ -66,22 +66,22 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser, nargs='+')
     parser.add_argument('--out', metavar='MODEL.yaml', help='write the model')
     parser.add_argument('--method', choices=METHODS, help='dwells: means at constant rates; '
-                        'likelihood: the reference heading itself; '
-                        'course: a course over ground, as of satellites; '
+                        'likelihood: maximum likelihood from the reference heading; '
+                        'course: a course over ground, as from satellite navigation; '
                         'rate: the rate of the reference heading, sample by sample. '
-                        'Default: what the log holds')
+                        'Default: by the columns of the log')
     what = parser.add_mutually_exclusive_group()
-    what.add_argument('--effects', type=_effects, metavar='NAME,...', help='fit these of '
+    what.add_argument('--effects', type=_effects, metavar='NAME,...', help='effects to fit, of '
                       f'{", ".join(STEADY)}; default: those that the data support')
     what.add_argument('--polynomial', type=_orders, nargs='?', const='3,2', metavar='P,Q',
                       help='fit the polynomial over output and temperature of these orders '
                       'instead; default: 3,2')
-    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='what the gyro is; '
-                        'decides where effects look alike, and what is likely where a course over '
-                        'ground leaves it open (default there: mems)')
+    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
+                        'selects between effects that the data do not distinguish, and the prior '
+                        'for a course over ground (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
-                        help='of the gyro, kept in the model')
-    parser.add_argument('--serial-number', metavar='TEXT', help='of the gyro, kept in the model')
+                        help='name of the gyro, stored in the model')
+    parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
                         'matrix C of Ojeda et al., in deg/s and degC')
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
@@ -94,7 +94,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _effects(text: str) -> list[Effect]:
     unknown = [name for name in text.split(',') if name not in STEADY]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is no effect that fit knows; '
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r} is an unknown effect; '
                                          f'choose from {", ".join(STEADY)}')
     return [STEADY[name] for name in dict.fromkeys(text.split(','))]
 
@@ -124,7 +124,7 @@ def _read(given: argparse.Namespace) -> tuple[str, Log]:
 
 
 def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
-    """Return the method, given or by the logs; '' lets the reference heading decide."""
+    """Return the method, given or by the logs; '' selects it by the reference heading."""
     if given.method:
         return str(given.method)
     chosen = ({effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'}
@@ -135,7 +135,7 @@ def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
 
 
 def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
-    """Return the model with what it comes from, and write it where that is wanted."""
+    """Return the model with its origin, and write it where --out is given."""
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
     model = replace(model, gyro={name: value for name, value in identity.items() if value},
@@ -170,8 +170,8 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     lines = [*dwell_lines(fit), '', *value_lines(model), '', *quality_lines(fit), '',
              *bin_lines(fit), *choice_lines(selection)]
     if effects and given.technology:
-        lines.append(f'--technology {given.technology} is kept in the model; it chose nothing, '
-                     'since the effects were given.')
+        lines.append(f'--technology {given.technology} is stored in the model; it had no '
+                     'influence, since the effects were given.')
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
     return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
@@ -182,11 +182,11 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
 def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if len(logs) > 1:
         raise UsageError(f'--method {given.method or "likelihood"} takes one log; '
-                         'give the logs one by one, or use --method dwells')
+                         'give one log, or use --method dwells')
     if (_names(given.effects) - {'bias', 'scale_factor_error'} or given.polynomial
             or given.surface or given.matrix):
-        raise UsageError('a reference heading gives bias and scale_factor_error; for other '
-                         'effects, --matrix and --surface use --method dwells')
+        raise UsageError('a reference heading determines bias and scale_factor_error only; for '
+                         'other effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
     found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)

@@ -28,8 +28,8 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import POLYNOMIAL
 import numpy as np
 
-#: A heading that is further off after calibration, rad, is worth a word.
-_MUCH_LEFT = 5.0 * DEGREE
+#: A larger heading error after calibration gives a warning, rad.
+_LARGE_ERROR = 5.0 * DEGREE
 #: Lines for people are not longer.
 _WIDTH = 120
 #: What people read instead of the unit of the file, and the factor to it.
@@ -41,7 +41,7 @@ _UNITS = {'rad/s': ('deg/s', 1 / DEGREE), 'rad/s/K': ('deg/s/K', 1 / DEGREE),
 # as data
 
 def model_data(model: GyroModel) -> dict[str, Any]:
-    """Return what a model holds beside its values."""
+    """Return covariance, ranges and technology of a model."""
     return {'covariance': None if model.covariance is None else model.covariance.tolist(),
             'rate_range_rad_s': list(model.rate_range),
             'temperature_range_degc': [_finite(end) for end in model.temperature_range],
@@ -164,7 +164,7 @@ def value_lines(model: GyroModel) -> Iterator[str]:
 
 
 def dwell_lines(fit: Calibration) -> Iterator[str]:
-    """Say what was measured, and what of it was left out."""
+    """Give the dwells that were measured, and those that were not fitted."""
     table = fit.dwells
     slowest, fastest = (rate / DEGREE for rate in (table.rate.min(), table.rate.max()))
     temperatures = ('' if table.temperature is None else
@@ -181,17 +181,17 @@ def dwell_lines(fit: Calibration) -> Iterator[str]:
 
 
 def quality_lines(fit: Calibration) -> Iterator[str]:
-    """Say how large the errors are, and what to mistrust."""
+    """Give the size of the errors, and warnings."""
     scatter, several = fit.scatter, len(np.unique(fit.dwells.sweep)) >= FEWEST_SWEEPS
     part = 'sweeps' if several else 'blocks of time'
     yield (f'Error {fit.before_rms / DEGREE:.4f} deg/s rms before, '
            f'{fit.residual_rms / DEGREE:.4f} after; '
-           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} that were left out.'
+           + (f'{fit.left_out_rms / DEGREE:.4f} in {part} left out of the fit.'
               if math.isfinite(fit.left_out_rms)
-              else f'some values show in one of the {part} only, which cannot be left out.'))
+              else f'no cross-validation, since some values depend on one of the {part} only.'))
     wander = (f'sweeps by {scatter.sweep_bias / DEGREE:.4f} deg/s '
               f'and {100.0 * scatter.sweep_scale:.3f} %' if several
-              else f'how sweeps scatter takes at least {FEWEST_SWEEPS} of them')
+              else f'the scatter of sweeps needs at least {FEWEST_SWEEPS} sweeps')
     yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s '
                    f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
                    f'Condition number {fit.condition:.1f}.')
@@ -201,13 +201,14 @@ def quality_lines(fit: Calibration) -> Iterator[str]:
 def _warnings(fit: Calibration) -> Iterator[str]:
     excess = math.sqrt(fit.misfit / fit.freedom) if fit.freedom else 1.0
     if excess > 1.2:
-        yield (f'These effects leave {excess:.1f} times the scatter of the dwells about a smooth '
-               'surface: something is missing. The intervals are widened by that.')
+        yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
+               'surface: the model lacks an effect. The intervals are widened by this factor.')
     if fit.folded_beyond is not None:
-        yield (f'From {fit.folded_beyond / DEGREE:.0f} deg/s on the output does not grow with the '
-               'rate, so that an output has two rates there: do not use the model beyond it.')
+        yield (f'Above {fit.folded_beyond / DEGREE:.0f} deg/s the modelled output does not '
+               'increase with the rate, so one output has two rates: do not use the model there.')
     if not fit.freedom:
-        yield 'There are as many values as dwells, so nothing says how sure they are: add dwells.'
+        yield ('There are as many values as dwells, so their standard deviations are unknown: '
+               'add dwells.')
 
 
 def bin_lines(fit: Calibration) -> Iterator[str]:
@@ -229,7 +230,7 @@ def bin_lines(fit: Calibration) -> Iterator[str]:
 
 
 def choice_lines(selection: Selection) -> Iterator[str]:
-    """Say why each effect was taken or not, and what looks alike."""
+    """Give the reason why each effect was taken or not, and effects not distinguished."""
     if selection.choices:
         yield f'{"left-out error, deg/s rms":26s} {"without":>8s} {"with":>8s} {"chance":>7s}'
     for choice in selection.choices:
@@ -245,8 +246,8 @@ def choice_lines(selection: Selection) -> Iterator[str]:
 def _alike(pair: Confounders) -> str:
     remedy = ('no rate up to three times the fastest' if pair.rate is None
               else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
-    return (f'These data hardly distinguish {pair.taken} from {pair.other}: {pair.reason}. '
-            f'It matters beyond the calibrated rates; {remedy} would distinguish them.')
+    return (f'These data do not distinguish {pair.taken} from {pair.other}: {pair.reason}. '
+            f'They differ beyond the calibrated rates; {remedy} would distinguish them.')
 
 
 def _shown(value: float, form: str) -> str:
@@ -261,14 +262,14 @@ def matrix_lines(matrix: list[list[float]]) -> Iterator[str]:
 
 
 def heading_lines(found: EncoderCalibration) -> Iterator[str]:
-    """Say how large the errors of the heading are."""
+    """Give the errors of the heading before and after calibration."""
     if math.isfinite(found.fit.time_offset):
         yield (f'The gyro lags the reference by {1000.0 * found.fit.time_offset:.1f} ms; '
-               'that is taken out.')
+               'the errors are corrected for it.')
     for name, residual in (('before', found.before), ('after', found.after)):
         yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '
                f'{residual.largest / DEGREE:.3f} deg at most.')
-    if found.after.rms > _MUCH_LEFT:
-        yield _wrapped('That is much. If the gyro is not linear, or changes with temperature, '
-                       '--method dwells finds the effects, provided that the log has stretches '
-                       'of steady rate.')
+    if found.after.rms > _LARGE_ERROR:
+        yield _wrapped(f'The error is above {_LARGE_ERROR / DEGREE:g} deg rms. If the gyro is '
+                       'nonlinear or depends on temperature, use --method dwells; it needs '
+                       'stretches of constant rate in the log.')

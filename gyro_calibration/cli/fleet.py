@@ -59,29 +59,29 @@ _GIGABYTE = 1e9
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'fleet', _fleet, 'calibrate and diagnose many logs of many gyros, and '
-                  'say what is of the unit, of the type, and of the reference',
+                  'attribute errors to the unit, the type and the reference',
                   'drives/ --out fleet')
     parser.add_argument('logs', metavar='LOGS', nargs='+', help='logs, folders or globs of them, '
                         'a list (.txt), or a table (.csv) with the columns log and any of unit, '
                         'type, drive, date, temperature')
-    parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; what '
-                        'was done is not done again')
-    parser.add_argument('--pattern', type=_pattern, metavar='TEXT', help='how the files are '
-                        "named, without their ends, such as 'rc_car_{drive}_unit{unit}'")
-    parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='of all logs whose type '
-                        'is not said')
+    parser.add_argument('--out', metavar='DIR', required=True, help='folder of the results; logs '
+                        'with a result there are not processed again')
+    parser.add_argument('--pattern', type=_pattern, metavar='TEXT', help='pattern of the file '
+                        "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
+    parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='type of the gyro in '
+                        'logs without a type')
     parser.add_argument('--technology', choices=list(PRIORS), default='mems',
-                        help='of the gyros; default: mems')
-    parser.add_argument('--no-diagnosis', action='store_true', help='calibrate alone, which is '
+                        help='technology of the gyros; default: mems')
+    parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
                         'faster')
-    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='of what a diagnosis '
-                        'draws; default: 0')
-    parser.add_argument('--workers', type=_count, metavar='N', help='processes; default: one a '
-                        'core')
-    parser.add_argument('--memory', type=positive, metavar='GB', help='that a worker may use; '
-                        "default: its share of this machine's")
-    parser.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster that does the '
-                        'work, such as tcp://host:8786; its workers see the same files')
+    parser.add_argument('--seed', type=whole, default=0, metavar='N', help='seed of the random '
+                        'draws of a diagnosis; default: 0')
+    parser.add_argument('--workers', type=_count, metavar='N', help='number of processes; '
+                        'default: one per core')
+    parser.add_argument('--memory', type=positive, metavar='GB', help='memory limit per worker; '
+                        'default: an equal share of this machine')
+    parser.add_argument('--scheduler', metavar='ADDRESS', help='address of a Dask cluster, such '
+                        'as tcp://host:8786; its workers need the same files')
     return parser
 
 
@@ -95,7 +95,7 @@ def _pattern(text: str) -> re.Pattern[str]:
 def _count(text: str) -> int:
     value = int(text)
     if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is below 1')
+        raise argparse.ArgumentTypeError(f'{text} is below 1; give an integer of 1 or more')
     return value
 
 
@@ -103,7 +103,7 @@ def _fleet(given: argparse.Namespace) -> Answer:
     listed = entries(given.logs, without=given.out)
     folder = os.path.abspath(given.out)
     if os.path.exists(folder) and not os.path.isdir(folder):
-        raise UsageError(f'{given.out}: is a file, where a folder is wanted; name another')
+        raise UsageError(f'{given.out}: is a file, but must be a folder; give another name')
     records = _records(given, [_task(given, entry, folder) for entry in listed])
     used = [each for each in records if each['status'] == DONE]
     if not used:
@@ -146,7 +146,7 @@ def _file_name(text: str) -> str:
 
 
 def _lines(found: TypeFound) -> Iterator[str]:
-    """Say what is known of a type, and of its units."""
+    """Give the estimates of a type, and of its units."""
     yield (f'{found.name or "One type"}: {len(found.records)} logs of {len(found.units)} units '
            f'on {len(found.drives)} drives.')
     for each in found.values.values():
@@ -163,7 +163,7 @@ def _lines(found: TypeFound) -> Iterator[str]:
 
 
 def _spread(each: Found, of: Component) -> str:
-    """Say a standard deviation; its upper bound where it may be zero."""
+    """Return a standard deviation in words; its upper bound where it may be zero."""
     if of.low > 0.0:
         return amount(of.estimate, each.unit, each.name)
     return f'less than {amount(of.high, each.unit, each.name)}'
@@ -209,7 +209,7 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
             yield given.workers or 64, create
     except ImportError:
         raise UsageError('--scheduler needs distributed, which is not installed; install '
-                         'gyro_calibration[fleet], or leave --scheduler out') from None
+                         'gyro_calibration[fleet] or omit --scheduler') from None
     except (OSError, ValueError) as error:
         raise UsageError(f'{given.scheduler}: no Dask scheduler answers there '
                          f'({type(error).__name__}); give its address, such as '
@@ -217,14 +217,14 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
 
 
 def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return records in which a double, and a log of nobody, is no evidence."""
+    """Return records in which a copy of a log, or a log without a unit, is no evidence."""
     seen: dict[str, str] = {}
     found = []
     for each in records:
         first = seen.setdefault(each['sha256'], each['log']) if each['sha256'] else each['log']
         why = ('' if each['status'] != DONE
-               else f'it holds the same as {plain(first)}' if first != each['log']
+               else f'it is a copy of {plain(first)}' if first != each['log']
                else '' if each['unit']
-               else 'it does not say of which unit it is; give a table, or --pattern')
+               else 'its unit is unknown; give a table or --pattern')
         found.append({**each, 'status': NO_EVIDENCE, 'reason': why} if why else each)
     return found

@@ -51,8 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(error)
         return NO_ANSWER
     except (ArithmeticError, np.linalg.LinAlgError, MemoryError) as error:
-        say(f'the numbers are too large or too far apart to be computed with ({reason(error)}); '
-            'see whether columns and units are right')
+        say(f'the values exceed the range of computation ({reason(error)}); '
+            'check columns and units')
         return NO_ANSWER
     except InputError as error:
         say(error)
@@ -82,8 +82,7 @@ def _refuse_empty(given: argparse.Namespace) -> None:
     """Refuse an option with an empty value, as from a shell variable that is not set."""
     for name, value in vars(given).items():
         if value == '' or isinstance(value, list) and '' in value:
-            raise UsageError(f'{name.replace("_", "-")} is empty; '
-                             'give it a value, or leave it out')
+            raise UsageError(f'{name.replace("_", "-")} is empty; give a value or omit it')
 
 
 def _show(text: str) -> None:
@@ -115,6 +114,6 @@ def _parser(called: str = '') -> argparse.ArgumentParser:
         of_verb.add_argument('--json', action='store_true',
                              help='print one JSON object and nothing else')
         of_verb.add_argument('--catalogue', action='append', default=[], metavar='FILE.py',
-                             help='Python file of your own, which is run, with EFFECTS, a list of '
-                             'effects that models and diagnoses then know')
+                             help='Python file, which is executed, with EFFECTS, a list of '
+                             'further effects for models and diagnoses')
     return parser

@@ -47,7 +47,7 @@ LIMITS = {
     'rest_s': ('rest', 1.0, 0.1, 100.0),
 }
 NEEDED = ('maximum_rate_dps', 'maximum_acceleration_dps2')
-#: Lengths for which the answer says what they would buy, s, and the longest that is planned.
+#: Lengths for which the answer predicts the accuracy, s, and the longest that is planned.
 LENGTHS, LONGEST = (20.0, 30.0, 60.0, 120.0), 300.0
 
 
@@ -56,7 +56,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'compute the motion that calibrates best within what a robot can do',
                   '--limits limits.yaml --seconds 20 --out profile.csv')
     parser.add_argument('--limits', required=True, metavar='LIMITS.yaml',
-                        help='what the robot can do; config/limits.yaml is an example')
+                        help='limits of the robot; config/limits.yaml is an example')
     parser.add_argument('--seconds', type=positive, default=20.0, metavar='S',
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
@@ -64,19 +64,19 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
                         help='draw the motion, .png or .svg')
     parser.add_argument('--model', metavar='MODEL.yaml',
-                        help='its noise figures; default: those of the Epson XV-3500')
+                        help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
-                        help='the later drive whose heading counts, one of '
-                        f'{", ".join(NAMED)} or a profile; default: robot')
+                        help='drive after the calibration whose heading error is predicted, one '
+                        f'of {", ".join(NAMED)} or a profile; default: robot')
     parser.add_argument('--drive', type=positive, metavar='S',
-                        help='length of that drive, begun again where it ends; default: its own')
-    parser.add_argument('--seed', type=whole, default=1, help='of the search; default: 1')
+                        help='length of that drive, which is repeated; default: its own length')
+    parser.add_argument('--seed', type=whole, default=1, help='seed of the search; default: 1')
     return parser
 
 
 def _plan(given: argparse.Namespace) -> Answer:
     if given.seconds > LONGEST:
-        raise UsageError(f'--seconds {given.seconds:g} is beyond {LONGEST:g}; '
+        raise UsageError(f'--seconds {given.seconds:g} is above {LONGEST:g}; '
                          'plan a shorter motion and repeat it')
     ability, noise = read_limits(given.limits), _noise(given)
 
@@ -119,18 +119,19 @@ def read_limits(path: str) -> Ability:
         content = read_settings(path)
     except (OSError, ValueError) as error:
         raise UsageError(f'{path}: cannot be read as YAML ({reason(error)}); '
-                         'begin with a copy of config/limits.yaml') from error
+                         'start with a copy of config/limits.yaml') from error
     try:
         given = checked('the file', content, dict.fromkeys(LIMITS, _limit))
     except WrongValue as error:
         raise UsageError(f'{path}: {error}; config/limits.yaml is an example') from None
     missing = [name for name in NEEDED if name not in given]
     if missing:
-        raise UsageError(f'{path}: {missing[0]} is missing; add what the robot can do')
+        raise UsageError(f'{path}: {missing[0]} is missing; add the limit of the robot')
     ability = Ability(**{LIMITS[name][0]: value * LIMITS[name][1]
                          for name, value in given.items()})
     if ability.slowest > ability.rate:
-        raise UsageError(f'{path}: minimum_rate_dps is above maximum_rate_dps; mend one of them')
+        raise UsageError(f'{path}: minimum_rate_dps is above maximum_rate_dps; correct one of '
+                         'them')
     return ability
 
 
@@ -142,7 +143,7 @@ def _limit(place: str, value: Any) -> float:
 def _noise(given: argparse.Namespace) -> Noise:
     noise = read_model(given.model).noise if given.model else XV3500.noise
     if not noise.angle_random_walk:
-        raise UsageError(f'{given.model}: gives no angle_random_walk; '
+        raise UsageError(f'{given.model}: has no angle_random_walk; '
                          'run allan on a log at rest, with --model and --out')
     return noise
 
@@ -171,12 +172,12 @@ def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
     lines += [_row(f'planned, {seconds:g} s', row) for seconds, row in more.items()]
     scale, less = _gains(rows)
     lines += [
-        '', f'Over one turn there and back, the scale is {scale:.2f} times as well known, '
-        f'and the heading errs by {100 * less:.2f} % less.',
-        f'White noise, integrated, makes {plan.prediction.floor / DEGREE:.3f} deg of the error, '
-        'whatever the calibration.',
-        'The bias is known as well as the time allows, whatever the motion: '
-        'only more seconds help.']
+        '', 'Compared with one turn there and back, the scale factor is '
+        f'{scale:.2f} times as accurate, and the mean heading error is {100 * less:.2f} % '
+        'smaller.',
+        f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
+        'independent of the calibration.',
+        'The accuracy of the bias depends on the length of the motion only.']
     written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
     return '\n'.join(lines + written)
 

@@ -210,8 +210,8 @@ def _mark(axes: Any, symbol: str, times: Array, line: Array) -> None:
     at = (int(np.argmin(np.abs(times - _READ_AT))) if symbol == 'N'
           else len(times) * (1 if symbol in 'BQ' else 2) // 3)
     # below what rises, above what falls: away from the sum
-    beside = (10, -14) if symbol in 'KR' else (0, 6)
-    axes.annotate(symbol, (times[at], line[at]), xytext=beside, textcoords='offset points',
+    offset = (10, -14) if symbol in 'KR' else (0, 6)
+    axes.annotate(symbol, (times[at], line[at]), xytext=offset, textcoords='offset points',
                   fontsize=13, weight='bold', ha='center')
 
 

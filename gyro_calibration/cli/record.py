@@ -48,7 +48,7 @@ Recorder = CsvRecorder | McapRecorder
 _TOPICS = {'gyro': 'imu/data_raw', 'temperature': 'imu/temperature'}
 _INCREMENTS = {'always': True, 'never': False, 'default': None}
 _LARGEST_BAUD = 4_000_000  # bit/s; no line of Linux is faster
-_PATIENCE = 5.0  # s; without a message, until it is said what is waited for
+_PATIENCE = 5.0  # s; without a message, until topics without a publisher are named
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -58,42 +58,42 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--out', required=True, metavar='FILE',
                         help=f'a new file, {", ".join(KINDS)}')
     parser.add_argument('--seconds', type=positive, metavar='N',
-                        help='end after so many seconds; default: when interrupted')
+                        help='duration, s; default: until interrupted')
     topics = parser.add_argument_group('from topics, with ROS 2')
     topics.add_argument('--topic', metavar='TOPIC',
-                        help=f'of the gyro; default: {_TOPICS["gyro"]}')
+                        help=f'topic of the gyro; default: {_TOPICS["gyro"]}')
     topics.add_argument('--temperature-topic', metavar='TOPIC',
                         help=f'default: {_TOPICS["temperature"]}')
     topics.add_argument('--reference-topic', metavar='TOPIC', action='append', default=[],
-                        help='of a reference; in .mcap several may be given')
-    topics.add_argument('--all', action='store_true', help='every topic that there is, into .mcap')
+                        help='topic of a reference; several are possible with .mcap')
+    topics.add_argument('--all', action='store_true', help='all topics, with .mcap')
     port = parser.add_argument_group('from the port, without ROS 2')
-    port.add_argument('--port', metavar='PORT', help='of the gyro, or a pattern such as '
+    port.add_argument('--port', metavar='PORT', help='port of the gyro, or a pattern such as '
                       '"/dev/serial/by-id/*A9003XYZ*"')
     port.add_argument('--protocol', metavar='NAME',
                       help=f'{", ".join(PROTOCOLS)}; default: {AUTO}, found by listening')
     port.add_argument('--baud', type=int, default=0, metavar='N',
                       help='bit/s; default: that of the protocol')
-    port.add_argument('--columns', metavar='NAME,...', help='of the protocol csv; '
+    port.add_argument('--columns', metavar='NAME,...', help='columns of the protocol csv; '
                       f'default: {",".join(Settings().columns)}')
     port.add_argument('--sensitivity', type=positive, metavar='DPS',
-                      help='deg/s a count; default: that of the protocol')
+                      help='deg/s per count; default: that of the protocol')
     port.add_argument('--axis', default='z', choices=['x', 'y', 'z'],
-                      help='of a gyro with three; default: z')
+                      help='axis of a gyro with three; default: z')
     port.add_argument('--invert', action='store_true', default=None,
-                      help='the gyro counts clockwise turns positive')
+                      help='the gyro reports clockwise turns as positive')
     port.add_argument('--increments', choices=list(_INCREMENTS), default='default',
                       help='whether the gyro sends angles, not rates; '
-                      'default: as the protocol says')
+                      'default: that of the protocol')
     port.add_argument('--sample-rate', type=positive, metavar='HZ',
-                      help='that the gyro is set to; default: that of the protocol')
+                      help='sample rate of the gyro; default: that of the protocol')
     return parser
 
 
 def _record(given: argparse.Namespace) -> Answer:
     if not given.out.endswith(KINDS):
-        raise UsageError(f'{given.out}: a recording ends in {", ".join(KINDS[:-1])} or '
-                         f'{KINDS[-1]}; name it so')
+        raise UsageError(f'{given.out} is no recording file; give a name that ends in '
+                         f'{", ".join(KINDS[:-1])} or {KINDS[-1]}')
     with _stopping(given.seconds) as stop:
         session = (_PortSession if given.port else _TopicSession)(given, stop)
         session.run()
@@ -142,8 +142,8 @@ def _prints_on_standard_error() -> Iterator[None]:
 class _Session:
     """The common part of both ways to record: the file, its pieces, the progress, the answer."""
 
-    #: What is waited for, for the sentence that nothing came.
-    waited_for = ''
+    #: The remedy where no sample came.
+    remedy = ''
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         self._given, self._stop = given, stop
@@ -172,8 +172,8 @@ class _Session:
             return (McapRecorder(self._given.out, notes) if self._is_mcap()
                     else CsvRecorder(self._given.out, notes, expected))
         except FileExistsError:
-            raise UsageError(f'{self._given.out}: is there already, and no recording is ever '
-                             'written over; name a new file') from None
+            raise UsageError(f'{self._given.out}: exists already, and recordings are never '
+                             'overwritten; give a new name') from None
 
     def _is_mcap(self) -> bool:
         return bool(self._given.out.endswith('.mcap'))
@@ -199,16 +199,16 @@ class _Session:
         shown.update(self.samples - shown.n)
 
     def answer(self) -> Answer:
-        """Say what was recorded."""
+        """Return what was recorded."""
         seconds = time.monotonic() - self._begin
         if self._full is not None:
-            written = (f'{self._recorder.size} bytes stay in {self._given.out}, '
-                       f'which can be read up to the last {PIECE:g} s')
+            written = (f'{self._recorder.size} bytes remain in {self._given.out}, '
+                       f'which is complete but for the last {PIECE:g} s')
             written = written if self._recorder.size else 'nothing was written'
             raise DataRefused(f'{self._full.strerror}; {written}: make room, then record again')
         if not self.samples:
-            raise DataRefused(f'nothing came within {seconds:.1f} s{self._why()}; '
-                              f'no file was written: {self.waited_for}')
+            raise DataRefused(f'no sample was received in {seconds:.1f} s{self._why()}; '
+                              f'no file was written: {self.remedy}')
         data = {'out': self._given.out, 'samples': self.samples, 'lost': self.lost,
                 'seconds': seconds, **self._details()}
         lines = [f'{self.samples} samples in {seconds:.1f} s, {self.lost} lost, '
@@ -223,15 +223,15 @@ class _Session:
 
     def _remarks(self) -> list[str]:
         missed = sorted(self._recorder.missed) if isinstance(self._recorder, CsvRecorder) else []
-        way_out = '.mcap keeps temperature, acceleration and reference whenever they come'
-        return ([f'{", ".join(missed)} came too late for a column of a log; {way_out}.']
+        return ([f'{", ".join(missed)} came too late for a column of a log; record into .mcap '
+                 'to keep temperature, acceleration and reference from any time on.']
                 if missed else [])
 
 
 class _PortSession(_Session):
     """Records what comes on a port."""
 
-    waited_for = 'check the port, the power and the wires of the gyro'
+    remedy = 'check the port, the power and the wires of the gyro'
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         if given.topic or given.temperature_topic or given.reference_topic or given.all:
@@ -247,11 +247,11 @@ class _PortSession(_Session):
                 sensitivity=sensitivity, invert=given.invert, axis=given.axis, columns=columns,
                 increments=_INCREMENTS[given.increments], sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
-                                          self._settings, on_change=self._tell)
+                                          self._settings, on_change=self._report)
         except ValueError as error:
             raise UsageError(str(error)) from None
         self._last_message = ''
-        # Fixed at the beginning: the stamps must not jump where somebody sets the clock.
+        # Fixed at the beginning: the stamps must not jump when the clock is set.
         self._since = time.time_ns() - round(steady() * NSEC_PER_SEC)
         super().__init__(given, stop)
 
@@ -264,7 +264,7 @@ class _PortSession(_Session):
         return self._connection.counts().lost_samples
 
     def _open(self) -> Recorder:
-        # Nobody knows before it comes whether a gyro says its temperature, and how often.
+        # Whether and how often a gyro sends its temperature is not known before.
         return self._create(self._about, ('temperature_degc',))
 
     def _about(self) -> dict[str, str]:
@@ -283,17 +283,17 @@ class _PortSession(_Session):
                 self._recorder.add_sample(round(stamp * NSEC_PER_SEC) + self._since, sample)
             tick()
 
-    def _tell(self, state: State) -> None:
+    def _report(self, state: State) -> None:
         if state.name == 'failed':
             self._recorder.flush()  # there is no piece in a silence
-        said = state.problem or state.name
-        if (state.name == 'opening' or said == self._last_message
+        message = state.problem or state.name
+        if (state.name == 'opening' or message == self._last_message
                 or state.name == 'listening' and self._last_message):
             return  # it listens again at each attempt
-        found, self._last_message = self._connection, said
+        found, self._last_message = self._connection, message
         name = (f'samples of {found.protocol.name} come at {found.baud} bit/s'
                 if found.protocol else '')
-        say(name if state.name == 'reading' else said)
+        say(name if state.name == 'reading' else message)
 
     def _why(self) -> str:
         return f' ({self._connection.last_error})' if self._connection.last_error else ''
@@ -328,22 +328,22 @@ def _scale(protocol: Protocol, settings: Settings) -> dict[str, str]:
 class _TopicSession(_Session):
     """Records what comes on topics."""
 
-    waited_for = ('see whether a driver publishes, and whether ROS_DOMAIN_ID and '
-                  'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
+    remedy = ('check that a driver publishes, and that ROS_DOMAIN_ID and '
+              'ROS_AUTOMATIC_DISCOVERY_RANGE agree')
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         wire = (given.protocol, given.columns, given.sensitivity, given.invert, given.baud,
                 given.sample_rate)
         if any(wire) or given.increments != 'default':
             raise UsageError('options of a port were given without --port; '
-                             'give it, or leave them out')
+                             'give --port or omit them')
         if not given.out.endswith('.mcap') and (given.all or len(given.reference_topic) > 1):
             raise UsageError(f'{given.out}: a log has one gyro and one reference; '
                              'record several topics into .mcap')
         try:
             from gyro_calibration.ros.recorder_node import take_messages
         except ImportError as error:
-            raise UsageError(f'topics need ROS 2, which is not there ({error}); '
+            raise UsageError(f'topics need ROS 2, which is not available ({error}); '
                              'source it, or record from --port') from None
         self._take_messages = take_messages
         roles = {'gyro': given.topic or _TOPICS['gyro'],
@@ -355,8 +355,8 @@ class _TopicSession(_Session):
             raise UsageError(f'one topic was named twice, of {", ".join(self._roles.values())}; '
                              f'name one each for {", ".join(roles)}')
         self._topics = [*self._roles.values(), *given.reference_topic[1:]]
-        self._heard, self._waiting, self._missing, self._known = (0, True, list(self._topics),
-                                                                  list[str]())
+        self._messages, self._waiting = 0, True
+        self._missing, self._known = list(self._topics), list[str]()
         self._unknown: dict[str, str] = {}
         super().__init__(given, stop)
         self._log = MessageLog(
@@ -364,7 +364,7 @@ class _TopicSession(_Session):
 
     @property
     def samples(self) -> int:
-        return self._log.samples or (self._heard if self._is_mcap() else 0)
+        return self._log.samples or (self._messages if self._is_mcap() else 0)
 
     @property
     def lost(self) -> int:
@@ -383,7 +383,7 @@ class _TopicSession(_Session):
                                 lambda node: self._watch(node, tick), self._stop)
 
     def _add(self, message: Message, definition: str) -> None:
-        self._heard += 1
+        self._messages += 1
         self._log.add(message)
         if isinstance(self._recorder, McapRecorder):
             self._recorder.add_message(message, definition)
@@ -399,20 +399,19 @@ class _TopicSession(_Session):
                     f'there are {", ".join(self._known) or "none"}')
 
     def _details(self) -> dict[str, Any]:
-        return {**super()._details(), 'messages': self._heard}
+        return {**super()._details(), 'messages': self._messages}
 
     def _remarks(self) -> list[str]:
         log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.'
                                    for topic, reason in self._unknown.items()]
-        left_out = '' if self._is_mcap() else ', and were left out'
+        left_out = '' if self._is_mcap() else ' and were left out'
         remarks += [f'{wrong}; it was recorded as it is.'
                     for wrong in log.of_another_kind.values()]
         if log.damaged:
             remarks.append(f'{log.damaged} messages could not be read.')
         if log.left_out:
-            remarks.append(f'{log.left_out} samples had the stamp of another or an earlier one'
-                           f'{left_out}.')
+            remarks.append(f'{log.left_out} samples had a repeated or an earlier stamp{left_out}.')
         if log.clock_steps:
             remarks.append(f'The clock of the stamps was set {log.clock_steps} times; '
-                           'the log goes on by the time of receiving.')
+                           'the log continues by the time of reception.')
         return [*remarks, *super()._remarks()]

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The verb reproduce: the numbers of the sources beside those that come out here."""
+"""The verb reproduce: published numbers of the sources and those reproduced here."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ HEADER = ('quantity', 'unit', 'where', 'published', 'ours', 'verdict')
 
 def add(verbs: Any) -> argparse.ArgumentParser:
     parser = verb(verbs, 'reproduce', _reproduce,
-                  "the sources' numbers beside ours, with a verdict on each", 'hong_park')
+                  'compare published numbers of the sources with those reproduced here',
+                  'hong_park')
     parser.add_argument('source', nargs='?', choices=list(SOURCES), metavar='SOURCE',
                         help=f'one of {", ".join(SOURCES)}; default: all')
     parser.add_argument('--seed', type=whole, default=0,
-                        help='of the noise; default: 0, as in docs/explanation/reproduction.md')
+                        help='seed of the noise; default: 0, as in '
+                        'docs/explanation/reproduction.md')
     return parser
 
 

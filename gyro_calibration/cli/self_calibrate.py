@@ -45,7 +45,7 @@ from gyro_calibration.cli.verb import (
 )
 from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
-from gyro_calibration.model.gyro_model import GyroModel, SelfCalibration, with_self_calibration
+from gyro_calibration.model.gyro_model import GyroModel, with_self_calibration
 from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import from_headings, from_rates, Motion, read_motion
 import numpy as np
@@ -61,22 +61,22 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     add_log(parser)
     parser.add_argument('--profile', metavar='PROFILE.csv', help='time_s and heading_deg or '
                         'rate_dps; default: the reference of the log')
-    parser.add_argument('--turns', type=_turns, metavar='N', help='the robot was turned so many '
-                        'whole turns from a mark to the same mark with a rest at both ends, '
-                        f'counter-clockwise positive; or {NEAREST}')
+    parser.add_argument('--turns', type=_turns, metavar='N', help='number of full turns from a '
+                        'mark to the same mark with standstill at both ends, counter-clockwise '
+                        f'positive; {NEAREST}: the number nearest to the gyro')
     parser.add_argument('--marking', type=not_negative, metavar='DEG', help='standard deviation '
-                        'of the angle between the two rests on the mark, deg; '
+                        'of the angle between both standstills on the mark, deg; '
                         f'default: {MARKING / DEGREE:g}')
     parser.add_argument('--method', choices=list(METHODS), default='likelihood',
                         help='default: likelihood; the others as published')
-    parser.add_argument('--model', metavar='MODEL.yaml', help='compensate by it first')
+    parser.add_argument('--model', metavar='MODEL.yaml', help='model to compensate by first')
     for name, unit, what in (('scale-deviation', '%%', 'the scale factor error'),
                              ('drift', 'deg/s', 'the drift'),
                              ('random-walk', 'deg/sqrt(h)', 'the angle random walk')):
         default = '; default: 0.58 for rates of a profile' if name == 'scale-deviation' else ''
         parser.add_argument(f'--reference-{name}', type=not_negative, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
-                            f'or of who drives the profile, {unit}{default}')
+                            f'or of the driven profile, {unit}{default}')
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
                         help='draw the run, and its heading error before and after, .png or .svg')
     parser.add_argument('--out', metavar='MODEL.yaml',
@@ -92,21 +92,21 @@ def _turns(text: str) -> int | str:
     except ValueError:
         value = 0
     if not value:
-        raise argparse.ArgumentTypeError(f'{text} is no whole number of turns other than 0, '
-                                         f'nor {NEAREST}')
+        raise argparse.ArgumentTypeError(f'{text} is no number of turns; give an integer other '
+                                         f'than 0, or {NEAREST}')
     return value
 
 
 def _self_calibrate(given: argparse.Namespace) -> Answer:
     if given.turns is not None and given.profile:
         raise UsageError('--turns and --profile were both given; '
-                         'the mark or the profile is the reference, not both')
+                         'give one of them as the reference')
     if given.turns is not None and given.picture:
-        raise UsageError('--picture draws a run against a profile, which --turns has not; '
-                         'leave one of the two out')
+        raise UsageError('--picture draws a run against a profile, which --turns does not have; '
+                         'omit one of the two')
     if given.turns is None and given.marking is not None:
-        raise UsageError('--marking is the error of a mark, which only --turns has; '
-                         'leave it out, or say how many turns')
+        raise UsageError('--marking needs --turns, whose mark it is the error of; '
+                         'omit it, or give --turns')
     model = read_model(given.model) if given.model else GyroModel()
     log = read(given)
     return (_of_turns(given, model, log) if given.turns is not None
@@ -163,12 +163,13 @@ def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
 def _turned(found: Turns, marking: float) -> str:
     way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
     before, after = found.rests
-    return (f'{abs(found.turns)} whole turns {way} in {found.duration:.1f} s, between rests of '
-            f'{before:.1f} and {after:.1f} s; the mark is met to {marking / DEGREE:g} deg.')
+    return (f'{abs(found.turns)} full turns {way} in {found.duration:.1f} s, between standstills '
+            f'of {before:.1f} and {after:.1f} s; standard deviation of the mark '
+            f'{marking / DEGREE:g} deg.')
 
 
 def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
-    """Return how good the reference is said to be; a profile is driven, a reference measured."""
+    """Return the accuracy of the reference by the options, or the usual one of a profile."""
     scale = given.reference_scale_deviation
     usual = usual_reference(motion) if given.profile else Reference()
     return Reference(usual.scale_deviation if scale is None else scale / 100.0,
@@ -178,7 +179,7 @@ def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
 
 def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, used: Mask,
             method: str, data: dict[str, Any], lines: list[str]) -> Answer:
-    """Keep the calibration, and say what it is."""
+    """Write the calibration, and return the answer."""
     temperature = None if log.temperature is None else float(log.temperature[used].mean())
     calibration = record(fit, method, datetime.now(timezone.utc).isoformat(timespec='seconds'),
                          temperature)
@@ -186,15 +187,12 @@ def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, use
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
     written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
-    said = ([f'{refused} rows are not used: no such gyro reports that rate or temperature.']
-            if refused else [])
-    return Answer('\n'.join([_first(calibration, int(used.sum())), *lines, *said, *written]),
+    remarks = ([f'{refused} rows have an implausible rate or temperature and are not used.']
+               if refused else [])
+    first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {used.sum()} samples.'
+    return Answer('\n'.join([first, *lines, *remarks, *written]),
                   {**calibration.figures(), 'samples': int(used.sum()),
                    'refused_samples': refused, **data, 'out': given.out})
-
-
-def _first(calibration: SelfCalibration, samples: int) -> str:
-    return f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {samples} samples.'
 
 
 def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
@@ -225,7 +223,7 @@ def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
         yield f'{fit.goodness}.'
     if check:
         yield (f'At rest after the run the corrected rate is {check.rate / DEGREE:.4f} deg/s; '
-               f'up to {check.limit / DEGREE:.4f} are explained.')
+               f'limit: {check.limit / DEGREE:.4f} deg/s.')
 
 
 def _reference(given: argparse.Namespace, log: Log, time: Array) -> tuple[Motion, float]:
@@ -235,7 +233,7 @@ def _reference(given: argparse.Namespace, log: Log, time: Array) -> tuple[Motion
         if values is not None:
             known = np.isfinite(values)
             if known.sum() < 2:
-                raise DataRefused(f'{given.log}: the reference is lost nearly everywhere; '
-                                  'give the motion by --profile')
+                raise DataRefused(f'{given.log}: the reference has {known.sum()} values; at '
+                                  'least 2 are needed: give the motion with --profile')
             return motion(time[known], values[known]), float(time[known][0])
-    raise UsageError(f'{given.log}: holds no reference; give the motion by --profile')
+    raise UsageError(f'{given.log}: has no reference; give the motion with --profile')

@@ -44,7 +44,7 @@ def add_motion(parser: argparse.ArgumentParser, **how: Any) -> None:
                         help='default: 100')
     parser.add_argument('--temperature', type=degrees_celsius, metavar='DEGC',
                         help='default: the reference temperature of the model')
-    parser.add_argument('--seed', type=whole, help='of the noise; default: another one each time')
+    parser.add_argument('--seed', type=whole, help='seed of the noise; default: random')
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -70,13 +70,13 @@ def simulated(given: argparse.Namespace) -> tuple[Log, int]:
     seed = secrets.randbits(32) if given.seed is None else given.seed
     if given.motion not in NAMED and not os.path.exists(given.motion):
         raise UsageError(f'{given.motion}: there is no such motion; '
-                         f'name a file, or one of {", ".join(NAMED)}')
+                         f'give a file, or one of {", ".join(NAMED)}')
     motion = NAMED[given.motion] if given.motion in NAMED else read_motion(given.motion)
     if motion.duration * given.sample_rate > MOST:
         raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has more than '
                          f'{MOST:g} samples; give a lower rate or a shorter motion')
     if round(motion.duration * given.sample_rate) < 1:
-        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has less than '
+        raise UsageError(f'{given.motion} at --sample-rate {given.sample_rate:g} has fewer than '
                          'two samples; give a higher rate or a longer motion')
     return simulate(read_model(given.model), motion, given.sample_rate,
                     np.random.default_rng(seed), given.temperature), seed

@@ -34,14 +34,13 @@ from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
-    digest,
     output_of,
     picture_file,
     positive,
     read,
     verb,
 )
-from gyro_calibration.files import write_atomically
+from gyro_calibration.files import digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log, Mask
 from gyro_calibration.logs.ros_bag import files_of
@@ -63,11 +62,12 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'table.csv --picture turn.png')
     add_log(parser)
     parser.add_argument('--model', metavar='MODEL.yaml',
-                        help='used as it is; default: the effects that the data support, '
+                        help='model to evaluate; default: the effects that the data support, '
                         'fitted for each sweep to the other sweeps')
     parser.add_argument('--slowest', type=positive, default=SLOWEST / DEGREE, metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
-    parser.add_argument('--out', metavar='TURN.csv', help='the table, a row a turn, in SI')
+    parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
+                        'SI units')
     parser.add_argument('--picture', type=picture_file, metavar='FILE',
                         help='draw the errors over the rate, .png or .svg')
     return parser
@@ -97,8 +97,7 @@ def _fitted(found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     calibration = select_effects(found).calibration
     names = [effect.name for effect in calibration.effects]
     remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
-              'for each sweep to the other sweeps, so that no turn is corrected by a model that '
-              'has seen it')
+              'for each sweep to the other sweeps, so no turn is in the data of its model')
     return (predicted_rates(calibration), calibration.scatter.kept, [remark],
             {'effects': names, 'left_out': True})
 
@@ -110,10 +109,10 @@ def _as_given(given: argparse.Namespace, model: GyroModel, log: Log,
     names = [term.effect.name for term in model.terms]
     clipped, beyond = (int(np.count_nonzero(each))
                        for each in (result.temperature_clipped, result.beyond_range))
-    remarks = [f'the model is {given.model} as it is: {", ".join(names) or "no effects"}'
-               f'{_acquainted(model, given.log)}']
+    remarks = [f'the model is {given.model}: {", ".join(names) or "no effects"}'
+               f'{_fitted_to(model, given.log)}']
     if found.temperature is None and model.looks_at('temperature'):
-        remarks.append('the log holds no temperature: '
+        remarks.append('the log has no temperature: '
                        'the model was used at its reference temperature')
     if clipped:
         remarks.append(f'{clipped} of {len(found)} dwells are outside the calibrated '
@@ -133,11 +132,10 @@ def _around(model: GyroModel, log: Log, found: Dwells) -> Array:
     return found.output - np.array([error[rows].mean() for rows in found.rows])
 
 
-def _acquainted(model: GyroModel, log: str) -> str:
-    """Say whether the model was fitted to the log, by the sums of the files that it comes from."""
+def _fitted_to(model: GyroModel, log: str) -> str:
+    """Return whether the model was fitted to the log, by the SHA-256 of its files."""
     if any(file.is_file() and digest(file) in str(model.origin) for file in files_of(log)):
-        return ('; it was fitted to this log, '
-                'so that these are errors of a fit, not of a prediction')
+        return '; it was fitted to this log, so these are errors of a fit, not of a prediction'
     return '' if 'sha256' in str(model.origin) else (
         '; if it was fitted to this log, these are errors of a fit, not of a prediction')
 
@@ -192,9 +190,9 @@ def _text(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> 
     before, after = size(errors.static), size(errors.modelled)
     yield (f'Error of a turn of 360 deg: largest {_degrees(before.largest)} with the static bias '
            f'only, {_degrees(after.largest)} with the model, '
-           f'{_ratio(before.largest, after.largest)} times less; '
+           f'a factor of {_ratio(before.largest, after.largest)}; '
            f'rms {_degrees(before.rms)} and {_degrees(after.rms)}, '
-           f'{_ratio(before.rms, after.rms)} times less.')
+           f'a factor of {_ratio(before.rms, after.rms)}.')
     yield (f'{len(errors)} turns, {given.slowest:g} deg/s and faster, '
            f'of {len(np.unique(errors.sweep))} sweeps in {given.log}.')
     for remark in remarks:
@@ -210,7 +208,7 @@ def _degrees(error: float) -> str:
 
 
 def _ratio(before: float, after: float) -> str:
-    return f'{before / after:.2g}' if after > 0.0 else 'infinitely many'
+    return f'{before / after:.2g}' if after > 0.0 else 'infinity'
 
 
 def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:

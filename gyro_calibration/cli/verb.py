@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What the verbs share: their answer, their options for logs, and what they say of a wrong use."""
+"""What the verbs share: their answer, their options for logs, and errors of usage."""
 
 from __future__ import annotations
 
@@ -17,16 +17,14 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-import hashlib
 import importlib.util
 import math
 import os
-from pathlib import Path
 import sys
 from typing import Any
 
 from gyro_calibration import __version__
-from gyro_calibration.files import InputError, LARGEST, opened, plain
+from gyro_calibration.files import digest, InputError, LARGEST, plain
 from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
     Array,
@@ -50,7 +48,7 @@ class UsageError(InputError):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a verb found: plain words for people, and the same as data."""
+    """The result of a verb, as text and as data."""
 
     text: str
     data: dict[str, Any]
@@ -68,41 +66,41 @@ def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer 
 def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
     parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a '
                         'ROS 2 recording: folder, .mcap or .db3', **how)
-    parser.add_argument('--rate', type=positive, metavar='HZ', help='the samples come at this '
-                        'rate; for logs without a usable time_s')
+    parser.add_argument('--rate', type=positive, metavar='HZ',
+                        help='sample rate, for logs without a usable time_s')
     parser.add_argument('--sensitivity', type=positive, metavar='DPS',
-                        help='deg/s a count, for logs that hold gyro_counts alone')
+                        help='deg/s per count, for logs with gyro_counts only')
     parser.add_argument('--invert', action='store_true',
-                        help='the gyro counts clockwise turns positive')
+                        help='the gyro reports clockwise turns as positive')
     parser.add_argument('--columns', dest='names', type=columns, default={},
                         metavar='QUANTITY=NAME:UNIT,...',
-                        help='columns with names of other programs, such as '
-                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; without a unit that of SI')
-    parser.add_argument('--axis', choices=AXES, default='z', help='of the gyro, for columns such '
-                        'as gyro_x_dps and for recordings; default: z')
-    parser.add_argument('--unwrap', action='store_true', help='the reference heading jumps by '
-                        'whole turns; make it continuous')
+                        help='columns with other names than in the log format, such as '
+                        'time=t:ms,gyro=wz:deg/s,heading=yaw:deg; default unit: SI')
+    parser.add_argument('--axis', choices=AXES, default='z', help='axis of the gyro, for columns '
+                        'such as gyro_x_dps and for recordings; default: z')
+    parser.add_argument('--unwrap', action='store_true', help='remove jumps by full turns from '
+                        'the reference heading')
     parser.add_argument('--from', dest='begin', type=float, default=0.0, metavar='S',
-                        help='leave out what comes before, s since the first sample')
+                        help='omit samples before this time, s since the first sample')
     parser.add_argument('--to', dest='end', type=float, default=math.inf, metavar='S',
-                        help='leave out what comes after')
+                        help='omit samples after this time, s since the first sample')
     add_topics(parser)
 
 
-#: What `read` goes by where a verb has no such options.
+#: Values of the options that `read` uses, for a verb without them.
 AS_IT_IS: dict[str, Any] = {'invert': False, 'names': {}, 'axis': 'z', 'unwrap': False,
                             'begin': 0.0, 'end': math.inf}
 
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--topic', metavar='TOPIC', help='of the gyro in a recording, '
-                        'sensor_msgs/Imu or another kind with a rate; default: the only Imu')
-    parser.add_argument('--reference-topic', metavar='TOPIC', help='of the reference in a '
+    parser.add_argument('--topic', metavar='TOPIC', help='topic of the gyro in a recording, '
+                        'sensor_msgs/Imu or another type with a rate; default: the only Imu')
+    parser.add_argument('--reference-topic', metavar='TOPIC', help='topic of the reference in a '
                         'recording, nav_msgs/Odometry, sensor_msgs/Imu, '
-                        'geometry_msgs/PoseStamped, TwistStamped or another kind with a rate '
+                        'geometry_msgs/PoseStamped, TwistStamped or another type with a rate '
                         'or an orientation; default: none')
-    parser.add_argument('--temperature-topic', metavar='TOPIC', help='in a recording; '
-                        'default: the one named most like that of the gyro')
+    parser.add_argument('--temperature-topic', metavar='TOPIC', help='topic of the temperature '
+                        'in a recording; default: the name nearest to the topic of the gyro')
 
 
 def columns(text: str) -> dict[str, str]:
@@ -117,14 +115,16 @@ def columns(text: str) -> dict[str, str]:
 def positive(text: str) -> float:
     value = float(text)
     if not 1.0 / LARGEST <= value <= LARGEST:
-        raise argparse.ArgumentTypeError(f'{text} is not above 0, or beyond what there is')
+        raise argparse.ArgumentTypeError(f'{text} is out of range; give a number from '
+                                         f'{1.0 / LARGEST:g} to {LARGEST:g}')
     return value
 
 
 def degrees_celsius(text: str) -> float:
     value = float(text)
     if not -273.15 <= value <= 1e4:
-        raise argparse.ArgumentTypeError(f'{text} is no temperature in degC')
+        raise argparse.ArgumentTypeError(f'{text} degC is out of range; give a temperature from '
+                                         '-273.15 to 10000 degC')
     return value
 
 
@@ -136,17 +136,18 @@ def whole(text: str) -> int:
     """Return a seed, as a numpy Generator takes it."""
     value = int(text)
     if value < 0:
-        raise argparse.ArgumentTypeError(f'{text} is below 0; a seed is a whole number from 0 on')
+        raise argparse.ArgumentTypeError(f'{text} is below 0; give an integer of 0 or more')
     return value
 
 
 def picture_file(text: str) -> str:
     """Return the name of a picture to draw, if one can be drawn."""
     if not text.endswith(('.png', '.svg')):
-        raise argparse.ArgumentTypeError(f'{text}: a picture ends in .png or .svg; name it so')
+        raise argparse.ArgumentTypeError(f'{text} is no picture file; give a name that ends in '
+                                         '.png or .svg')
     if importlib.util.find_spec('matplotlib') is None:
         raise argparse.ArgumentTypeError('a picture needs matplotlib, which is not installed; '
-                                         'install it, or leave the picture out')
+                                         'install it or omit the option')
     return text
 
 
@@ -176,11 +177,11 @@ def _inside(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
             yield part(log, rows)
     if found is None:
         raise DataRefused(f'{given.log}: --from {given.begin:g} --to {given.end:g} leaves no '
-                          'sample; look at its times')
+                          'sample; give a range within the log')
 
 
 def say(text: object) -> None:
-    """Say something on standard error."""
+    """Print a message on standard error."""
     print(f'gyro_calibration: {plain(text)}', file=sys.stderr, flush=True)
 
 
@@ -190,7 +191,7 @@ def bar(items: Iterable[Any], what: str, total: int | None = None) -> Iterable[A
 
 
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:
-    """Return what a model file says of where it comes from: logs, date, program."""
+    """Return the origin of a model, for its file: logs, date, program."""
     files = [{'name': plain(file.name),
               **({'sha256': digest(file)} if os.path.isfile(file) else {})}
              for path in paths for file in files_of(path)]
@@ -201,15 +202,6 @@ def origin_of(paths: Iterable[str]) -> dict[str, Any]:
 def with_origin(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return the model of --model as it is, or else the new one with the log as its origin."""
     return model if given.model else replace(model, origin=origin_of([given.log]))
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, which must not be a pipe: that would block."""
-    found = hashlib.sha256()
-    with opened(path) as file:
-        while piece := file.read(1 << 20):
-            found.update(piece)
-    return found.hexdigest()
 
 
 def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
@@ -234,7 +226,7 @@ def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
 
 
 def _recorded(given: argparse.Namespace) -> Log:
-    """Read a recording, and print on standard error what was taken and mended."""
+    """Read a recording, and print on standard error what was used and corrected."""
     topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
     with _bytes_of(given.log) as on_progress:
         return read_recording(given.log, topics, given.rate, on_progress, say)
@@ -250,13 +242,13 @@ def _turned(given: argparse.Namespace, log: Log) -> Log:
 
 def output_of(given: argparse.Namespace, log: Log) -> Array:
     if log.output is None:
-        raise UsageError(f'{given.log}: holds gyro_counts alone; '
-                         'say with --sensitivity how many deg/s a count is')
+        raise UsageError(f'{given.log}: has gyro_counts only; '
+                         'give the deg/s per count with --sensitivity')
     return log.output
 
 
 def time_of(given: argparse.Namespace, log: Log) -> Array:
     if log.time is None:
         raise UsageError(f'{given.log}: has no time_s, which {given.name} needs; '
-                         'say with --rate how many samples a second it holds')
+                         'give the sample rate in Hz with --rate')
     return log.time

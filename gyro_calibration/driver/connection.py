@@ -9,9 +9,9 @@
 # under the License.
 
 """
-A gyro on a serial port, whatever happens to the port: found, recognized, read, lost, found again.
+A gyro on a serial port: opened, recognized, read, and opened again after the port was lost.
 
-No ROS, and no thread: who wants samples takes them from `Connection.chunks`, in a thread or not.
+No ROS, and no thread: `Connection.chunks` gives the samples, in a thread of the caller or not.
 
 """
 
@@ -37,7 +37,7 @@ _SILENCE = 2.0  # s; without a sample, after which the port is opened anew
 _PERIODS = 3.0  # without a sample, for a gyro that is slower than that
 _REOPEN = (0.1, 5.0)  # s; first and longest time before a lost port is opened again
 _RESTART = 5.0  # s; a board that restarts when its port is opened is silent for this time at most
-_ASKING = 0.8  # s; between two requests to send: a gyro that starts does not hear them
+_ASKING = 0.8  # s; between two requests to send: a gyro that starts does not receive them
 _LISTENING = 1.0  # s; a gyro of 10 Hz has sent enough by then
 _POLLING = 0.1  # s; between two attempts to recognize what came
 _MOST_BYTES = 16384  # of what came last, to be recognized
@@ -218,7 +218,7 @@ class Connection:
     on_change : callable
         Gets each new `State`, in the thread that takes the samples.
     clock : callable
-        Returns seconds of a clock that nobody sets.
+        Returns seconds of a steady clock.
     make_port : callable
         Returns what reads a port, given its path and baud.
 
@@ -364,8 +364,8 @@ class Connection:
             best = max(best or recognition, recognition, key=lambda each: each.explained)
         assert best is not None
         tried = ', '.join(map(str, self._bauds()))
-        return (f'bytes come on {self._pattern}, but of no protocol for sure at {tried} bit/s; '
-                f'at best {best.words}')
+        return (f'bytes come on {self._pattern}, but no protocol was recognized at {tried} bit/s; '
+                f'nearest: {best.words}')
 
     def _recognize(self, port: SerialPort, restarted: float, stop: threading.Event) -> Recognition:
         """Return what is recognized within a second from the first byte on."""
@@ -428,11 +428,11 @@ class Connection:
         has_bytes, has_faults, is_beyond = (
             now > then for now, then in zip(counts, before, strict=True))
         if has_faults:
-            return (f'the gyro on {port} calls each of its samples invalid for {limit:g} s: turn '
-                    'it off and on, then have it checked')
+            return (f'the gyro on {port} marks all samples as invalid for {limit:g} s: turn it '
+                    'off and on, then have it checked')
         if is_beyond:
-            return (f'each sample on {port} is beyond full scale for {limit:g} s: check protocol, '
-                    'sensitivity and full_scale')
+            return (f'all samples on {port} are beyond full scale for {limit:g} s: check '
+                    'protocol, sensitivity and full_scale')
         if not has_bytes:
             return self._nothing(limit)
         assert self.protocol is not None

@@ -60,8 +60,8 @@ class Emulator:
         Each with its time, in seconds.
     settings : Settings or None
     speed : float
-        Times real time; inf is as fast as the reader reads. At 1 or slower, bytes that nobody
-        reads are lost, as on a real line; faster is a replay, which waits for the reader.
+        Times real time; inf is as fast as the reader reads. At 1 or slower, bytes that are not
+        read are lost, as on a real line; faster is a replay, which waits for the reader.
     link : path or None
         A symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
         removed at the end.
@@ -92,8 +92,7 @@ class Emulator:
         generator: np.random.Generator | None = None,
     ):
         if not speed > 0.0:
-            raise ValueError(f'speed is {speed}, but must be above 0: 1 is real time, 10 is ten '
-                             'times faster')
+            raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
         self._settings = settings or Settings()
         protocol.check(self._settings)
         self._protocol = protocol
@@ -103,8 +102,7 @@ class Emulator:
         self._wait_for_reader = wait_for_reader
         self._faults = faults = faults or SerialFaults()
         if generator is None and faults.is_random:
-            raise ValueError('the line loses or damages bytes, but no generator chooses which: '
-                             'give a numpy Generator')
+            raise ValueError('the line loses or damages bytes at random: give a numpy Generator')
         self._generator = generator or np.random.default_rng(0)  # never asked
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
@@ -182,7 +180,7 @@ class Emulator:
         if self.link is None:
             return
         if self.link.exists() and not self.link.is_symlink():
-            raise FileExistsError(f'{self.link} is no link, so it is not replaced: choose another '
+            raise FileExistsError(f'{self.link} is no link, so it is not replaced: give another '
                                   'path for the link')
         temporary = self.link.with_name(f'.{self.link.name}.{os.getpid()}')
         os.symlink(self.path, temporary)
@@ -254,8 +252,7 @@ class Emulator:
 
 def _time(sample: Sample) -> float:
     if sample.time is None:
-        raise ValueError('a sample has no time, but the emulator sends each at its time: set '
-                         'Sample.time in seconds')
+        raise ValueError('a sample has no time at which to send it: set Sample.time in seconds')
     return sample.time
 
 

@@ -120,14 +120,14 @@ class AtomicAppender:
                 left = left[file.write(left):]
         except FileExistsError:
             self.is_full = True
-            raise LogError(f'{self.path}: another program has made it meanwhile, and no recording '
-                           'is ever written over; name a new file') from None
+            raise LogError(f'{self.path}: another program has created it meanwhile, and '
+                           'recordings are never overwritten; give a new name') from None
         except OSError as error:
             self.is_full = True
             if self._file:
                 self._file.truncate(self.size)
                 self._file.seek(self.size)
-            problem = f'{self.path}: cannot be written any more ({error.strerror})'
+            problem = f'{self.path}: writing has failed ({error.strerror})'
             raise DiskFull(error.errno, problem) from error
         self.size += len(piece)
 
@@ -188,13 +188,13 @@ class McapRecorder:
         numbers = 37 * [0.0]
         numbers[3], numbers[ORIENTATION_COVARIANCE] = 1.0, NOT_REPORTED
         numbers[RATE_Z] = sample.output
-        beside = UNMEASURED_VARIANCE, UNMEASURED_VARIANCE
-        numbers[RATE_COVARIANCE:FORCE_Z - 2:4] = *beside, self.variance
+        other_axes = UNMEASURED_VARIANCE, UNMEASURED_VARIANCE
+        numbers[RATE_COVARIANCE:FORCE_Z - 2:4] = *other_axes, self.variance
         if sample.specific_force is None:
             numbers[FORCE_COVARIANCE] = NOT_REPORTED
         else:
             numbers[FORCE_Z] = sample.specific_force
-            numbers[FORCE_COVARIANCE::4] = *beside, ASSUMED_FORCE_NOISE ** 2
+            numbers[FORCE_COVARIANCE::4] = *other_axes, ASSUMED_FORCE_NOISE ** 2
         if sample.temperature is not None:
             self._add_numbers('/imu/temperature', TEMPERATURE, stamp, [sample.temperature, 0.0])
         self._add_numbers('/imu/data_raw', IMU, stamp, numbers)

@@ -64,8 +64,8 @@ class SerialFaults:
                 raise ValueError(f'{name} is {getattr(self, name)}, but must be a probability '
                                  'from 0 to 1')
         if self.lost_bytes + self.doubled_bytes + self.flipped_bytes > 1.0:
-            raise ValueError('lost_bytes, doubled_bytes and flipped_bytes add up to more than 1: '
-                             'a byte can meet one of the three')
+            raise ValueError('lost_bytes, doubled_bytes and flipped_bytes add up to more than 1, '
+                             'but a byte has at most one of these faults')
         if not (0.0 <= self.burst <= 10.0 and self.piece >= 0):
             raise ValueError(f'burst is {self.burst} s and piece {self.piece}, but must be from '
                              '0 to 10 s, and a number of bytes')

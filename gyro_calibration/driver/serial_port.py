@@ -32,7 +32,7 @@ _REMEDIES = {
     errno.EAGAIN: 'another program has opened it: stop that one',
     errno.ENOTTY: 'it is no serial port: set another port',
     errno.EISDIR: 'it is a folder, no serial port: set another port',
-    errno.EIO: 'the device is gone: plug it in again',
+    errno.EIO: 'the device was disconnected: plug it in again',
 }
 
 
@@ -87,7 +87,7 @@ class SerialPort:
 
         Raises
         ------
-        PortError : the device is gone; the port is then closed
+        PortError : the device was disconnected; the port is then closed
 
         """
         return self._guarded(self._read)
@@ -98,7 +98,7 @@ class SerialPort:
 
         Raises
         ------
-        PortError : the device is gone; the port is then closed
+        PortError : the device was disconnected; the port is then closed
 
         """
         self._guarded(lambda port: port.write(data))
@@ -111,7 +111,7 @@ class SerialPort:
 
         Raises
         ------
-        PortError : the device is gone, or does not know that speed; the port is then closed
+        PortError : the device was disconnected, or lacks that speed; the port is then closed
 
         """
         self.baud = baud

@@ -22,7 +22,7 @@ early.
 is set by months when it finds a time server; then stamps jump, and nothing else has happened.
 `NodeTime` gives stamps of such a clock, `HostClock` and `MessageClock` take them to an even axis.
 
-No clock is read here, except by `steady`: who reads the port or a topic gives the time.
+No clock is read here, except by `steady`: the caller gives the time of arrival.
 
 References
 ----------
@@ -56,7 +56,7 @@ _WINDOWS = 64  # of `_HOLD` each, over which a slow sweep of the lateness is lea
 _SWEEPING = 0.2  # of those windows; by chance alone it is a few
 _MEMORY = 256  # arrivals, over which the share of late ones without any loss is learned
 _JITTER_TIME = 10.0  # s; over which jitter is averaged
-_DRIFT = 2e-5  # by which the clock of a device may become faster while counts are in doubt
+_DRIFT = 2e-5  # by which the clock of a device may become faster while counts are uncertain
 _FINEST = 0.5e-3  # s; a host that wakes up later than before is no proof of a loss below this
 _OUTLYING = 0.02  # s; above the 16 ms of a burst: with a sequence, no sample is off by more
 _ODD = 8  # advances in a row that do not fit their size show that the size is wrong
@@ -376,7 +376,7 @@ class SampleClock:
         self._lateness, self._outlying = _Lateness(), _Lateness()
         self._line = LowerLine(1.0 / rate)
         self._number, self._slew = 0.0, 0.0
-        self._doubtful, self._doubtful_since, self._just_lost = 0, 0.0, 0
+        self._uncertain, self._uncertain_since, self._just_lost = 0, 0.0, 0
         self._last, self._arrival, self._before = after, -math.inf, -math.inf
         self._squares: tuple[float, ...] = (0.0, 0.0)
         self.lost = 0
@@ -441,8 +441,8 @@ class SampleClock:
             numbers.append(number)
         self._just_lost = self.lost - before
         if self._just_lost:
-            self._doubtful += self._just_lost
-            self._doubtful_since = arrival
+            self._uncertain += self._just_lost
+            self._uncertain_since = arrival
         return numbers
 
     def _most(self, number: float, arrival: float) -> float:
@@ -476,8 +476,8 @@ class SampleClock:
 
     def _counted_too_often(self, unit: int, lateness: float) -> int:
         excess = unit and unit * round(-lateness / (unit * self.period))
-        if excess and excess <= self._doubtful:
-            return self._renumber(self._doubtful_since, -excess)
+        if excess and excess <= self._uncertain:
+            return self._renumber(self._uncertain_since, -excess)
         if not unit:  # a wrong time of the device: what it seemed to skip was not lost
             self.lost -= self._just_lost
         if unit != 1:  # or a sequence that began anew
@@ -493,20 +493,20 @@ class SampleClock:
         if is_no_loss:
             self._begin_anew()
             return 0
-        self._doubtful_since = since
+        self._uncertain_since = since
         return self._renumber(since, lost)
 
     def _renumber(self, since: float, by: int) -> int:
         self._line.shift(since, by)
         self.lost += by
-        self._doubtful += by
+        self._uncertain += by
         return by
 
     def _begin_anew(self) -> None:
         self._line = LowerLine(self._line.slope)
         self._lateness.reset()
         self._outlying.reset()
-        self._slew, self._doubtful = 0.0, 0
+        self._slew, self._uncertain = 0.0, 0
 
     def _fit(self, number: float, arrival: float) -> None:
         line, is_first = self._line, not self._line.span()
@@ -518,9 +518,9 @@ class SampleClock:
         self._slew = min(slew, arrival - line.at(number))
 
     def _lowest(self, number: float, arrival: float) -> float:
-        """Return how low a point may be: nearly the line, for a while after a count in doubt."""
-        in_doubt = self.is_settled and self._doubtful and self._numbers.unit
-        if in_doubt and arrival - self._doubtful_since < _HOLD:
+        """Return how low a point may be: near the line, for `_HOLD` after an uncertain count."""
+        is_uncertain = self.is_settled and self._uncertain and self._numbers.unit
+        if is_uncertain and arrival - self._uncertain_since < _HOLD:
             return self._line.at(number) - _DRIFT * (arrival - self._before)
         return -math.inf
 
@@ -542,7 +542,7 @@ class SampleClock:
 
 
 def steady() -> float:
-    """Return seconds that nobody sets; they include the sleep of the host, where it is known."""
+    """Return seconds of the steady clock; they include suspension of the host, where possible."""
     return time.clock_gettime(_STEADY)
 
 
@@ -560,7 +560,7 @@ def read_together(
 
 class ClockSteps:
     """
-    Detects a clock that is set, by its times beside those of a steady one.
+    Detects a clock that is set, by comparing it with a steady one.
 
     Parameters
     ----------
@@ -647,7 +647,7 @@ class _Step:
 
 class HostClock:
     """
-    Takes stamps to one axis of time, s, whatever is done to the clock of the host.
+    Converts stamps to one axis of time, s, also where the clock of the host is set.
 
     A jump of the stamps counts as none if that clock has just made the same one against the
     steady clock.
@@ -702,7 +702,7 @@ class HostClock:
         return before + bridged
 
     def of_other(self, stamp: float, sample: float) -> float:
-        """Return the time of what came beside samples, s; it may be of before or after a step."""
+        """Return the time of a message other than a sample, s, from before or after a step."""
         there = stamp - self._offset
         shifts = [sign * step.size for step in self._recent for sign in (1.0, -1.0)]
         return min((there, *(there + shift for shift in shifts)),

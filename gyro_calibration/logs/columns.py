@@ -50,7 +50,7 @@ AXES = ('x', 'y', 'z')
 _RATES = {'rad/s': 1.0, 'deg/s': _DEGREE, 'dps': _DEGREE, 'mrad/s': 1e-3,
           'deg/h': _DEGREE / 3600.0}
 _ANGLES = {'rad': 1.0, 'deg': _DEGREE, 'mrad': 1e-3, 'turn': 2.0 * math.pi}
-#: What a user calls a quantity -> the quantity, and its units: factor to SI, that of SI first.
+#: Name of a quantity in options -> the quantity, and its units: factor to SI, that of SI first.
 _QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
     'time': ('time', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}),
     'gyro': ('output', _RATES),
@@ -64,7 +64,7 @@ _QUANTITIES: Mapping[str, tuple[str, Mapping[str, float]]] = {
 }
 #: Unit -> what is added after its factor, in SI.
 _OFFSETS = {'K': -273.15, 'degF': -160.0 / 9.0}
-#: Quantity as a user calls it -> names that other programs give its column, without case, marks
+#: Name of a quantity in options -> names that other programs give its column, without case, marks
 #: and the unit.
 _USUAL = {
     'time': r't|time|timestamp|stamp|sec|secs|seconds|nanoseconds|elapsed',

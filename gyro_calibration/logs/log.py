@@ -178,8 +178,8 @@ def _while_it_fits(path: str | Path, blocks: Iterable[Log]) -> Iterator[Log]:
         numbers += len(block) * (sum(getattr(block, quantity) is not None
                                      for quantity in QUANTITIES) + _TEXT * len(block.others))
         if numbers > _WHOLE:
-            raise LogError(f'{path}: holds more than {_WHOLE} numbers, which are too many to look '
-                           'at at once; cut it into pieces')
+            raise LogError(f'{path}: has more than {_WHOLE} numbers, which is above the limit of '
+                           'memory; split it')
         yield block
 
 
@@ -212,8 +212,8 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
         while block := _block(lines, rows):
             unfolded += sum(map(len, block))
             if compressed and file.seekable() and unfolded > GROWN + GROWTH * file.tell():
-                raise LogError(f'{path}: unfolds to more than {GROWTH} times its size, as no log '
-                               'does; unpack it if that is what was recorded')
+                raise LogError(f'{path}: decompresses to more than {GROWTH} times its size, which '
+                               'is the limit; decompress it first if this is intended')
             places, arrays, others = (_quickly(block, first_line, table)
                                       or _carefully(path, block, lines, first_line, table))
             first_line, before, count = places[-1], count, count + len(places) - 1
@@ -227,7 +227,7 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
             if count > 1:
                 yield Log(**arrays, notes=table.notes, others=others)
     if count < 2:
-        raise LogError(f'{path}: {count} rows of data; a log has at least two: record more')
+        raise LogError(f'{path}: {count} rows of data, but at least 2 are needed; record more')
 
 
 @contextmanager
@@ -374,7 +374,7 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
     for row in reader:
         if len(row) != len(header):
             raise LogError(f'{path}: line {places[-1]} has {len(row)} values where the header has '
-                           f'{len(header)}; mend or remove the line')
+                           f'{len(header)}; correct or remove the line')
         rows.append(row)
         places.append(first_line + reader.line_num)
         if reader.line_num >= len(lines) and len(rows) > 1:
@@ -399,7 +399,7 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
     wrong = _wrong(values, quantity)
     if wrong.any():
         row = int(np.argmax(wrong))
-        fault = (f'beyond {_most(quantity):g}, which no gyro means' if np.isfinite(values[row])
+        fault = (f'beyond the limit of {_most(quantity):g}' if np.isfinite(values[row])
                  else 'not a finite number')
         raise LogError(f'{path}: line {places[row]}, column {name}: {shown(texts[row])} '
                        f'is {fault}; remove the row')
@@ -436,9 +436,9 @@ def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
     late = ~(np.diff(time, prepend=before) >= SHORTEST)
     if late.any():
         row = int(np.argmax(late))
-        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s does not come '
-                       f'after {time[row - 1] if row else before:g} s; sort the rows, or give '
-                       '--rate where the stamps are no use')
+        raise LogError(f'{path}: line {places[row]}, column time_s: {time[row]:g} s is not later '
+                       f'than {time[row - 1] if row else before:g} s; sort the rows, or give '
+                       'the sample rate with --rate')
     return float(time[-1])
 
 
@@ -502,7 +502,7 @@ def unwrapped(at: Array, wrapped: Array, time: Array, output: Array) -> tuple[Ar
 
     Returns
     -------
-    the heading, rad, and whether the gyro had to say by how many turns it went on
+    the heading, rad, and whether the gyro determined a number of turns
 
     """
     known, heading = np.isfinite(wrapped), np.full(len(wrapped), np.nan)

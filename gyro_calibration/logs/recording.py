@@ -250,7 +250,7 @@ class _Reader:
         found = self._named(wanted, 'gyro') if wanted else self._only_imu()
         course = self._course(found)
         if not course.reports('rate'):
-            raise LogError(f'{self._path}: {found} says that it reports no angular velocity; '
+            raise LogError(f'{self._path}: {found} declares that it reports no angular velocity; '
                            'name another by --topic')
         return course
 
@@ -261,7 +261,7 @@ class _Reader:
             return found[0]
         if found:
             raise LogError(f'{self._path}: several gyros, {_listed(found)}; '
-                           'say by --topic which one is meant')
+                           'select one with --topic')
         reasons = ''.join(f' ({note})' for note in self._contents.notes)
         raise LogError(f'{self._path}: no message of {IMU} in it{reasons}'
                        f'{self._what_there_is()}; record the topic of the gyro')
@@ -288,8 +288,8 @@ class _Reader:
         near = max(found, key=lambda topic: len(
             os.path.commonprefix([topic.strip('/'), gyro.strip('/')])))
         if len(found) > 1:
-            self._notes.append(f'of the temperatures {_listed(found)}, '
-                               'the one named most like the gyro is taken')
+            self._notes.append(f'of the temperatures {_listed(found)}, the one whose name is '
+                               'nearest to the topic of the gyro is used')
         return self._course(near)
 
     def _named(self, wanted: str, role: str) -> str:
@@ -343,8 +343,8 @@ class _Reader:
             place = int(np.argmax(back > _LARGEST_STEP_BACK * NSEC_PER_SEC))
             raise LogError(
                 f'{self._path}: the stamps of {gyro.topic} step back by {_seconds(back[place])} s '
-                f'at sample {place + 1}, as of a clock that was set; cut the recording there, or '
-                'give --rate')
+                f'at sample {place + 1}, as after setting a clock; split the recording there, or '
+                'give the sample rate with --rate')
         self._notes.append(f'{np.count_nonzero(back)} samples came out of order and were sorted')
         return gyro.taken(np.argsort(gyro.stamps, kind='stable'))
 
@@ -359,7 +359,7 @@ class _Reader:
         if other > 1 + _DOUBLED * len(gyro):
             raise LogError(f'{self._path}: {other} of {len(gyro)} samples of {gyro.topic} have '
                            'the stamp of another sample, so their times are unknown; '
-                           'give --rate')
+                           'give the sample rate with --rate')
         self._notes.append(f'{np.count_nonzero(doubled)} samples with the stamp of another one '
                            'were left out')
         return gyro.taken(~doubled)
@@ -383,7 +383,7 @@ class _Reader:
             return None
         return force.copy()
 
-    # Beside the gyro
+    # Temperature and reference
 
     def _temperature(self, course: _Course, begin: np.int64, time: Array) -> Array | None:
         """
@@ -397,7 +397,7 @@ class _Reader:
         at = (course.stamps - begin) / NSEC_PER_SEC
         if (not len(at) or at[0] > time[-1] + _LONG_WITHOUT_TEMPERATURE
                 or at[-1] < -_LONG_WITHOUT_TEMPERATURE):
-            self._notes.append(f'temperature: {course.topic} says none at the times of the gyro, '
+            self._notes.append(f'temperature: {course.topic} has none at the times of the gyro, '
                                'and was left out')
             return None
         self._notes.append(f'temperature: {course.topic} ({course.kind}), {len(at)} readings')
@@ -420,15 +420,15 @@ class _Reader:
         heading = None if wrapped is None else self._continuous(at, wrapped, time, output)
         if (rate is not None and heading is not None and not rate.any()
                 and np.nanmax(heading) - np.nanmin(heading) > 0.1):
-            self._notes.append('the rates of the reference are never filled in, and were left out')
+            self._notes.append('the rates of the reference are all zero, and were left out')
             rate = None
         found: dict[str, Any] = {
             name: _at(time, at, values)
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
-            raise LogError(f'{self._path}: {course.topic} says no heading and no rate at the '
-                           'times of the gyro; name another reference, or see whether both '
+            raise LogError(f'{self._path}: {course.topic} has no heading and no rate at the '
+                           'times of the gyro; name another reference, or check that both '
                            'clocks agree')
         lost = np.isnan(next(iter(found.values()))).mean()
         self._notes.append(f'reference: {course.topic} ({course.kind}), {len(at)} values, '
@@ -440,7 +440,7 @@ class _Reader:
         heading, by_gyro = unwrapped(at, wrapped, time, np.asarray(output))
         if by_gyro:
             self._notes.append('the reference turned by more than half a turn between two values; '
-                               'the gyro says by how much')
+                               'the number of turns was taken from the gyro')
         return heading
 
 

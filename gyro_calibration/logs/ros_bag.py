@@ -219,9 +219,9 @@ class _Budget:
         """
         self._left -= size
         if self._left < 0:
-            raise LogError(f'{self._path}: grows to more than {GROWTH} times its size, as no '
-                           'recording does; record again, or unpack it if that is what was '
-                           'recorded')
+            raise LogError(f'{self._path}: decompresses to more than {GROWTH} times its size, '
+                           'which is the limit; record again, or decompress it first if this is '
+                           'intended')
 
 
 def _unpacked(packed: BinaryIO) -> Iterator[bytes]:
@@ -432,8 +432,8 @@ def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, se
     """
     Open a database for reading only, and give it with the names of its tables.
 
-    It is tried with the files that a killed writer left beside it, without them, and at last as
-    the part that is there. Its tables are read as they are stored: nothing in its schema is
+    It is tried with the files that a killed writer left in its folder, without them, and at last
+    as the part that is there. Its tables are read as they are stored: nothing in its schema is
     computed, since nothing in the file would bound the cost.
 
     """
@@ -458,7 +458,7 @@ def _database(source: Path, path: Path) -> Iterator[tuple[sqlite3.Connection, se
 
 
 def _why(error: Exception | None) -> str:
-    return _printable(str(error) or 'it asks for more memory than there may be')
+    return _printable(str(error) or 'it needs more memory than the limit')
 
 
 def _opened(file: Path, how: str) -> tuple[sqlite3.Connection, set[str]]:

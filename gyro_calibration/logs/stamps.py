@@ -41,7 +41,7 @@ _WHOLE, _EXACT = 0.9, 0.3
 #: Samples over which delayed stamps catch up again: single late ones, and bursts of packets.
 _CATCH_UP, _CATCH_UP_BURSTS = 10, 300
 
-#: Lost samples that can be told from the wander of delayed stamps.
+#: Lost samples that can be distinguished from the wander of delayed stamps.
 _SURELY_LOST = 10
 
 #: A gap of more than 1 / LONG of the record is crossed by no window; a longer window is too long
@@ -116,9 +116,9 @@ def number_stamps(time: Array) -> Stamps:
     uneven = not bursts and float(
         (np.abs(steps / usual - np.round(steps / usual)) > 0.4).mean()) > 0.2
     if uneven or wander > 0.05 * len(time) * interval:
-        raise DataRefused(f'the stamps belong to no even interval (about {usual:g} s; up to '
-                          f'{wander:g} s off); if the samples are even, say with --rate how many '
-                          'there are a second')
+        raise DataRefused(f'the stamps have no even interval (about {usual:g} s; up to '
+                          f'{wander:g} s off); if the samples are even, give the sample rate '
+                          'with --rate')
     return Stamps(time, lost, _numbers(np.minimum(lost, _longest_gap(time))), interval, wander,
                   bursts)
 
@@ -157,7 +157,7 @@ def _usual_interval(time: Array, steps: Array) -> float:
         raise DataRefused(
             f'most stamps are {1000 * usual:.4g} ms apart, but 100 samples take '
             f'{100 * interval:.4g} s: either most samples are lost, or they come in long bursts; '
-            'say with --rate how many there are a second, or record again')
+            'give the sample rate with --rate, or record again')
     whole = np.abs(steps / usual - np.maximum(np.round(steps / usual), 1.0)) < _EXACT
     return (float(steps[whole & (steps < 1.5 * usual)].mean())
             if alike and float(whole.mean()) > _WHOLE else interval)

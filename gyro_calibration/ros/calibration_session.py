@@ -16,7 +16,7 @@ Samples, odometry and commands go in with the time of the steady clock; commands
 `Run.reason` set ('' where its samples are complete); `CalibrationSession.conclude` then fits it.
 
 A foreign command is one that was not sent here: the own commands come back on `cmd_vel` in the
-order in which they were sent, and any other command is that of another node, also a zero beside
+order in which they were sent, and any other command is that of another node, also a zero among
 zeros.
 
 """
@@ -135,7 +135,7 @@ class Run:
         if self.elapsed >= self.duration + self.after:
             return ''
         if math.isinf(self.duration) and self.elapsed > LONGEST:
-            return (f'nobody called finish_calibration within {LONGEST:g} s: call it when the '
+            return (f'finish_calibration was not called within {LONGEST:g} s: call it when the '
                     'robot stands on the mark again')
         return None
 
@@ -210,11 +210,11 @@ class Drive:
     """Time between commands, s."""
 
     def __init__(self, run: Run, clock: Clock, blind: Callable[[], float]):
-        """Begin to wait for somebody who receives the commands; `blind` in s, see `BLIND`."""
+        """Begin to wait for a receiver of the commands; `blind` in s, see `BLIND`."""
         assert run.motion is not None
         self._run, self._motion, self._clock, self._blind = run, run.motion, clock, blind
         self._begun = clock.steady()
-        self._heard, self._suspected, self._due = False, False, -math.inf
+        self._received, self._suspected, self._due = False, False, -math.inf
         self._called = self._alone = False
         # Time of arrival and delay, s, of samples with less delay than any before them.
         self._prompt: deque[tuple[float, float]] = deque()
@@ -231,9 +231,9 @@ class Drive:
         self.sample_lateness = max(self.sample_lateness, now - time - self._prompt[0][1])
 
     def waits(self, receivers: int) -> bool:
-        """Tell whether the run has not begun because nobody receives its commands."""
-        self._heard = self._heard or receivers > 0
-        return not self._heard
+        """Tell whether the run has not begun because no node receives its commands."""
+        self._received = self._received or receivers > 0
+        return not self._received
 
     def fault(self, receivers: int, ros_time_stands: bool) -> str:
         """Return why the run must end; '' where it goes on."""
@@ -244,15 +244,15 @@ class Drive:
             return self._not_received
         if ros_time_stands:
             return STANDING_TIME
-        # Decided at the second look: after a pause of this process the samples that wait in its
+        # Decided at the second poll: after a pause of this process the samples that wait in its
         # queue come after its timers.
         silence = now - self._run.received
         before, self._suspected = self._suspected, silence > self._blind()
-        return (f'no sample came for {silence:.2f} s while the robot was driven: look at the gyro '
+        return (f'no sample came for {silence:.2f} s while the robot was driven: check the gyro '
                 'and its driver') if before and self._suspected else ''
 
     def is_abandoned(self, callers: int) -> bool:
-        """Tell whether the callers of the service, who were there, are gone at two looks."""
+        """Tell whether the callers of the service have left, at two polls."""
         self._called = self._called or callers > 0
         before, self._alone = self._alone, self._called and not callers
         return before and self._alone
@@ -281,13 +281,13 @@ class Drive:
                      'to its topic, or change cmd_vel_stamped')
 
     def lateness(self, limits: Limits) -> str:
-        """Say how late commands and samples were, where that turns the robot beyond the limit."""
+        """Return how late commands and samples were, where that exceeds the residual limit."""
         fastest = float(np.abs(self._motion.rate_at(
             np.linspace(0.0, self._motion.duration, 1000))).max())
         if max(self.command_lateness, self.sample_lateness) * fastest <= limits.residual:
             return ''
         return (f'this computer was busy: commands were up to {self.command_lateness:.2f} s '
-                f'late and samples up to {self.sample_lateness:.2f} s; give it less to do and '
+                f'late and samples up to {self.sample_lateness:.2f} s; reduce its load and '
                 'run again')
 
 
@@ -378,8 +378,7 @@ class CalibrationSession:
 
     def _commanded(self) -> str:
         if self._clock.steady() - self._others < 1.0:
-            return ('another node sends commands on cmd_vel: stop it, or take the robot from it, '
-                    'and run again')
+            return 'another node sends commands on cmd_vel: stop it, and run again'
         return ''
 
     def _blind(self) -> float:
@@ -415,7 +414,7 @@ class CalibrationSession:
         if alone and STOPPING < late < 2.0 * STOPPING and abs(rate) > math.radians(1.0):
             self.warning = (f'odom shows that the robot turned at {rate / DEGREE:.0f} deg/s '
                             f'{late:.1f} s after it was commanded to stop: set the command '
-                            'time-out of its base, and look at who else commands it')
+                            'time-out of its base, and check for other nodes that command it')
 
     def add_command(self, velocity: Velocity) -> None:
         """
@@ -432,8 +431,8 @@ class CalibrationSession:
                 return
         self._others = self._clock.steady()
         if self._drive:
-            self.end('another node sent a command on cmd_vel while the robot was driven; it has '
-                     'the robot now: stop it and run again')
+            self.end('another node sent a command on cmd_vel while the robot was driven, and '
+                     'controls the robot now: stop that node and run again')
 
     # Guards
 
@@ -467,18 +466,18 @@ class CalibrationSession:
             self._command_if_due(self._drive)
         suspected, self._suspected = self._suspected, self._clock.steady() - run.received > SILENCE
         if suspected and self._suspected:
-            self.end(f'no sample came for {SILENCE:g} s: look at the gyro and its driver')
+            self.end(f'no sample came for {SILENCE:g} s: check the gyro and its driver')
 
     def see_callers(self, count: int) -> None:
         """Take the number of clients of the service, a few times a second; a drive wants one."""
         if self._drive and self._drive.is_abandoned(count):
-            self.end('the program that called calibrate is gone, and nobody waits for the answer: '
-                     'let it run until then')
+            self.end('the program that called calibrate has ended before the answer: keep it '
+                     'running until the answer')
 
     def interrupt(self, reason: str) -> None:
         """End a run over which integration began anew."""
         if self.run and self.run.times:
-            self.end(f"{reason}: look at the gyro's line and run again")
+            self.end(f'{reason}: check the cable of the gyro and run again')
 
     def _command_if_due(self, drive: Drive) -> None:
         """Send the next command, at a sample or at a look: a simulation may be a fast one."""
@@ -511,7 +510,7 @@ class CalibrationSession:
         if run is None or run.kind not in (ODOMETRY, TURNS):
             return False, 'no calibration by turns or by odometry is in progress'
         if not run.times:
-            return False, ('no sample has come since the calibration began: look at the gyro and '
+            return False, ('no sample has come since the calibration began: check the gyro and '
                            'its driver')
         return True, run.finish()
 
@@ -536,7 +535,7 @@ class CalibrationSession:
         except DataRefused as error:
             late = drive.lateness(self._rules.limits) if drive and not run.reason else ''
             return False, f'{late} (the run shows: {error})' if late else str(error)
-        except Exception as error:  # the robot stands, the caller hears of it, the node goes on
+        except Exception as error:  # the robot stands, the caller is informed, the node continues
             return False, f'the fit failed and nothing was changed: {error!r}'
         finally:
             if drive:
@@ -602,8 +601,8 @@ def _odometry_motion(run: Run) -> tuple[float, Motion]:
     increases = len(rows) > 1 and bool((np.diff(rows[:, 0]) > 0.0).all())
     if len(rows) < 10 or not increases or np.ptp(rows[:, 0]) < 0.8 * run.duration:
         raise DataRefused(
-            f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 over '
-            'most of the run, with stamps that increase, are needed: look at the odometry')
+            f'{len(rows)} messages came on odom in {run.duration:.0f} s, but at least 10 with '
+            'increasing stamps over most of the run are needed: check the odometry')
     time, heading, rate = rows.T
     heading = np.unwrap(heading)
     turned = np.ptp(heading) > _TURNED
@@ -629,7 +628,7 @@ def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion,
         if after is not None:
             rest = check_rest(time[after], rate[after], fit, noise, limits)
             fit = rest.fit
-            remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, up to '
-                           f'{rest.limit / DEGREE:.4f} is explained')
+            remarks.append(f'at rest after it the rate was {rest.rate / DEGREE:.4f} deg/s, limit '
+                           f'{rest.limit / DEGREE:.4f} deg/s')
     method = 'odometry' if odometry else 'likelihood'
     return record(fit, method, when, run.temperature), '; '.join(remarks)

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""The clocks of a node: even seconds, the date, and ROS time, which may stand still."""
+"""The clocks of a node: steady seconds, the date, and ROS time, which may be paused."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What a node reads its times from; tests bring their own."""
+    """The clocks that a node reads; tests have their own."""
 
     def steady(self) -> float:
-        """Return seconds that nobody sets; every guard and time-out looks at these."""
+        """Return seconds of the steady clock, which all guards and time-outs use."""
 
     def date(self) -> float:
         """Return seconds since 1970 by the clock of the host."""
 
     def simulated(self) -> float | None:
-        """Return the time of a simulation, s, 0 before it began; None where there is none."""
+        """Return simulated time, s, 0 before the simulation starts; None without one."""
 
 
 class RosTime:
     """
-    Whether ROS time goes on.
+    Whether ROS time advances.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class RosTime:
         self.standing = 0.0
         self._last, self._changed = -1.0, 0.0
 
-    def look(self, clock: Clock) -> float:
-        """Compare with the last look, and return `standing`; inf before a simulation begins."""
+    def poll(self, clock: Clock) -> float:
+        """Compare with the last poll, and return `standing`; inf before a simulation starts."""
         now, time = clock.steady(), clock.simulated()
         if time is not None and time != self._last:
             self._last, self._changed = time, now

@@ -60,7 +60,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
-#: Between two looks at who is there and whether time goes on, s.
+#: Between two polls of publishers, receivers and clocks, s.
 _WATCH_INTERVAL = 0.2
 _NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
 _UNMEASURED = (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0,
@@ -75,7 +75,7 @@ class NodeClock:
         self._clock = node.get_clock()
 
     def steady(self) -> float:
-        """Return seconds that nobody sets."""
+        """Return seconds of the steady clock."""
         return steady()
 
     def date(self) -> float:
@@ -146,7 +146,7 @@ class CompensationNode(Node):
         self._values = values
         self._pipeline.set(values)
 
-    # What comes in
+    # Subscriptions
 
     def _on_temperature(self, message: Temperature) -> None:
         self._pipeline.temperature(_stamp(message.header), message.temperature)
@@ -172,7 +172,7 @@ class CompensationNode(Node):
         if self._waiting:
             self._answer_ended()
 
-    # What goes out
+    # Publishers
 
     def _publish(self, imu: Imu, found: Output) -> None:
         """Publish the message that came with its z corrected, and the heading."""
@@ -224,7 +224,7 @@ class CompensationNode(Node):
         self._status.publish(status_array(self, 'calibration', status))
 
     def _watch(self) -> None:
-        """Look who is there, whether time goes on, and whether the report has become worse."""
+        """Poll publishers, receivers, clocks and the level of the report."""
         names = [f'{each.node_namespace.rstrip("/")}/{each.node_name}'
                  for each in self.get_publishers_info_by_topic(self._samples.topic_name)]
         self._pipeline.publishers(names)
@@ -274,7 +274,7 @@ class CompensationNode(Node):
         return self._waiting[1]
 
     def _answer_ended(self) -> None:
-        """Fit a run that has ended, use what it gives, and answer who asked for it."""
+        """Fit a run that has ended, use its calibration, and answer the service."""
         session = self._pipeline.session
         if not self._waiting or session.run is None or session.run.reason is None:
             return
@@ -323,7 +323,7 @@ class CompensationNode(Node):
         return self._pipeline.obstacle()
 
     def _learn_to_drive(self) -> str:
-        """Become a publisher of cmd_vel, or return why not; who never drives is none."""
+        """Become a publisher of cmd_vel, or return why not; only before a first drive."""
         if self._velocity is None:
             kind = TwistStamped if self._stamped else Twist
             try:

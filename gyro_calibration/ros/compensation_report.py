@@ -38,7 +38,7 @@ class CompensationReport:
 
     def level(self) -> bytes:
         """Return the level that a report would have now."""
-        return self._judge(self._growing())[0]
+        return self._evaluate(self._growing())[0]
 
     def make(self) -> Report:
         """Return level, message and values; a count is a warning only while it grows."""
@@ -47,14 +47,14 @@ class CompensationReport:
         seconds = now - self._asked
         rate = (counts['samples'] - self._before['samples']) / seconds if seconds > 0.0 else 0.0
         self._before, self._asked = dict(counts), now
-        return *self._judge(growing), self._values(rate)
+        return *self._evaluate(growing), self._values(rate)
 
     def _growing(self) -> set[str]:
         counts = self._pipeline.journal.counts
         return {name for name, count in counts.items()
                 if count - self._before.get(name, 0) > _TOLERATED.get(name, 0)}
 
-    def _judge(self, growing: set[str]) -> tuple[bytes, str]:
+    def _evaluate(self, growing: set[str]) -> tuple[bytes, str]:
         pipeline = self._pipeline
         silent = self._clock.steady() - pipeline.journal.received
         if error := pipeline.store.problem or pipeline.conflict or pipeline.several:
@@ -70,7 +70,7 @@ class CompensationReport:
         if 'rebuilt' in growing:
             return ERROR, pipeline.journal.event
         estimator, store, monitor = pipeline.estimator, pipeline.store, pipeline.monitor
-        missing = [f'the model needs the {channel.replace("_", " ")}, which no message brings; '
+        missing = [f'the model needs the {channel.replace("_", " ")}, which no message contains; '
                    'that effect is left out'
                    for channel in estimator.missing(pipeline.journal.channels)]
         others = (pipeline.session.warning, store.hint, store.shared_hint, monitor.bias_alarm,
@@ -80,7 +80,7 @@ class CompensationReport:
         if warnings:
             return WARN, warnings[0]
         tracked = pipeline.estimator.tracker.slowest_noticed > 0.0
-        return OK, 'heading goes on' + ('' if tracked else '; the bias is not tracked at rest')
+        return OK, 'heading goes on' + ('' if tracked else '; the bias is not estimated at rest')
 
     def _counted(self, growing: set[str]) -> list[str]:
         low, high = self._pipeline.estimator.model.temperature_range
@@ -88,14 +88,14 @@ class CompensationReport:
         texts = {
             'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
             'refused_temperatures': event,
-            'lost_samples': 'samples are lost: look at the cable, the baud rate and the load of '
-                            'the computer; the heading goes on over the gaps, and its variance '
-                            'allows for them',
+            'lost_samples': 'samples are lost: check the cable, the baud rate and the load of '
+                            'the computer; the heading is integrated over the gaps, and its '
+                            'variance includes them',
             'beyond_range': 'the rate is beyond the calibrated range; the correction is '
                             'extrapolated',
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
                                    f'{high:g} degC; the correction is extrapolated, and its '
-                                   'variance grows'}
+                                   'variance increases'}
         return [text for name, text in texts.items() if name in growing]
 
     def _values(self, rate: float) -> dict[str, object]:
@@ -127,15 +127,16 @@ class CompensationReport:
         moving = wheels.moving(now)
         method = pipeline.values.stationary_method
         if method == 'rest' and not pipeline.estimator.model.noise.angle_random_walk:
-            method = ('threshold, as the model has no angle random walk: measure it (allan), and '
-                      'rests are found and used')
+            method = ('threshold, since the model has no angle random walk: measure it with '
+                      'allan for the method rest')
         unseen = moving is None and not math.isnan(slowest)
         return {
             'stationary_method': method, 'resting': tracker.resting,
             'bias_deg_s': f'{bias / DEGREE:.5f}',
             'bias_standard_deviation_deg_s': f'{deviation / DEGREE:.5f}',
             'slowest_noticed_turn_deg_s': f'{slowest:.4f}',
-            'slow_turns': 'without wheels or commands, slower turns cannot be told from drift'
+            'slow_turns': 'without wheels or commands, slower turns cannot be distinguished from '
+                          'drift'
             if unseen else '',
             'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
             'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else ''}
@@ -149,7 +150,7 @@ def _temperature(estimator: HeadingEstimator) -> list[str]:
                 f'{reference:g} degC')
         return [text] if estimator.model.looks_at('temperature') else []
     text = (f'no temperature comes any more; the last one, {estimator.temperature:.1f} degC, is '
-            'held, and the bias becomes less and less known')
+            'held, and the standard deviation of the bias increases')
     return [text] if estimator.temperature_is_lost else []
 
 
@@ -195,5 +196,5 @@ def calibration_status(store: StateStore, run: Run | None
     if store.hint:
         return WARN, store.hint, values
     if not calibration:
-        return WARN, 'no self-calibration yet; call calibrate', values
+        return WARN, 'no self-calibration is stored; call calibrate', values
     return OK, str(calibration), values

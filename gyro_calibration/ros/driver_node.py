@@ -73,8 +73,8 @@ PARAMETERS = (
 )
 
 _REPORT_INTERVAL = 1.0  # s
-_WATCH_INTERVAL = 0.5  # s; between two looks whether the port is still read
-_CLOCK_INTERVAL = 0.01  # s; between two looks at the node's clock, which cost as much as a message
+_WATCH_INTERVAL = 0.5  # s; between two checks that the thread runs
+_CLOCK_INTERVAL = 0.01  # s; between two readings of the node's clock, which cost as a message does
 
 
 class DriverNode(Node):
@@ -103,7 +103,7 @@ class DriverNode(Node):
         self._messages = Messages(values.frame_id)
         self._imu = publish_on(self, Imu, 'imu/data_raw')
         self._temperature = publish_on(self, Temperature, 'imu/temperature')
-        self._time, self._looked, self._problem = NodeTime(), 0.0, ''
+        self._time, self._polled, self._problem = NodeTime(), 0.0, ''
         self._report = DriverReport(self._connection, values.port, self._settings, steady)
         self._diagnostics = Diagnostics(self, 'gyro', self._report.make, values.port)
         if self.get_parameter('use_sim_time').value:
@@ -128,7 +128,7 @@ class DriverNode(Node):
 
     def _work(self) -> None:
         for chunk in self._connection.chunks(self._stop):
-            self._look_at_the_clock(chunk.arrival)
+            self._poll_clock(chunk.arrival)
             self._report.add(chunk.samples)
             protocol, clock = self._connection.protocol, self._connection.clock
             assert protocol is not None and clock is not None  # they made the samples
@@ -148,13 +148,13 @@ class DriverNode(Node):
             self._temperature.publish(self._messages.temperature)
         self._imu.publish(self._messages.imu)
 
-    def _look_at_the_clock(self, arrival: float) -> None:
-        if arrival - self._looked < _CLOCK_INTERVAL:
+    def _poll_clock(self, arrival: float) -> None:
+        if arrival - self._polled < _CLOCK_INTERVAL:
             return
         read = read_together(steady, self._now)
-        if read is None and self._looked:
+        if read is None and self._polled:
             return
-        self._looked = arrival
+        self._polled = arrival
         step = self._time.watch(*(read or (arrival, self._now())))
         if step and not self.get_parameter('use_sim_time').value:
             self._report.add_clock_step(step)
@@ -164,7 +164,7 @@ class DriverNode(Node):
         return self.get_clock().now().nanoseconds / NSEC_PER_SEC or time.time()
 
     def _on_change(self, state: State) -> None:
-        """Log at once where a connection fails or comes back, but not again at each attempt."""
+        """Log once where a connection fails or is restored, not at each attempt."""
         if state.problem:
             self._flush()
             self._report.clear()

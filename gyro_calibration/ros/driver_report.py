@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""What the driver reports of its gyro in the diagnostics."""
+"""The diagnostics of the driver."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OPENING = {'opening': 'opening the port', 'listening': 'listening for a protoco
 
 class DriverReport:
     """
-    Judges the state of a connection, once a second.
+    Reports the state of a connection, once a second.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class DriverReport:
         As it was given.
     settings : Settings
     clock : callable
-        Returns seconds that nobody sets.
+        Returns seconds of the steady clock.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class DriverReport:
     def make(self) -> Report:
         """Return level, message and values."""
         counts = self._count()
-        return *self._judge(), {
+        return *self._evaluate(), {
             **self._of_the_port(),
             **vars(counts),
             'rate_hz': f'{self._rate:.1f}',
@@ -97,7 +97,7 @@ class DriverReport:
             self._last, self._last_time = counts, now
         return counts
 
-    def _judge(self) -> tuple[bytes, str]:
+    def _evaluate(self) -> tuple[bytes, str]:
         state = self._connection.state
         if state.name == 'failed':
             return ERROR, state.problem

@@ -59,14 +59,14 @@ class Rest:
     Attributes
     ----------
     time : of its end, s
-    noise_ratio : standard deviation of the noise over the one that the model claims
+    noise_ratio : standard deviation of the noise over that of the model
     noise_fits : whether that is within chance and tolerance
     bias : mean rate, rad/s
     sigmas : of the mean, in standard deviations of what the model explains; nan where the model
         does not give the accuracy of the bias
     bias_fits : whether that is within chance
     bias_deviation : standard deviation of the mean by the noise of this stretch, rad/s
-    promised : whether the rest was announced
+    announced : whether the rest was announced
 
     """
 
@@ -77,7 +77,7 @@ class Rest:
     sigmas: float
     bias_fits: bool
     bias_deviation: float
-    promised: bool
+    announced: bool
 
 
 @dataclass
@@ -161,7 +161,7 @@ class HealthMonitor:
         gathered.rate.append(rate)
         return time - gathered.time[0] >= STRETCH
 
-    def examine(self, bias_variance: float, age: float, promised: bool = False) -> Rest | None:
+    def examine(self, bias_variance: float, age: float, announced: bool = False) -> Rest | None:
         """
         Examine the stretch that is complete, and begin the next.
 
@@ -169,7 +169,7 @@ class HealthMonitor:
         ----------
         bias_variance : of the bias by its calibration, (rad/s)²; nan where it is not known
         age : of that calibration, s
-        promised : whether the rest was announced
+        announced : whether the rest was announced
 
         Returns
         -------
@@ -181,21 +181,21 @@ class HealthMonitor:
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
         rest = examine(time, output, rate, self._noise, self._level, self._step, bias_variance,
-                       age, promised)
+                       age, announced)
         if rest is not None:
             self.last, self.examined = rest, self.examined + 1
             self._rests = [*self._rests, rest][-_IN_A_ROW:]
-            self._judge(rest)
+            self._set_alarms(rest)
         return rest
 
-    def _judge(self, rest: Rest) -> None:
+    def _set_alarms(self, rest: Rest) -> None:
         if rest.noise_fits:
             self.noise_alarm = ''
-        elif rest.promised or self._in_a_row('noise_fits'):
+        elif rest.announced or self._in_a_row('noise_fits'):
             self.noise_alarm = _noise_sentence(rest)
         if rest.bias_fits:
             self.bias_alarm = ''
-        elif (rest.promised or abs(rest.bias) < self.standing
+        elif (rest.announced or abs(rest.bias) < self.standing
               or self._in_a_row('bias_fits') and self._stays()):
             self.bias_alarm = _bias_sentence(rest)
 
@@ -211,7 +211,7 @@ class HealthMonitor:
 
 def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
             step: float = 0.0, bias_variance: float = math.nan, age: float = 0.0,
-            promised: bool = False) -> Rest | None:
+            announced: bool = False) -> Rest | None:
     """
     Test a stretch of samples against noise and bias of a model.
 
@@ -224,7 +224,7 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     noise : of the model
     level : chance of each of the four false alarms
     step : between the codes of the output, rad/s; inf where the output never changed
-    bias_variance, age, promised : as in `HealthMonitor.examine`
+    bias_variance, age, announced : as in `HealthMonitor.examine`
 
     Returns
     -------
@@ -250,7 +250,7 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     too_little = not hidden and chdtr(count, count * measured * QUIET ** 2 / claimed) < level
     return Rest(float(time[-1]), math.sqrt(measured / claimed), not (too_much or too_little),
                 *_bias(time, rate, largest * size * interval, noise, level, bias_variance, age,
-                       0.5 * step if hidden else 0.0), promised)
+                       0.5 * step if hidden else 0.0), announced)
 
 
 def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
@@ -299,23 +299,22 @@ def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: 
     differences = np.array([after.scale_factor_error - before.scale_factor_error,
                             after.bias - before.bias])
     sigmas = np.abs(differences) / np.sqrt(variances)
-    said = [text for text, size in zip(
-        (f'the scale factor error by {100 * differences[0]:.3f} %',
-         f'the bias by {differences[1] / DEGREE:.4f} deg/s'), sigmas)
-            if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
-    return (f'that is more than the model explains: it changed {" and ".join(said)}; '
-            'if it does so again, diagnose a log' if said else '')
+    found = [f'the {name} changed by {text} ({size:.1f} sigma)' for name, text, size in zip(
+        ('scale factor error', 'bias'),
+        (f'{100 * differences[0]:.3f} %', f'{differences[1] / DEGREE:.4f} deg/s'), sigmas)
+        if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
+    return (f'{" and ".join(found)}, more than the model predicts; '
+            'if this occurs again, diagnose a log' if found else '')
 
 
 def _noise_sentence(rest: Rest) -> str:
     remedy = ('record a log at rest, and run allan or diagnose on it' if rest.noise_ratio > 1.0
-              else 'look whether the gyro is alive')
-    shaken = '' if rest.promised or rest.noise_ratio < 1.0 else ', or the robot shakes'
-    return (f'the noise at rest is {rest.noise_ratio:.2f} times what the model claims{shaken}: '
+              else 'check that the gyro responds to turns')
+    shaken = '' if rest.announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
+    return (f'the noise at rest is {rest.noise_ratio:.2f} times that of the model{shaken}: '
             f'{remedy}')
 
 
 def _bias_sentence(rest: Rest) -> str:
     return (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, {rest.sigmas:.0f} '
-            'standard deviations of what the model explains: calibrate, and if it comes back, '
-            'diagnose a log')
+            'sigma of the model: calibrate, and if this occurs again, diagnose a log')

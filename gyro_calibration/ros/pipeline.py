@@ -135,7 +135,7 @@ class Journal:
     counts : of samples, and of what was wrong with some
     event : the last, in words
     refused : number of refused calibrations, and the last reasons
-    channels : those that samples bring beside the rate
+    channels : further quantities in the samples
     clock_steps : of the clock of the host, in words; ''
 
     """
@@ -226,7 +226,7 @@ class Pipeline:
         return 1e-9 * (stamp - self._epoch)
 
     def _time(self, stamp: int) -> float:
-        """Return the time of what came beside the samples, s."""
+        """Return the time of a message other than a sample, s."""
         since = self._since_epoch(stamp)
         return since if self._last == -math.inf else self._host.of_other(since, self._last)
 
@@ -244,8 +244,8 @@ class Pipeline:
         read = read_together(clock.steady, clock.date)
         if not read or not (step := self._host.watch(*read)):
             return
-        journal.event = (f'the clock of this computer was set by {step:+.1f} s; the heading goes '
-                         'on')
+        journal.event = (f'the clock of this computer was set by {step:+.1f} s; the heading '
+                         'continues')
         journal.clock_steps = f'{self._host.steps.count}, last by {step:+.1f} s'
         self.estimator.clock_was_set(step)
         if self.store.written is not None:
@@ -264,7 +264,7 @@ class Pipeline:
         refused = self.estimator.refused_temperatures
         if refused > self.journal.counts['refused_temperatures']:
             self.journal.counts['refused_temperatures'] = refused
-            self.journal.event = f'a temperature of {value:g} degC is not plausible, and not used'
+            self.journal.event = f'a temperature of {value:g} degC is implausible and not used'
 
     def odometry(self, stamp: int, heading: float, velocity: Velocity) -> None:
         """Take a heading, rad, and a velocity by the wheels."""
@@ -300,8 +300,8 @@ class Pipeline:
         counts['samples'] += 1
         if not 0 <= stamp < _END_OF_TIME:
             counts['refused_samples'] += 1
-            journal.event = f'a stamp of {stamp / NSEC_PER_SEC:g} s is none of ROS time; the ' \
-                            'sample is not used'
+            journal.event = (f'a stamp of {stamp / NSEC_PER_SEC:g} s is outside the range of ROS '
+                             'time; the sample is not used')
             return None
         if stamp < self._newest:
             self._see_jump(now)
@@ -321,7 +321,7 @@ class Pipeline:
             journal.event = f'the stamp stands still at {time:.3f} s; the sample is not used'
             return None
         if self._standing is not None:
-            self._doubt_standing(now)
+            self._add_unseen_turn(now)
         gap = not 0.0 < time - self._last <= self.values.maximum_gap
         if not gap:
             self._interval = min(time - self._last, self.estimator.tracker.intervals.usual)
@@ -331,7 +331,7 @@ class Pipeline:
         journal.channels = set() if specific_force is None else {'specific_force'}
         return self._use(stamp, time, gap, output, specific_force, now, receivers)
 
-    def _doubt_standing(self, now: float) -> None:
+    def _add_unseen_turn(self, now: float) -> None:
         """Add to the variance what the gyro may have turned while its stamps stood still."""
         (first, fastest), self._standing = self._standing or (now, 0.0), None
         if now - first > BLIND:
@@ -339,14 +339,14 @@ class Pipeline:
             tracker = self.estimator.tracker
             self.estimator.rewind(tracker.heading, tracker.variance + turned ** 2)
             self.journal.event = (f'the stamps stood still for {now - first:.1f} s while samples '
-                                  'came; what turned meanwhile is not in the heading')
+                                  'came; turns in this time are not in the heading')
 
     def _see_jump(self, now: float) -> None:
         """Take the second jump back of the stamps within 1 s for those of several publishers."""
         self._jumps.append(now)
         if len(self._jumps) > 1 and now - self._jumps[0] < _INTERLEAVED:
-            self._refuse_all('the stamps on imu/data_raw jump back again and again, as those of '
-                             'several gyros on one topic do: give each gyro a topic of its own')
+            self._refuse_all('the stamps on imu/data_raw jump back repeatedly, as with several '
+                             'gyros on one topic: give each gyro a topic of its own')
 
     def _was_silent(self, time: float, now: float) -> bool:
         """Tell whether the gyro may have been without power, and samples did not only wait."""
@@ -363,8 +363,8 @@ class Pipeline:
         restarted = estimator.add(time, output, self._clock.date(), force, moving)
         if estimator.refused > refused:
             counts['refused_samples'] += 1
-            self.journal.event = (f'a rate of {output:g} rad/s came, which is beyond what this '
-                                  'gyro reports: the sample is not used')
+            self.journal.event = (f'a rate of {output:g} rad/s is beyond the range of this gyro: '
+                                  'the sample is not used')
             return None
         self.journal.received, tracker = now, estimator.tracker
         counts['temperature_clipped'] += int(estimator.last.temperature_clipped)
@@ -405,16 +405,16 @@ class Pipeline:
     def _note_restart(self, reason: str) -> None:
         self.monitor.restart()
         self.journal.counts['restarts'] += 1
-        self.journal.event = f'{reason}: integration began anew'
+        self.journal.event = f'{reason}: integration was restarted'
         self._recent.clear()
         self.session.interrupt(reason)
 
-    # What must not go on
+    # Conflicts and obstacles
 
     def _refuse_all(self, conflict: str) -> None:
         """Use no more samples, and go back to the heading from before the conflict."""
         if not self.conflict:
-            # Nobody knows what is turned until one gyro sends alone: as much as any direction.
+            # Turns are unknown until one gyro sends alone: the variance is that of any direction.
             heading, variance = self._good
             self.estimator.rewind(heading, variance + math.tau ** 2)
             self.journal.event = conflict
@@ -424,8 +424,8 @@ class Pipeline:
     def publishers(self, names: Sequence[str]) -> None:
         """Take the nodes that publish the samples, a few times a second."""
         self.several = '' if len(names) < 2 else (
-            f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), whose '
-            'samples cannot be told apart: give each gyro a topic of its own')
+            f'{len(names)} publishers send on imu/data_raw ({", ".join(sorted(names))}), and '
+            'their samples cannot be distinguished: give each gyro a topic of its own')
         self._same_name = len(names) > len(set(names)) == 1
         if not self.several:
             self._switches = 0
@@ -457,26 +457,26 @@ class Pipeline:
     def obstacle(self) -> str:
         """Return why the robot must not be driven now; '' where nothing stands against it."""
         now = self._clock.steady()
-        if self.ros_time.look(self._clock) > BLIND:
+        if self.ros_time.poll(self._clock) > BLIND:
             return STANDING_TIME
         if conflict := self.conflict or self.several:
             return conflict
         if not self._recent or now - self.journal.received > 1.0:
-            return 'no sample comes on imu/data_raw: look at the gyro and its driver'
+            return 'no sample comes on imu/data_raw: check the gyro and its driver'
         if self.wheels.moving(now):
-            return ('odom or cmd_vel shows that the robot moves: let it stand, and run again')
+            return 'odom or cmd_vel shows that the robot moves: stop it, and run again'
         bias, deviation = self.estimator.tracker.bias
         rate = sum(each for _, each in self._recent) / max(len(self._recent), 1) - bias
         noise = self.store.model.noise.angle_random_walk / math.sqrt(_LOOKED_BACK)
         if abs(rate) > _SIGMAS * math.hypot(deviation, noise, self._tracking.threshold.rate):
-            return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: let the robot stand, or '
-                    'call calibrate_bias first where it does')
+            return (f'the gyro shows a turn at {rate / DEGREE:.2f} deg/s: stop the robot, or, if '
+                    'it stands, call calibrate_bias first')
         return ''
 
     # Now and then
 
     def set(self, values: SimpleNamespace) -> None:  # noqa: A003
-        """Go on with other values of the parameters."""
+        """Continue with other values of the parameters."""
         self.values = values
         tracking = tracker_settings(values, self.store.model.noise)
         if tracking != self._tracking:
@@ -485,8 +485,8 @@ class Pipeline:
             self.monitor.standing = tracking.threshold.rate
 
     def watch(self, receivers: int) -> None:
-        """Look whether time and samples go on; to be called several times a second."""
-        standing = self.ros_time.look(self._clock) > BLIND
+        """Check that time and samples advance; to be called several times a second."""
+        standing = self.ros_time.poll(self._clock) > BLIND
         # A robot is not driven by samples that may be those of another gyro in a moment.
         conflict = self.conflict or (self.several if self.session.drives else '')
         self.session.watch(self.values, receivers, standing, conflict)
@@ -499,13 +499,13 @@ class Pipeline:
         if event := self.estimator.learn(date, ending):
             self.journal.event = event
         self.store.keep_table(date, ending)
-        self.store.look()
+        self.store.poll()
 
     def reset(self) -> str:
-        """Call this direction zero; return what was done."""
+        """Set the heading to zero; return the answer of the service."""
         self.estimator.reset()
         self._good = 0.0, 0.0
-        if self.conflict:  # it goes on turning unseen
+        if self.conflict:  # turns are not measured
             self.estimator.rewind(0.0, math.tau ** 2)
         return 'the heading is zero here and now'
 

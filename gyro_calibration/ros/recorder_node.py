@@ -41,7 +41,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 _DEPTH = 5000  # as SENSOR_QOS: 5 s at 1 kHz are kept while a recorder is busy
 _LAST = 10.0  # s; longest time for taking what had come before a busy recorder is stopped
-_LOOK_INTERVAL = 0.3  # s; between two queries of the graph
+_POLL_INTERVAL = 0.3  # s; between two queries of the graph
 _LARGEST_DOMAIN = 232  # beyond it the ports of UDP end, and Fast DDS ends the process
 _LINE = '=' * 80
 _WORDS = {'double': 'float64', 'float': 'float32', 'boolean': 'bool', 'octet': 'byte'}
@@ -84,8 +84,8 @@ class RecorderNode(Node):
         self._everything, self._take = everything, take
         self._subscriptions_of: dict[str, tuple] = {}
         self._begin = time.time_ns() - round(steady() * NSEC_PER_SEC)
-        self.look()
-        call_every(self, _LOOK_INTERVAL, self.look)
+        self.poll()
+        call_every(self, _POLL_INTERVAL, self.poll)
 
     @property
     def missing(self) -> list[str]:
@@ -96,7 +96,7 @@ class RecorderNode(Node):
         """Return the topics in the graph."""
         return sorted(name for name, _ in self.get_topic_names_and_types())
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Subscribe to what is new in the graph."""
         for topic, kinds in self.get_topic_names_and_types():
             wanted = topic in self.topics or self._everything
@@ -134,7 +134,7 @@ def _resolved(node: Node, topic: str) -> str:
     try:
         return str(node.resolve_topic_name(topic))
     except (RuntimeError, ValueError) as error:
-        raise LogError(f'{topic} is no name of a topic ({_reason(error)}); name another') from None
+        raise LogError(f'{topic} is no topic name ({_reason(error)}); give another') from None
 
 
 def _reason(error: Exception) -> str:
@@ -241,10 +241,9 @@ def _take_what_came(executor: SingleThreadedExecutor, node: RecorderNode) -> Non
 def _start(context: rclpy.Context) -> None:
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > _LARGEST_DOMAIN:
-        raise LogError(f'ROS_DOMAIN_ID is {domain}, but the largest is {_LARGEST_DOMAIN}; '
-                       'set another')
+        raise LogError(f'ROS_DOMAIN_ID is {domain}, but must be from 0 to {_LARGEST_DOMAIN}')
     try:
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:
         raise LogError(f'ROS 2 cannot be started ({_reason(error)}); '
-                       'set its variables otherwise') from None
+                       'check its environment variables') from None

@@ -172,8 +172,8 @@ def call_every(node: Node, period: float, callback: Callable[[], None]) -> Timer
     """
     Call again and again while the node spins, each time after a period, s, of the steady clock.
 
-    By the clock of the node, as rclpy's timers go by themselves, all would rest for an hour when
-    somebody sets the clock back by one, and for ever where a simulation does not go on.
+    By the clock of the node, the default of rclpy's timers, all would stop for an hour when the
+    clock is set back by one, and for ever when a simulation is paused.
 
     """
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -277,11 +277,11 @@ def spin(node: Node, stop: threading.Event) -> None:
         while not stop.is_set():
             serving.spin_once(timeout_sec=timeout)
     except ExternalShutdownException:
-        pass  # somebody else shut rclpy down: the same end
+        pass  # rclpy was shut down elsewhere
     finally:
         serving.shutdown()
-        # Fast DDS 2.14 waits for ever, with the GIL held, where it hears of another node's end at
-        # the moment of its own, as after Ctrl-C.
+        # Fast DDS 2.14 waits for ever, with the GIL held, when it receives the end of another node
+        # at the moment of its own, as after Ctrl-C.
         faulthandler.dump_traceback_later(ENDING, exit=True)
         node.destroy_node()
         faulthandler.cancel_dump_traceback_later()

@@ -63,15 +63,15 @@ class StateStore:
         self.shared_hint, self._seen = '', {file: _version(file)
                                             for file in (calibration_file, bias_file)}
 
-    def look(self) -> None:
-        """Look whether another process has written to the files; to be called now and then."""
+    def poll(self) -> None:
+        """Check whether another process has written to the files; to be called regularly."""
         for file, seen in self._seen.items():
             found = _version(file)
             if found is not None and found != seen:
                 self.shared_hint = plain(
-                    f'{file} was written by somebody else, and whoever writes next replaces that: '
+                    f'{file} was written by another process, and the next writer replaces it: '
                     'give each node a calibration_file of its own, or restart this one to use '
-                    'what is there')
+                    'that file')
 
     def _written(self, file: Path, version: tuple[int, int]) -> None:
         self.shared_hint, self._seen[file] = '', version
@@ -104,7 +104,7 @@ class StateStore:
             self._written(self._calibration_file, write_model(self._calibration_file, self.model))
         except (OSError, ArithmeticError) as error:
             wanted = (remedy(error, self._calibration_file) if isinstance(error, OSError)
-                      else 'see whether the rates are right')
+                      else 'check the rates')
             self.hint = plain(f'the calibration is in use but NOT STORED ({reason(error)}): '
                               f'{wanted}, and calibrate again')
         return self.hint
@@ -126,7 +126,7 @@ class StateStore:
 def _fault(stored: GyroModel, model: GyroModel) -> str:
     """Return why a stored self-calibration does not fit a model, for a sentence; '' if it does."""
     if stored.self_calibration is None:
-        return 'the file holds none, as one that was cut off'
+        return 'the file has none; it may be truncated'
     if not same_effects(stored, model):
         return 'it belongs to another model'
     theirs, ours = (each.gyro.get('serial_number', '') for each in (stored, model))

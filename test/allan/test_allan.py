@@ -418,7 +418,7 @@ def test_the_verb_draws_the_chart(log, tmp_path, ending, begin):
 
 def test_wrong_use_of_the_verb_is_reported_before_the_work(log, capsys):
     assert main(['allan', str(log), '--model', 'x.yaml']) == 2
-    assert 'say with --out' in capsys.readouterr().err
+    assert 'given without --out' in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:  # argparse
         main(['allan', str(log), '--picture', 'chart.gif'])
     assert end.value.code == 2 and 'ends in .png or .svg' in capsys.readouterr().err

@@ -235,7 +235,7 @@ def test_emulate_sends_no_log_without_an_output(run, tmp_path, outputs):
     code, text, error = run('emulate', '--protocol', 'csv', '--log', tmp_path / 'log.csv',
                             '--repeat')
     assert (code == 1 and not text
-            and 'of 2 samples have an output; send a log with two or more' in error)
+            and 'of 2 samples have an output; give a log with two or more' in error)
 
 
 def test_emulate_prints_its_path_first_and_sends_the_model(model, tmp_path):
@@ -349,7 +349,7 @@ def test_a_seed_below_zero_is_wrong_use(words, capsys):
 def test_an_empty_option_is_wrong_use(run, model, log, words):
     """An unset variable of the shell leaves an empty argument, which is not no argument."""
     code, text, error = run(*[{'MODEL': model, 'LOG': log}.get(word, word) for word in words])
-    assert (code == 2 and not text and 'is empty; give it a value, or leave it out' in error
+    assert (code == 2 and not text and 'is empty; give a value or omit it' in error
             and error.count('\n') == 1)
 
 
@@ -361,7 +361,7 @@ def test_a_simulation_beyond_all_bounds_is_wrong_use(run, model, tmp_path, words
                             '--out', tmp_path / 'out.csv', *words)
     assert (code == 2 and not text and 'Traceback' not in error
             and not (tmp_path / 'out.csv').exists())
-    assert '0.001' not in words or 'less than two samples; give a higher rate' in error
+    assert '0.001' not in words or 'fewer than two samples; give a higher rate' in error
 
 
 def test_a_log_from_a_named_pipe_is_read_once(run, tmp_path):

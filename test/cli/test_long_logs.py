@@ -111,7 +111,7 @@ def test_what_is_refused_late_leaves_no_file(model, tmp_path, small_blocks, caps
         file.write('3.0,0.1,30\n')
     assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
                  '--out', str(tmp_path / 'out.csv')]) == 2
-    assert 'line 1002, column time_s: 3 s does not come after 9.99 s' in capsys.readouterr().err
+    assert 'line 1002, column time_s: 3 s is not later than 9.99 s' in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ['log.csv', 'model.yaml']
 
 
@@ -120,7 +120,7 @@ def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, caps
         'time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))
     assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
                  '--out', str(tmp_path / 'out.csv')]) == 1
-    assert ('no output of the gyro is a number' in capsys.readouterr().err
+    assert ('no gyro output is finite' in capsys.readouterr().err
             and not (tmp_path / 'out.csv').exists())
 
 

@@ -367,14 +367,14 @@ def small_messages(size):
 def test_a_small_recording_that_unfolds_to_gigabytes_is_refused(content, compression, tmp_path):
     (tmp_path / 'a.mcap').write_bytes(mcap(content(64 << 20), compression,
                                            40 if compression == 'zstd' else 1))
-    refused(tmp_path / 'a.mcap', 'grows to more than 100 times its size')
+    refused(tmp_path / 'a.mcap', 'decompresses to more than 100 times its size')
 
 
 def test_messages_that_unfold_once_more_are_counted_too(tmp_path):
     inner = pytest.importorskip('zstandard').ZstdCompressor().compress(bytes(1 << 16))
     message = record(5, struct.pack('<HIQQ', 1, 0, 0, 0) + inner)
     (tmp_path / 'a.mcap').write_bytes(mcap(message * 20_000, 'zstd', 1))
-    refused(tmp_path / 'a.mcap', 'grows to more than 100 times its size')
+    refused(tmp_path / 'a.mcap', 'decompresses to more than 100 times its size')
 
 
 def refused(path, words, megabytes=60):

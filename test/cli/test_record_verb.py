@@ -177,7 +177,7 @@ def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
 
 
 @pytest.mark.parametrize(('words', 'sentence'), [
-    (['--out', 'a.txt', '--port', '/dev/x'], 'a recording ends in .csv, .csv.gz or .mcap'),
+    (['--out', 'a.txt', '--port', '/dev/x'], 'give a name that ends in .csv, .csv.gz or .mcap'),
     (['--out', 'a.csv', '--port', '/dev/x', '--topic', 'imu'],
      '--port and topics were both given'),
     (['--out', 'a.csv', '--port', '/dev/x', '--protocol', 'morse'], 'morse'),
@@ -220,7 +220,7 @@ def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, ra
         code, out, error = run('record', *words, '--out', tmp_path / 'a.csv', '--json', *options)
     log, remarks = read(tmp_path / 'a.csv'), ' '.join(json.loads(out)['remarks'])
     assert code == 0 and log.output == pytest.approx(rate, rel=1e-6), error
-    assert options or ('samples a second are not the 1000 by which angles are made rates: set '
+    assert options or ('samples per second, but angles are converted to rates by 1000: set '
                        'sample_rate.' in remarks)
     assert any(note.startswith(f'sensitivity: {factor!r} rad/s a unit of the device')
                for note in log.notes), log.notes
@@ -240,7 +240,7 @@ def test_a_temperature_of_a_port_that_comes_too_late_for_a_column_is_a_remark(ru
 
 def test_a_port_that_is_not_there_is_reported_and_leaves_no_file(run, tmp_path):
     code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '1'))
-    assert ((code, out) == (1, '') and 'nothing came within' in error
+    assert ((code, out) == (1, '') and 'no sample was received in' in error
             and str(tmp_path / 'gyro') in error)
     assert not (tmp_path / 'a.csv').exists()
 
@@ -317,7 +317,7 @@ def test_a_file_that_may_not_grow_stays_readable(record, tmp_path, name, limit):
     with gyro(tmp_path / 'gyro', 1000.0):
         code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=limit).end()
     log, size = read(tmp_path / name), (tmp_path / name).stat().st_size
-    assert (code == 1 and f'{size} bytes stay in {tmp_path / name}' in error
+    assert (code == 1 and f'{size} bytes remain in {tmp_path / name}' in error
             and 'make room' in error)
     assert size <= limit and len(log) > 500 and is_unbroken(log)
 
@@ -526,12 +526,12 @@ def test_a_log_of_a_topic_of_another_kind_is_refused(ros, record, wait_until, tm
 
 
 @pytest.mark.parametrize(('topic', 'domain', 'sentence'), [
-    ('1x', None, '/1x is no name of a topic (failed to resolve name'),
-    ('a b', None, '/a b is no name of a topic (failed to resolve name'),
+    ('1x', None, '/1x is no topic name (failed to resolve name'),
+    ('a b', None, '/a b is no topic name (failed to resolve name'),
     ('imu', 'x',
      'ROS 2 cannot be started (failed to initialize rcl: '
      'ROS_DOMAIN_ID is not an integral number)'),
-    ('imu', '999', 'ROS_DOMAIN_ID is 999, but the largest is 232'),
+    ('imu', '999', 'ROS_DOMAIN_ID is 999, but must be from 0 to 232'),
 ])
 def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
         ros_domain, record, tmp_path, monkeypatch, topic, domain, sentence):
@@ -557,7 +557,8 @@ def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_
 
 def test_topics_that_nobody_publishes_are_reported(ros_domain, record, tmp_path):
     code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
-    assert (code, out) == (1, '') and 'nothing came within' in error and 'ROS_DOMAIN_ID' in error
+    assert (code, out) == (1, '')
+    assert 'no sample was received in' in error and 'ROS_DOMAIN_ID' in error
     assert not (tmp_path / 'a.csv').exists()
 
 

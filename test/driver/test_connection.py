@@ -100,7 +100,7 @@ def test_auto_finds_the_protocol_and_reports_it(name):
 def test_auto_with_a_baud_listens_at_that_one_only():
     world = World(3.0)
     world.send(b'\x00\x01\x02')
-    assert 'of no protocol for sure at 57600 bit/s' in Reading(world, baud=57600).problems[0]
+    assert 'no protocol was recognized at 57600 bit/s' in Reading(world, baud=57600).problems[0]
 
 
 def test_auto_asks_for_what_the_protocol_needs():
@@ -230,9 +230,9 @@ def test_a_slow_gyro_is_silent_after_three_of_its_periods(period):
     ('csv', b'!ANG:1,2,3,AN:1,2,3,4,5,6,7,8,9\r\n',
      'bytes come on /dev/gyro, but no sample of csv for 2 s: check protocol, baud and'),
     ('kvh_dsp3000', b'       0.015733   0\r\n',
-     'the gyro on /dev/gyro calls each of its samples invalid for 2 s: turn it off'),
+     'the gyro on /dev/gyro marks all samples as invalid for 2 s: turn it off'),
     ('kvh_dsp3000', b'     999.000000   1\r\n',
-     'each sample on /dev/gyro is beyond full scale for 2 s: check protocol, sens'),
+     'all samples on /dev/gyro are beyond full scale for 2 s: check protocol, sens'),
 ])
 def test_a_gyro_without_samples_is_reported_with_its_reason(protocol, line, reason):
     world = World(30.0)

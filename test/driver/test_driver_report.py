@@ -194,8 +194,8 @@ def test_angles_by_another_rate_than_the_gyro_sends_are_warned_of(given, is_warn
     world.gyro('kvh_1750', rate=250.0)
     level, message, _ = reported(world, 'kvh_1750', given)[-1]
     assert (level == WARN) == is_warned
-    assert ('250 samples a second are not the 1000 by which angles are made '
-            'rates: set sample_rate' in message) == is_warned
+    assert ('250 samples per second, but angles are converted to rates by 1000: set sample_rate'
+            in message) == is_warned
 
 
 def test_steps_of_the_clock_are_counted():

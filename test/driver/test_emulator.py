@@ -139,7 +139,7 @@ def test_a_link_that_another_gyro_has_taken_is_left_alone(tmp_path):
 
 def test_a_file_in_the_place_of_the_link_is_kept(tmp_path):
     (tmp_path / 'notes').write_text('precious')
-    with pytest.raises(FileExistsError, match='choose another path'):
+    with pytest.raises(FileExistsError, match='give another path'):
         Emulator(find('csv'), samples(), link=tmp_path / 'notes').open()
     assert (tmp_path / 'notes').read_text() == 'precious'
 

@@ -134,7 +134,7 @@ def test_what_is_killed_before_its_first_piece_takes_no_name(tmp_path, name):
 def test_a_place_that_is_taken_meanwhile_is_not_written_to(tmp_path):
     pieces = AtomicAppender(str(tmp_path / 'a.csv'))
     (tmp_path / 'a.csv').write_text('precious')
-    with pytest.raises(LogError, match='another program has made it meanwhile'):
+    with pytest.raises(LogError, match='another program has created it meanwhile'):
         pieces.append(b'a piece')
     pieces.close()
     assert (tmp_path / 'a.csv').read_text() == 'precious'

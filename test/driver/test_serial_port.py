@@ -58,7 +58,8 @@ def test_an_unplugged_port_is_lost_and_closed(terminal):
     port = SerialPort(path, 115200)
     port.open()
     os.close(master)
-    with pytest.raises(PortError, match=f'^lost {path}: the device is gone: plug it in again$'):
+    with pytest.raises(PortError, match=f'^lost {path}: the device was disconnected: plug it '
+                                        'in again$'):
         port.read()
     assert not port.is_open
 

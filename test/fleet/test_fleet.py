@@ -149,7 +149,7 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
     assert run(logs, '--out', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
     reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert told['logs'] == 5 and 'holds the same as' in reasons['b_unit1.csv']
+    assert told['logs'] == 5 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv'}
 

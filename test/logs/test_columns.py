@@ -170,7 +170,7 @@ def test_a_data_frame_is_a_log():
     ({'w': [1.0, 2.0]}, 'no gyro column'), ({'gyro_dps': ['a', 'b']}, 'is no log'),
     ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 2.0, 3.0]}, 'one shape'),
     ({'gyro_dps': [1.0]}, 'two rows'), ({'gyro_dps': [[1.0], [2.0]]}, 'one shape'),
-    ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 1.0]}, 'does not come after'),
+    ({'gyro_dps': [1.0, 2.0], 'time_s': [1.0, 1.0]}, 'is not later than'),
     ({'gyro_dps': [1.0, math.inf]}, 'remove the row')])
 def test_a_table_that_is_no_log_is_refused_in_a_sentence(table, wanted):
     with pytest.raises(LogError, match=wanted):

@@ -73,9 +73,9 @@ REFUSED = {
     'an empty line between': ('time_s,gyro_dps\n0,1\n\n1,1\n',
                               'line 3 has 0 values where the header has 2'),
     'stands': ('time_s,gyro_dps\n0,1\n1,1\n1,1\n',
-               'line 4, column time_s: 1 s does not come after 1 s'),
+               'line 4, column time_s: 1 s is not later than 1 s'),
     'goes back': ('time_s,gyro_dps\n0,1\n1,1\n0.5,1\n',
-                  'line 4, column time_s: 0.5 s does not come after 1 s'),
+                  'line 4, column time_s: 0.5 s is not later than 1 s'),
     'lost time': ('time_s,gyro_dps\n0,1\nnan,1\n2,1\n',
                   'line 3, column time_s: nan is not a finite number'),
     'lost temperature': ('gyro_dps,temperature_degc\n0,20\n1,nan\n',
@@ -94,9 +94,9 @@ REFUSED = {
     'binary': (bytes(range(256)), 'cannot be read as a log'),
     'beyond a gyro': (
         'time_s,gyro_dps\n0,1\n1,1e300\n',
-        'line 3, column gyro_dps: 1e300 is beyond 1e+20, which no gyro means; remove the'),
+        'line 3, column gyro_dps: 1e300 is beyond the limit of 1e+20; remove the'),
     'no time between': ('time_s,gyro_dps\n0,1\n1e-300,1\n',
-                        'line 3, column time_s: 1e-300 s does not come after 0 s'),
+                        'line 3, column time_s: 1e-300 s is not later than 0 s'),
     'a text of lines': ('gyro_dps,place\n1,a\n"1\n\n2",b\n', "'1\\n\\n2' is not a number"),
     'a header of lines': ('"a\nb",time_s\n1,1\n2,2\n', 'no gyro column among a\\nb,time_s;'),
     'a header of 30 000 columns': ('time_s,' + 'x,' * 30000 + '\n1,1\n',
@@ -126,7 +126,7 @@ def test_a_compressed_file_that_unfolds_without_end_is_refused(tmp_path, monkeyp
     with gzip.open(path, 'wb') as file:
         file.write(b'gyro_dps\n')
         file.write(b'0\n' * 1_000_000)
-    with pytest.raises(LogError, match='unfolds to more than 100 times its size.*; unpack it'):
+    with pytest.raises(LogError, match='decompresses to more than 100 times .*; decompress it'):
         list(read_log_blocks(path))
 
 
@@ -134,7 +134,7 @@ def test_a_log_that_is_too_large_for_the_memory_is_refused(tmp_path, monkeypatch
     monkeypatch.setattr('gyro_calibration.logs.log._WHOLE', 100)
     path = written(tmp_path,
                    'time_s,gyro_dps\n' + ''.join(f'{second},0\n' for second in range(51)))
-    with pytest.raises(LogError, match='more than 100 numbers.*; cut it into pieces'):
+    with pytest.raises(LogError, match='more than 100 numbers.*; split it'):
         read_log(path)
     assert len(list(read_log_blocks(path))[0]) == 51
 

@@ -413,7 +413,7 @@ def test_a_database_that_asks_for_more_memory_than_there_may_be_is_refused(tmp_p
                         104: b'\2', 108: b'\1\x89', 393: 17 * b'\xff', 411: b'C'}.items():
         page[place:place + len(data)] = data
     (tmp_path / 'a.db3').write_bytes(page[:412])
-    with pytest.raises(LogError, match='it asks for more memory than there may be'):
+    with pytest.raises(LogError, match='it needs more memory than the limit'):
         read_recording(tmp_path / 'a.db3')
 
 
@@ -432,7 +432,7 @@ def test_of_several_gyros_one_has_to_be_named(make, run, tmp_path, turning):
     path = write(tmp_path / 'bag', {'/imu/data_raw': gyro(make, time, rate),
                                     '/imu/data': gyro(make, time, 2 * rate)})
     code, _, error = run('allan', path)
-    assert code == 2 and '/imu/data and /imu/data_raw; say by --topic' in error
+    assert code == 2 and '/imu/data and /imu/data_raw; select one with --topic' in error
     for name in ('imu/data', '/imu/data'):
         np.testing.assert_array_equal(read_recording(path, Topics(name)).output, 2 * rate)
     # It is the only one left.
@@ -503,7 +503,7 @@ def test_stamps_that_say_nothing_are_refused_unless_the_rate_is_given(make, tmp_
     path = write(tmp_path / 'bag',
                  {'imu': [(at, make.imu(np.floor(10 * at) / 10, at)) for at in time]})
     with pytest.raises(LogError, match='270 of 300 samples of imu have the stamp of another '
-                                       'sample.* give --rate'):
+                                       'sample.* give the sample rate'):
         read_recording(path)
     log = read_recording(path, rate=RATE)
     np.testing.assert_array_equal(log.output, time)

@@ -112,7 +112,7 @@ def test_odometry_without_a_yaw_is_taken_by_its_rates():
 
 @pytest.mark.parametrize('spoil, reason', [
     (lambda told: [], '0 messages came on odom'), (lambda told: told[:20], '20 messages came'),
-    (lambda told: told[::-1], 'that increase')], ids=['none', 'too few', 'out of order'])
+    (lambda told: told[::-1], 'increasing stamps')], ids=['none', 'too few', 'out of order'])
 def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
     run.odometry = spoil(run.odometry)

@@ -113,9 +113,9 @@ def test_a_port_that_is_missing_comes_goes_and_comes_again(robot, tmp_path):
             values = {pair.key: pair.value
                       for pair in driver.reports('samples come', DiagnosticStatus.OK).values}
             assert int(values['reopened']) >= number and int(values['samples']) > 20
-        driver.reports('the device is gone', DiagnosticStatus.ERROR)
+        driver.reports('the device was disconnected', DiagnosticStatus.ERROR)
     interrupt_often(driver.node)
-    assert driver.node.output.count('the device is gone') == 2, (
+    assert driver.node.output.count('the device was disconnected') == 2, (
         'it is logged once, not at each attempt')
 
 

@@ -151,7 +151,7 @@ def test_two_compensation_nodes_go_on_through_any_order_of_starting_and_a_driver
                 assert heard.error(place + 5, -1) < NEARLY, 'from there on the heading goes on'
             assert heard.error(0, -1) < 4.0 * math.sqrt(heard.variances[-1])
         assert second.error(0, -1) < NEARLY, 'the gap is bridged'
-        first.says('integration began anew')
+        first.says('integration was restarted')
         second.says('lost')
         assert node.stop() == 0
         _, again = compensation()

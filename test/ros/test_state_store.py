@@ -115,12 +115,12 @@ def test_without_a_model_that_can_be_read_nothing_is_learned(remember, tmp_path)
 
 def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_writes(remember):
     first, second = remember(), remember()
-    first.look()
+    first.poll()
     assert not first.shared_hint
     second.keep(SelfCalibration(0.01, 0.02))
-    first.look()
-    second.look()
-    assert 'was written by somebody else' in first.shared_hint and not second.shared_hint
+    first.poll()
+    second.poll()
+    assert 'was written by another process' in first.shared_hint and not second.shared_hint
     first.keep(SelfCalibration(0.01, 0.03))
     assert not first.shared_hint
 
@@ -144,7 +144,7 @@ def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_gone_says
         step.wait()
         held = remember().model
         for memory in memories:
-            memory.look()
+            memory.poll()
             unknown += memory.model != held and not memory.shared_hint
     for writer in writers:
         writer.join()

@@ -32,7 +32,7 @@ _LONGEST = 8192  # last bytes that are looked at, so that a growing buffer costs
 _FRAMES = 3  # fewer may be chance
 _ENOUGH = 0.5  # of the bytes; a line may lose or damage the rest
 _ALL = 0.95  # of the bytes, where all frames are the same: zeros may pass a weak check
-_NEARLY = 0.8  # of what the best format explains: another that explains so much is as likely
+_NEARLY = 0.8  # of the share of the best format: another above it makes the result ambiguous
 _NUMBERS = re.compile(NUMBER + rb'(?: *, *' + NUMBER + rb')* *')
 
 
@@ -91,15 +91,14 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     scores = [_score(protocol, settings, data) for protocol in PROTOCOLS.values()]
     best, second = sorted(scores, key=lambda score: -score.explained)[:2]
     runner_up = second if second.explained else None
-    rivals = runner_up is not None and second.explained >= _NEARLY * best.explained
+    ambiguous = runner_up is not None and second.explained >= _NEARLY * best.explained
     enough = _ENOUGH if best.distinct >= _FRAMES else _ALL
-    if best.frames >= _FRAMES and best.explained >= enough and not rivals:
+    if best.frames >= _FRAMES and best.explained >= enough and not ambiguous:
         protocol, (explained, words) = best.protocol, _found(best, runner_up, data)
     else:
-        rival = second if rivals else None
-        protocol, (explained, words) = None, _not_found(best, rival, data, settings)
-    other = runner_up.protocol if runner_up else None
-    return Recognition(protocol, explained, best.frames, other, words)
+        other = second if ambiguous else None
+        protocol, (explained, words) = None, _not_found(best, other, data, settings)
+    return Recognition(protocol, explained, best.frames, runner_up and runner_up.protocol, words)
 
 
 def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
@@ -123,27 +122,26 @@ def _found(best: _Score, runner_up: _Score | None, data: bytes) -> tuple[float, 
     return best.explained, words
 
 
-def _not_found(best: _Score, rival: _Score | None, data: bytes,
+def _not_found(best: _Score, other: _Score | None, data: bytes,
                settings: Settings) -> tuple[float, str]:
     count, share = _numbers_of_a_line(data)
-    if not rival and count not in (0, len(settings.columns)):
+    if not other and count not in (0, len(settings.columns)):
         named = len(settings.columns)
         return share, (f'lines of {count} numbers came, but columns names {named}: name all '
                        'columns in their order')
-    return best.explained, _why_not(best, rival, data)
+    return best.explained, _why_not(best, other, data)
 
 
-def _why_not(best: _Score, rival: _Score | None, data: bytes) -> str:
+def _why_not(best: _Score, other: _Score | None, data: bytes) -> str:
     if not data:
         return 'nothing came: check the power and the wires of the gyro'
-    if rival:
-        return (f'the bytes may be {best.protocol.name} or {rival.protocol.name}: set protocol to '
-                'the one it is')
+    if other:
+        return (f'the bytes may be {best.protocol.name} or {other.protocol.name}: set protocol')
     came = f'{len(data)} bytes came'
     if best.frames:
-        return (f'{came}, too few of which are frames of {best.protocol.name} to be sure: listen '
-                'longer, or set protocol')
-    return f'{came}, but no format explains them: try another baud, or set protocol'
+        return (f'{came}, of which too few are frames of {best.protocol.name}: listen longer, or '
+                'set protocol')
+    return f'{came}, but in no known format: try another baud, or set protocol'
 
 
 def _numbers_of_a_line(data: bytes) -> tuple[int, float]:

@@ -34,7 +34,7 @@ GYRO_COLUMNS = {'gyro_dps': math.radians(1.0), 'gyro_rad_s': 1.0, 'gyro_counts':
 """Columns of the log format that hold the output, with their unit in rad/s, or in counts."""
 
 KNOWN_COLUMNS = 'temperature_degc', 'time_s', 'acceleration_mps2', 'supply_v'
-"""Columns of the log format that may stand beside it."""
+"""Further columns of the log format."""
 
 ASSUMED_NOISE = math.radians(0.5)
 """rad/s, standard deviation of one sample of a gyro whose data sheet is not known."""
@@ -123,8 +123,8 @@ class Settings:
         for name in ('sensitivity', 'full_scale', 'sample_rate'):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f'{name} is {value}, but must be above 0; for a gyro that counts '
-                                 'the other way set invert')
+                raise ValueError(f'{name} is {value}, but must be above 0; for the other sense of '
+                                 'rotation set invert')
         if self.axis not in ('x', 'y', 'z'):
             raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
         object.__setattr__(self, 'columns', tuple(self.columns))
@@ -137,8 +137,7 @@ def _check_columns(columns: tuple[str, ...]) -> None:
                          f'{", ".join(GYRO_COLUMNS)}')
     for name in KNOWN_COLUMNS:
         if columns.count(name) > 1:
-            raise ValueError(f'columns are {", ".join(columns)}, but {name} may stand there only '
-                             'once')
+            raise ValueError(f'columns are {", ".join(columns)}, but {name} may occur only once')
 
 
 @dataclass(frozen=True)
@@ -363,8 +362,8 @@ class Protocol:
         rate = self.nominal_rate(settings)
         if not self.sends_angles(settings) or abs(period * rate - 1.0) <= _MOST_DEVIATION:
             return ''
-        return (f'{1.0 / period:.0f} samples a second are not the {rate:g} by which angles are '
-                'made rates: set sample_rate')
+        return (f'the gyro sends {1.0 / period:.0f} samples per second, but angles are converted '
+                f'to rates by {rate:g}: set sample_rate')
 
     def factor(self, settings: Settings) -> float:
         """Return the rad/s, counter-clockwise positive, of one unit of the device."""
