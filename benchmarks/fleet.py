@@ -12,7 +12,7 @@
 A fleet: predicted drives, variances, alarms, smallest effects, slow effects, scale and priors.
 
     python benchmarks/fleet.py drives FOLDER [OUT]    # rc_car_*.csv.gz of the wheeled drives
-    python benchmarks/fleet.py variances alarms smallest slow scale prior
+    python benchmarks/fleet.py variances slopes alarms smallest slow scale prior
 
 """
 
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 import os
 from pathlib import Path
 import sys
@@ -29,16 +30,17 @@ from typing import Any
 
 from fleet_tasks import calibrate
 from gyro_calibration.calibration.self_calibration import Reference, self_calibrate
-from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, UNITS
+from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, SLOPES, UNITS
 from gyro_calibration.fleet.run import finished, Lost, processes
 from gyro_calibration.fleet.slow_effects import slow_effects
-from gyro_calibration.fleet.summary import lacking, summarized
+from gyro_calibration.fleet.summary import counted, lacking, summarized
 from gyro_calibration.fleet.table import entries
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.model.motion import from_rates
 import numpy as np
 from numpy.random import Generator
+from scipy.stats import beta
 
 #: Units, drives; standard deviations between units, drives and power-ons, and the stated error;
 #: the share of the error that is a log's own.
@@ -140,9 +142,37 @@ def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, kno
             (found.low < value[left]) & (value[left] < found.high))
 
 
+def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
+    """Give how often intervals of 95 % hold of drifts over age."""
+    yield '| units, drives | true: slope of the type, between units | type | units | spread |'
+    yield '|---|---|---:|---:|---:|'
+    for fleet, between in (((5, 4, 1.0, 0.3, 0.3, 0.2, 1.0), 0.5),
+                           ((10, 6, 1.0, 0.0, 0.3, 0.2, 1.0), 0.0),
+                           ((10, 6, 1.0, 0.5, 0.3, 0.2, 0.5), 0.5)):
+        held: list[list[Any]] = [[], [], []]
+        for _ in range(fleets):
+            observed, _ = drawn(generator, fleet)
+            units = np.arange(fleet[0])
+            age = observed.drive - 0.5 * (fleet[1] - 1.0)
+            true = 0.3 + between * generator.standard_normal(fleet[0])
+            pooled = Pooled(replace(observed, value=observed.value + true[observed.unit] * age,
+                                    columns=age[:, None], slopes=1))
+            row = np.array([[0.0, 1.0]])
+            spread = pooled.components[SLOPES[0]]
+            held[2].append(spread.low <= between <= spread.high)
+            for place, (wanted, value) in enumerate((
+                    (pooled.wanted(fixed=row), np.array([0.3])),
+                    (pooled.wanted(unit=units, fixed=np.tile(row, (len(units), 1)), part=1),
+                     true))):
+                found = pooled.estimate(wanted)
+                held[place].extend((found.low < value) & (value < found.high))
+        yield (f'| {fleet[0]}, {fleet[1]} | 0.3, {between} | '
+               + ' | '.join(f'{100.0 * np.mean(each):.1f} %' for each in held) + ' |')
+
+
 def _records(generator: Generator, units: int, drives: int, effect: float = 0.0
              ) -> list[dict[str, Any]]:
-    """Return records of a fleet in which nothing stands out."""
+    """Return records of a fleet in which nothing stands out, with 1 % of false names."""
     found = []
     size = {'bias': (0.4, 0.01, 0.01, 0.02), 'scale_factor_error': (0.3, 0.6, 0.1, 0.4),
             'time_offset': (0.0, 0.4, 0.02, 0.002)}
@@ -155,25 +185,29 @@ def _records(generator: Generator, units: int, drives: int, effect: float = 0.0
         of = {name: {'value': float(each.value[place]) + (
             0.0 if name in size else effect - 3.0), 'deviation': float(each.deviation[place]),
             'unit': '1'} for name, each in values.items()}
+        false = ([{'effect': f'effect_{generator.integers(5)}', 'status': 'established'}]
+                 if generator.random() < 0.01 else [])
         found.append({'log': str(place), 'unit': str(unit), 'type': '', 'drive': str(drive),
                       'date': f'2026-01-{drive + 1:02d}', 'temperature': None, 'noise': {},
-                      'diagnosis': None, 'values': {name: of[name] for name in size},
+                      'diagnosis': {'findings': false}, 'values': {
+                          name: of[name] for name in size},
                       'slow': {name: each for name, each in of.items() if name not in size}})
     return found
 
 
 def alarms(generator: Generator, fleets: int = 100) -> Iterator[str]:
     """Give how many fleets in which nothing is give any alarm; 1 % is stated."""
-    yield '| units, drives | fleets | with an alarm |'
-    yield '|---|---:|---:|'
-    for units, count in ((5, 4), (16, 3)):
+    yield '| units, drives | fleets | with an alarm | at most, with 95 % |'
+    yield '|---|---:|---:|---:|'
+    for units, count in ((5, 4), (16, 3), (30, 2)):
         found = 0
         for _ in range(fleets):
             (each,) = summarized(_records(generator, units, count))
-            found += bool(lacking(each)) or any(
+            found += bool(lacking(each)) or any(one.owner for one in counted(each)) or any(
                 one.outlying_units or one.outlying_drives or one.changed
                 for one in each.values.values())
-        yield f'| {units}, {count} | {fleets} | {found} |'
+        yield (f'| {units}, {count} | {fleets} | {found} | '
+               f'{100.0 * beta.ppf(0.95, found + 1, fleets - found):.1f} % |')
 
 
 def smallest(generator: Generator, fleets: int = 20) -> Iterator[str]:
@@ -284,7 +318,7 @@ def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
                f'{100 * np.mean(held[1]):.0f} % |')
 
 
-PARTS = {each.__name__: each for each in (variances, alarms, smallest, slow, scale, prior)}
+PARTS = {each.__name__: each for each in (variances, slopes, alarms, smallest, slow, scale, prior)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

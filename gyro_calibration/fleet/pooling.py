@@ -13,11 +13,12 @@ Partial pooling: what of a value is the type's, the unit's, the drive's, and of 
 
 Value ``y`` of the log ``i`` of unit ``u`` on drive ``d`` is taken as::
 
-    y_i = x_i' beta + unit_u + drive_d + power_on_i + error_i
+    y_i = x_i' beta + unit_u + t_i' slope_u + drive_d + power_on_i + error_i
 
-* ``beta``: mean of the type, and its slopes over age and temperature;
-* ``unit``, ``drive`` and ``power_on``: normal, with the standard deviations *between units*,
-  *between drives* and *between power-ons* that are sought;
+* ``beta``: mean of the type, and its slopes over age and temperature ``t``;
+* ``unit``, ``slope``, ``drive`` and ``power_on``: normal, with the standard deviations *between
+  units*, of the slopes of units about that of the type, *between drives* and *between power-ons*
+  that are sought;
 * ``error``: what the calibration of the log states, ``sigma_i``. Units that were moved together
   were compared with one reference, so the share ``1 - lambda`` of the variance of their errors is
   common to the drive: ``cov(error_i, error_j) = (1 - lambda) sigma_i sigma_j``.
@@ -35,7 +36,7 @@ is of one unit, so that only the columns of drives and ``beta`` are solved for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
@@ -53,6 +54,10 @@ from scipy.stats import qmc
 Numbers = NDArray[np.intp]
 #: The standard deviations that are sought, and the share of the errors that is a log's own.
 UNITS, DRIVES, POWER_ONS, OWN = 'units', 'drives', 'power_ons', 'own_share'
+#: Of the slopes of units over the first columns and the second.
+SLOPES = ('slopes_0', 'slopes_1')
+#: Logs of a unit, at different values of a column, that show a slope of its own.
+_FEWEST = 3
 #: Points of the sequence over the variances, and of a slice through the likeliest.
 POINTS, _SLICE = 512, 41
 #: Numbers that the equations take at a time.
@@ -75,6 +80,7 @@ class Observed:
     unit : number of the unit of each log, from 0 on, shape (n,)
     drive : number of the drive, from 0 on, or -1 where a log stands alone, shape (n,)
     columns : fixed effects beside the mean, such as age, shape (n, k)
+    slopes : the number of the first columns whose effect may differ from unit to unit, at most 2
 
     """
 
@@ -83,6 +89,7 @@ class Observed:
     unit: Numbers
     drive: Numbers
     columns: Array = field(default_factory=lambda: np.empty((0, 0)))
+    slopes: int = 0
 
     def __len__(self) -> int:
         return len(self.value)
@@ -107,6 +114,7 @@ class Wanted:
     ----------
     fixed : shape (k, 1 + columns)
     unit, drive : numbers, -1 for none, shape (k,)
+    of_unit : what of the unit: weights of its value and of its slopes, shape (1 + slopes,)
     error : standard deviation by which the common error of the drive counts, shape (k,)
     more : name of a variance -> how often it is added, for what is not estimated, such as the
         next power-on
@@ -118,6 +126,7 @@ class Wanted:
     unit: Numbers
     drive: Numbers
     error: Array
+    of_unit: Array
     more: Mapping[str, float] = field(default_factory=dict)
     measured: bool = False
 
@@ -141,10 +150,12 @@ class _Equations:
         self.units = int(of.unit.max()) + 1
         self.drives = int(of.drive.max()) + 1 if shared else 0
         self.columns = fixed.shape[1] + 2 * self.drives
+        #: the columns of the value of a unit, and of its slopes
+        self.of_unit = fixed[:, :1 + of.slopes]
         self.to_unit = _summing(of.unit)
         if self.drives:
             on = np.flatnonzero(of.drive >= 0)
-            self._on, self.to_drive = on, _summing(of.drive[on])
+            self.on, self.to_drive = on, _summing(of.drive[on])
             pairs, place = np.unique(of.unit[on] * self.drives + of.drive[on],
                                      return_inverse=True)
             self.to_pair = _summing(place)
@@ -152,7 +163,8 @@ class _Equations:
 
     def chunks(self, points: int) -> list[slice]:
         """Return parts of the points that are solved for at a time, so that memory is bounded."""
-        size = self.units * self.columns + self.columns ** 2 + len(self.of)
+        size = (self.units * self.columns * (1 + self.of.slopes) + self.columns ** 2
+                + len(self.of))
         step = max(_AT_A_TIME // size, 1)
         return [slice(begin, begin + step) for begin in range(0, points, step)]
 
@@ -173,7 +185,10 @@ class _Solved:
         of, fixed, count = at.of, at.fixed, len(next(iter(sizes.values())))
         none = np.zeros(count)
         own = sizes.get(OWN, none + 1.0)
-        self._at, self._tau = at, np.sqrt(sizes.get(UNITS, none))
+        self._at = at
+        tau = np.sqrt(np.column_stack([sizes.get(name, none)
+                                       for name in (UNITS, *SLOPES[:of.slopes])]))
+        self._tau = tau
         self._scale = np.sqrt(sizes.get(DRIVES, none)), np.sqrt(np.maximum(1.0 - own, 0.0))
         variance = (sizes.get(POWER_ONS, none)[:, None] + own[:, None] * of.deviation ** 2)
         weight = 1.0 / variance
@@ -183,43 +198,53 @@ class _Solved:
 
         kept, total = fixed.shape[1], at.columns
         normal, right = np.zeros((count, total, total)), np.zeros((count, total))
-        across = np.zeros((count, at.units, total))
+        parts = at.of_unit.shape[1]
+        alone = np.empty((count, at.units, parts))
+        across = np.zeros((count, at.units, parts, total))
         normal[:, :kept, :kept] = np.einsum('pn,na,nb->pab', weight, fixed, fixed, optimize=True)
         right[:, :kept] = weight @ (of.value[:, None] * fixed)
-        for place in range(kept):
-            across[:, :, place] = summed(at.to_unit, weight * fixed[:, place])
+        for part, column in enumerate(at.of_unit.T):
+            alone[:, :, part] = summed(at.to_unit, weight * column * of.value)
+            for place in range(kept):
+                across[:, :, part, place] = summed(at.to_unit, weight * column * fixed[:, place])
         if at.drives:
-            here, error = weight[:, at._on], of.deviation[at._on]
+            here, error = weight[:, at.on], of.deviation[at.on]
             first = kept + np.arange(at.drives)
-            parts = [(first + kind * at.drives, scale[:, None], error ** kind)
+            kinds = [(first + kind * at.drives, scale[:, None], error ** kind)
                      for kind, scale in enumerate(self._scale)]
-            for index, scale, by in parts:
+            for index, scale, by in kinds:
                 weighted = here * by
-                right[:, index] = scale * summed(at.to_drive, weighted * of.value[at._on])
-                across[:, at.pair_unit, index[at.pair_drive]] = scale * summed(at.to_pair,
-                                                                               weighted)
+                right[:, index] = scale * summed(at.to_drive, weighted * of.value[at.on])
+                for part, column in enumerate(at.of_unit[at.on].T):
+                    across[:, at.pair_unit, part, index[at.pair_drive]] = scale * summed(
+                        at.to_pair, weighted * column)
                 for place in range(kept):
                     normal[:, place, index] = scale * summed(
-                        at.to_drive, weighted * fixed[at._on, place])
+                        at.to_drive, weighted * fixed[at.on, place])
                     normal[:, index, place] = normal[:, place, index]
-                for other, other_scale, other_by in parts:
+                for other, other_scale, other_by in kinds:
                     normal[:, index, other] = scale * other_scale * summed(
                         at.to_drive, weighted * other_by)
             normal[:, range(kept, total), range(kept, total)] += 1.0
-        tau = self._tau[:, None]
-        self._of_unit = 1.0 + tau ** 2 * summed(at.to_unit, weight)
-        self._across = tau[:, :, None] * across
-        self._right = tau * summed(at.to_unit, weight * of.value)
-        lighter = self._across / self._of_unit[:, :, None]
-        triangle = np.linalg.cholesky(normal - np.swapaxes(lighter, 1, 2) @ self._across)
+        # what is of a unit is among the fixed effects, and first
+        precision = (np.eye(parts) + tau[:, None, :, None] * tau[:, None, None, :]
+                     * across[:, :, :, :parts])
+        self._within = np.linalg.inv(precision)
+        self._across = tau[:, None, :, None] * across
+        self._right = tau[:, None] * alone
+        lighter = self._within @ self._across
+        rows = count, at.units * parts
+        triangle = np.linalg.cholesky(
+            normal - np.swapaxes(lighter.reshape(*rows, total), 1, 2)
+            @ self._across.reshape(*rows, total))
         self._inverse = np.linalg.inv(triangle)  # of at most some hundred columns
-        reduced = right - np.einsum('puc,pu->pc', lighter, self._right)
+        reduced = right - np.einsum('puac,pua->pc', lighter, self._right)
         half = np.einsum('pij,pj->pi', self._inverse, reduced)
         self._solution = np.einsum('pij,pi->pj', self._inverse, half)
-        squares = (weight @ of.value ** 2 - np.sum(self._right ** 2 / self._of_unit, axis=1)
-                   - np.sum(half ** 2, axis=1))
+        squares = (weight @ of.value ** 2 - np.sum(half ** 2, axis=1)
+                   - np.einsum('pua,puab,pub->p', self._right, self._within, self._right))
         self.log_likelihood = -0.5 * (
-            np.log(variance).sum(axis=1) + np.log(self._of_unit).sum(axis=1) + squares
+            np.log(variance).sum(axis=1) + np.linalg.slogdet(precision)[1].sum(axis=1) + squares
             + 2.0 * np.log(np.diagonal(triangle, axis1=1, axis2=2)).sum(axis=1))
 
     def moments(self, wanted: Wanted) -> tuple[Array, Array]:
@@ -233,12 +258,13 @@ class _Solved:
             rows[:, on, kept + at.drives + wanted.drive[on]] = (self._scale[1][:, None]
                                                                 * wanted.error[on])
         unit = np.maximum(wanted.unit, 0)
-        size = self._tau[:, None] * (wanted.unit >= 0)
-        share = size / self._of_unit[:, unit]
-        rows -= share[:, :, None] * self._across[:, unit]
-        mean = np.einsum('pkc,pc->pk', rows, self._solution) + share * self._right[:, unit]
+        size = self._tau[:, None] * (wanted.of_unit * (wanted.unit >= 0)[:, None])
+        share = np.einsum('pkab,pkb->pka', self._within[:, unit], size)
+        rows -= np.einsum('pka,pkac->pkc', share, self._across[:, unit])
+        mean = (np.einsum('pkc,pc->pk', rows, self._solution)
+                + np.sum(share * self._right[:, unit], axis=2))
         spread = rows @ np.swapaxes(self._inverse, 1, 2)
-        return mean, size * share + np.sum(spread ** 2, axis=2)
+        return mean, np.sum(size * share, axis=2) + np.sum(spread ** 2, axis=2)
 
 
 @dataclass(frozen=True)
@@ -275,10 +301,11 @@ class Pooled:
         # columns of about one, so that the equations are well conditioned
         self._scales = np.maximum(np.abs(fixed).max(axis=0), 1e-300)
         self._fixed = fixed / self._scales
-        # what a file is rounded to is no better than a millionth of what values differ by
+        # smaller errors than 1e-5 of what values differ by would leave no digits to solve with
         self._scaled = replace(
             observed, value=(observed.value - self._middle) / self._size,
-            deviation=np.maximum(observed.deviation / self._size, 1e-6))
+            deviation=np.maximum(observed.deviation / self._size, 1e-5),
+            columns=self._fixed[:, 1:])
         self.names = _told_apart(observed)
         self._bounds = _bounds(self._scaled, self.names)
         self._equations = _Equations(self._scaled, self._fixed, DRIVES in self.names)
@@ -287,6 +314,7 @@ class Pooled:
                           for name, value in self._sizes(self._best[None]).items()
                           if name in self.names}
         self._sample, self._weight = self._integrated(points)
+        self._kept: _Solved | None = None
 
     # the variances
 
@@ -304,7 +332,7 @@ class Pooled:
             sizes = self._sizes(points[part])
             found.append(self._equations.solve(sizes).log_likelihood)
             if prior:
-                found[-1] = found[-1] + _log_prior(self._scaled, sizes) + sum(
+                found[-1] = found[-1] + _log_prior(self._equations, sizes) + sum(
                     column for name, column in zip(self.names, points[part].T) if name != OWN)
         return np.concatenate(found)
 
@@ -377,8 +405,9 @@ class Pooled:
             elif name == DRIVES and self._gain({name: 0}) <= _REJECTED:
                 # the common part of the errors alone may be all
                 low = self._spread(*self._at(name, errors_alone=True))[1]
-            size = 1.0 if name == OWN else self._size
-            found[name] = Component(size * best, size * low, size * high)
+            size = (1.0 if name == OWN else self._size / self._scales[1 + SLOPES.index(name)]
+                    if name in SLOPES else self._size)
+            found[name] = Component(*(float(size * each) for each in (best, low, high)))
         return found
 
     def _gain(self, held: Mapping[str, int]) -> float:
@@ -412,11 +441,11 @@ class Pooled:
     def _moments(self, wanted: Wanted) -> tuple[Array, Array]:
         """Return means and variances at each point, shape (points, k), in units of the values."""
         scaled = replace(wanted, fixed=wanted.fixed / self._scales,
+                         of_unit=wanted.of_unit / self._scales[:1 + self.observed.slopes],
                          error=wanted.error / self._size)
         found = []
-        for part in self._equations.chunks(len(self._sample)):
-            sizes = self._sizes(self._sample[part])
-            mean, variance = self._equations.solve(sizes).moments(scaled)
+        for sizes, solved in self._solutions():
+            mean, variance = solved.moments(scaled)
             for name, often in wanted.more.items():
                 variance = variance + often * sizes.get(name, np.zeros(1))[:, None]
             if wanted.measured:
@@ -426,6 +455,17 @@ class Pooled:
         mean, variance = (np.concatenate(each) for each in zip(*found))
         constant = self._middle * wanted.fixed[:, 0]
         return constant + self._size * mean, self._size ** 2 * np.maximum(variance, 1e-30)
+
+    def _solutions(self) -> Iterator[tuple[Mapping[str, Array], _Solved]]:
+        """Give variances and solutions at the points; what is solved at once is kept."""
+        parts = self._equations.chunks(len(self._sample))
+        for part in parts:
+            sizes = self._sizes(self._sample[part])
+            if len(parts) > 1:
+                yield sizes, self._equations.solve(sizes)
+                continue
+            self._kept = self._kept or self._equations.solve(sizes)
+            yield sizes, self._kept
 
     def estimate(self, wanted: Wanted, level: float = 0.95) -> Interval:
         """Return estimates with intervals that hold with a chance of `level`."""
@@ -444,24 +484,33 @@ class Pooled:
 
     def wanted(self, unit: Numbers | None = None, drive: Numbers | None = None,
                fixed: Array | None = None, error: Array | float = 0.0,
-               measured: bool = False, **more: float) -> Wanted:
-        """Return what is wanted; by default the mean of the type, or of units and drives."""
+               measured: bool = False, part: int = 0, **more: float) -> Wanted:
+        """
+        Return what is wanted; by default the mean of the type, or of units and drives.
+
+        Parameters
+        ----------
+        unit, drive, fixed, error, measured, more : as of `Wanted`
+        part : of a unit: 0 for its value, from 1 on for a slope
+
+        """
         count = max(len(each) for each in (unit, drive, fixed, [0]) if each is not None)
         none = np.full(count, -1)
         row = np.zeros((count, self._fixed.shape[1]))
         row[:, 0] = 1.0
         return Wanted(row if fixed is None else fixed, none if unit is None else unit,
                       none if drive is None else drive,
-                      np.broadcast_to(np.asarray(error, float), (count,)), more, measured)
+                      np.broadcast_to(np.asarray(error, float), (count,)),
+                      np.eye(1 + self.observed.slopes)[part], more, measured)
 
     def score(self, column: Array) -> float:
         """Return how many standard deviations one more fixed effect is from 0, roughly."""
         fixed = np.column_stack([self._fixed, column])
         sizes = self._sizes(self._best[None])
         solved = _Equations(self._scaled, fixed, DRIVES in self.names).solve(sizes)
-        row, none = np.zeros((1, fixed.shape[1])), np.array([-1])
+        row = np.zeros((1, fixed.shape[1]))
         row[0, -1] = 1.0
-        mean, variance = solved.moments(Wanted(row, none, none, np.zeros(1)))
+        mean, variance = solved.moments(self.wanted(fixed=row))
         return float(mean[0, 0] / math.sqrt(variance[0, 0]))
 
     def standing(self, kind: str) -> Array:
@@ -482,6 +531,9 @@ def _told_apart(of: Observed) -> list[str]:
     """Return the variances that the logs can tell apart."""
     logs = np.bincount(of.unit)
     names = [UNITS] if len(logs) > 1 else []
+    for name, column in zip(SLOPES, of.columns.T[:of.slopes]):
+        many = sum(len(np.unique(column[of.unit == unit])) >= _FEWEST for unit in range(len(logs)))
+        names += [name] if many > 1 else []
     if len(logs) == 1 or logs.max() > 1:
         names.append(POWER_ONS)
     on = of.drive[of.drive >= 0]
@@ -493,7 +545,7 @@ def _told_apart(of: Observed) -> list[str]:
 def _bounds(of: Observed, names: list[str]) -> dict[str, tuple[float, float]]:
     """Return the ends of each coordinate: the logarithm of floor, and of floor plus largest."""
     square = float(np.median(of.deviation ** 2))
-    floors = {UNITS: square * len(np.unique(of.unit)) / len(of),
+    floors = {**dict.fromkeys((UNITS, *SLOPES), square * len(np.unique(of.unit)) / len(of)),
               DRIVES: square * len(np.unique(of.drive)) / len(of), POWER_ONS: square}
     found = {}
     for name in names:
@@ -503,22 +555,31 @@ def _bounds(of: Observed, names: list[str]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _log_prior(of: Observed, sizes: Mapping[str, Array]) -> Array:
+def _log_prior(at: _Equations, sizes: Mapping[str, Array]) -> Array:
     """Return logarithms of Jeffreys' prior of the variances of groups, shape (points,)."""
-    none = np.zeros((len(next(iter(sizes.values()))), 1))
-    own = none + sizes.get(OWN, np.ones(1))[:, None]
-    variance = none + sizes.get(POWER_ONS, np.zeros(1))[:, None] + own * of.deviation ** 2
-    found = np.zeros(len(none))
+    of, found = at.of, np.zeros(len(next(iter(sizes.values()))))
+    own = sizes.get(OWN, found + 1.0)[:, None]
+    variance = sizes.get(POWER_ONS, found)[:, None] + own * of.deviation ** 2
+
+    def jeffreys(name: str, mean: Array) -> Array:
+        """Return it for a variance beside that of the means of groups."""
+        size = sizes[name][:, None]
+        return np.asarray(0.5 * np.log(np.sum((size + mean) ** -2.0, axis=1)))
+
     if POWER_ONS in sizes:
-        found += 0.5 * np.log(np.sum(variance ** -2.0, axis=1))
-    for name, number in ((UNITS, of.unit), (DRIVES, of.drive)):
+        found = found + 0.5 * np.log(np.sum(variance ** -2.0, axis=1))
+    known = np.maximum((at.to_unit @ (1.0 / variance).T).T, 1e-100)  # none of a unit without logs
+    if UNITS in sizes:
+        found = found + jeffreys(UNITS, 1.0 / known)
+    for name, column in zip(SLOPES, of.columns.T):
         if name in sizes:
-            on = number >= 0
-            known = np.asarray((_summing(number[on]) @ (1.0 / variance[:, on]).T).T)
-            mean = 1.0 / known
-            if name == DRIVES:
-                mean = mean + (1.0 - own) * float(np.mean(of.deviation[on] ** 2))
-            found += 0.5 * np.log(np.sum((sizes[name][:, None] + mean) ** -2.0, axis=1))
+            first, second = ((at.to_unit @ (column ** power / variance).T).T for power in (1, 2))
+            found = found + jeffreys(name, 1.0 / np.maximum(second - first ** 2 / known,
+                                                            1e-12 * known))
+    if DRIVES in sizes:
+        usual = float(np.mean(of.deviation[at.on] ** 2))
+        found = found + jeffreys(DRIVES, (1.0 - own) * usual
+                                 + 1.0 / (at.to_drive @ (1.0 / variance[:, at.on]).T).T)
     return found
 
 

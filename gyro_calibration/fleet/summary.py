@@ -13,12 +13,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import date
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate
+from gyro_calibration.diagnosis.findings import Diagnosis, Estimate
 from gyro_calibration.diagnosis.words import amount, listed, quantity, spoken
 from gyro_calibration.files import plain
 from gyro_calibration.fleet.outliers import Change, changes, Outlier, outliers
@@ -31,15 +31,19 @@ from gyro_calibration.fleet.pooling import (
     OWN,
     Pooled,
     POWER_ONS,
+    SLOPES,
     UNITS,
 )
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
 
 #: Chance that a fleet in which nothing stands out, changes or is missing gives any alarm.
 FALSE_ALARMS = 0.01
-#: Kinds of alarms of a value: a unit, a drive, a change, and an effect of the type.
-_KINDS = 4
+#: Kinds of alarms of a value: a unit, a drive, a change, and an effect of the type; and of the
+#: effects of diagnoses: the type's, a unit's and a drive's.
+_KINDS, _COUNTED = 4, 3
 _YEAR = 365.25
 Record = Mapping[str, Any]
 
@@ -62,6 +66,7 @@ class Found:
     new_unit : what one more unit of the type will have
     drives : what the logs of each drive have in common, beside type and unit
     slopes : name -> drift of the type, over age in years or over temperature in K
+    unit_slopes : the same of each unit, where the logs show by how much units differ
     chance : that the mean of the type is as far from zero by chance
     outlying_units, outlying_drives, changed : what stands out
 
@@ -79,6 +84,7 @@ class Found:
     new_unit: Interval
     drives: Interval
     slopes: Mapping[str, Interval]
+    unit_slopes: Mapping[str, Interval]
     chance: float
     outlying_units: Sequence[Outlier]
     outlying_drives: Sequence[Outlier]
@@ -127,7 +133,7 @@ def summarized(records: Sequence[Record], false_alarms: float = FALSE_ALARMS) ->
     types = sorted({str(each['type']) for each in records})
     named = {kind: [[each for each in records if each['type'] == kind]] for kind in types}
     values = {kind: _names(logs[0]) for kind, logs in named.items()}
-    tests = max(_KINDS * sum(map(len, values.values())), 1)
+    tests = _KINDS * sum(map(len, values.values())) + _COUNTED * len(types)
     return [_of_type(kind, named[kind][0], values[kind], false_alarms / tests) for kind in types]
 
 
@@ -168,11 +174,13 @@ def _of_value(name: str, slow: bool, records: Sequence[Record], units: Sequence[
     rows, none = np.tile(fixed, (len(units), 1)), 0.0 * np.tile(fixed, (len(drives), 1))
     each = np.arange(len(units))
     mean = pooled.wanted(fixed=fixed)
-    slopes = {}
-    for place, (covariate, (_, scale)) in enumerate(columns.items(), 1):
-        row = np.zeros_like(fixed)
-        row[0, place] = 1.0 / scale
+    slopes, unit_slopes = {}, {}
+    for place, covariate in enumerate(columns, 1):
+        row = np.eye(1 + len(columns))[place:place + 1]
         slopes[covariate] = pooled.estimate(pooled.wanted(fixed=row))
+        if SLOPES[place - 1] in pooled.names:
+            unit_slopes[covariate] = pooled.estimate(pooled.wanted(
+                unit=each, fixed=np.tile(row, (len(units), 1)), part=place))
     numbers = np.array([dates.index(one['date']) if one['date'] else -1 for one in held])
     error = float(np.median(observed.deviation))
     return Found(
@@ -182,28 +190,27 @@ def _of_value(name: str, slow: bool, records: Sequence[Record], units: Sequence[
         pooled.estimate(pooled.wanted(unit=each, fixed=rows, power_ons=1.0)),
         pooled.estimate(pooled.wanted(fixed=fixed, units=1.0, power_ons=1.0)),
         pooled.estimate(pooled.wanted(drive=np.arange(len(drives)), fixed=none, error=error)),
-        slopes, float(pooled.chance(mean)[0]), outliers(observed, UNITS, level, pooled),
+        slopes, unit_slopes, float(pooled.chance(mean)[0]),
+        outliers(observed, UNITS, level, pooled),
         outliers(observed, DRIVES, level, pooled), changes(observed, numbers, level, pooled))
 
 
 def _observed(records: Sequence[Record], name: str, key: str, units: Sequence[str],
-              drives: Sequence[str]) -> tuple[Observed, dict[str, tuple[Array, float]]]:
-    """Return a value over logs, and its covariates, centred, with the scale of each."""
+              drives: Sequence[str]) -> tuple[Observed, list[str]]:
+    """Return a value over logs, and the names of its covariates, which are centred."""
     value, deviation = (np.array([each[key][name][what] for each in records])
                         for what in ('value', 'deviation'))
     unit = np.array([units.index(str(each['unit'])) for each in records])
     drive = np.array([drives.index(str(each['drive'])) if each['drive'] else -1
                       for each in records])
-    columns = {}
-    for covariate, column in (('age', _ages(records)), ('temperature', _temperatures(records))):
-        if column is not None and (scale := _within(column, unit)) > 0.0:
-            columns[covariate] = ((column - column.mean()) / scale, scale)
-    more = (np.column_stack([column for column, _ in columns.values()]) if columns
-            else np.empty((0, 0)))
+    columns = {covariate: column - column.mean() for covariate, column in (
+        ('age', _ages(records)), ('temperature', _temperatures(records)))
+        if column is not None and _varies(column, unit)}
     # slopes need logs enough beside the means of units
-    if len(records) < len(set(unit.tolist())) + len(columns) + 2:
-        more, columns = np.empty((0, 0)), {}
-    return Observed(value, deviation, unit, drive, more), columns
+    if not columns or len(records) < len(set(unit.tolist())) + len(columns) + 2:
+        return Observed(value, deviation, unit, drive), []
+    return Observed(value, deviation, unit, drive, np.column_stack(list(columns.values())),
+                    len(columns)), list(columns)
 
 
 def _ages(records: Sequence[Record]) -> Array | None:
@@ -219,11 +226,10 @@ def _temperatures(records: Sequence[Record]) -> Array | None:
     return np.array([float(each['temperature']) for each in records])
 
 
-def _within(column: Array, unit: Numbers) -> float:
-    """Return how much a covariate varies within units; 0 where it is that of each unit."""
+def _varies(column: Array, unit: Numbers) -> bool:
+    """Tell whether a covariate varies within units."""
     centre = np.bincount(unit, column) / np.maximum(np.bincount(unit), 1)
-    spread = float(np.std(column - centre[unit]))
-    return spread if spread > 1e-9 * (1.0 + float(np.abs(column).max())) else 0.0
+    return bool(np.std(column - centre[unit]) > 1e-9 * (1.0 + np.abs(column).max()))
 
 
 # who is to blame
@@ -233,7 +239,7 @@ def sentences(found: TypeFound) -> Iterator[str]:
     for each in found.values.values():
         yield from _blame(found, each)
     yield from _lacking(found)
-    yield from (f'{spoken(name)}: {text}' for name, text in diagnosed(found))
+    yield from (_of_count(each, len(found.units)) for each in counted(found))
 
 
 def _blame(found: TypeFound, each: Found) -> Iterator[str]:
@@ -285,22 +291,76 @@ def _lacking(found: TypeFound) -> Iterator[str]:
                'logs show of them is the wander of the bias')
 
 
-def diagnosed(found: TypeFound) -> Iterator[tuple[str, str]]:
-    """Give each established effect that is not among the pooled values, and whose it is."""
-    seen: dict[str, list[Record]] = {}
-    for each in found.records:
-        for finding in (each['diagnosis'] or {}).get('findings', ()):
-            if finding['status'] == 'established' and finding['effect'] not in found.values:
-                seen.setdefault(finding['effect'], []).append(each)
-    for effect, logs in seen.items():
-        units, drives = ({str(each[key]) for each in logs} for key in ('unit', 'drive'))
-        many = len(units) > 0.5 * len(found.units) and len(drives) > 0.5 * len(found.drives)
-        whose = ("the type's" if many and len(units) > 1
-                 else f"the unit's, {plain(min(units))}" if len(units) == 1 and len(drives) > 1
-                 else f"the drive's, {plain(min(drives))}"
-                 if len(drives) == 1 and len(units) > 1 and drives != {''} else 'not settled')
-        yield effect, (f'established in {len(logs)} of {len(found.records)} logs, of {len(units)} '
-                       f'of {len(found.units)} units: {whose}')
+@dataclass(frozen=True)
+class Counted:
+    """
+    An effect that diagnoses of single logs established, and that is not among the pooled values.
+
+    Attributes
+    ----------
+    effect : its name
+    logs, units, of : number of logs and of units that show it, and of logs that were diagnosed
+    owner : of it, 'type', 'unit' or 'drive'; '' where as many are no more than false names
+    name : of the unit or drive
+    chance : that so many logs show one effect by false names, times the units or drives that it
+        was chosen from
+
+    """
+
+    effect: str
+    logs: int
+    units: int
+    of: int
+    owner: str
+    name: str
+    chance: float
+
+
+def counted(found: TypeFound) -> list[Counted]:
+    """
+    Return whose the established effects of diagnoses are, by the numbers of logs that show them.
+
+    A diagnosis names some effect falsely at a rate that is stated. An effect is the type's where
+    it is in more logs than that explains even without the unit, and without the drive, that show
+    it most; else it is the unit's or the drive's whose own logs show it more often.
+
+    """
+    logs = [each for each in found.records if each['diagnosis']]
+    shown = [{one['effect'] for one in each['diagnosis']['findings']
+              if one['status'] == 'established'} for each in logs]
+    result = []
+    for effect in sorted(set().union(*shown) - set(found.values)):
+        has = np.array([effect in each for each in shown])
+        rest, owners = [float(_by_chance(has))], []
+        for kind in ('unit', 'drive'):
+            other = 'drive' if kind == 'unit' else 'unit'
+            groups = {str(each[kind]) for each in logs} - {''}
+            own = {name: np.array([each[kind] == name for each in logs]) for name in groups}
+            if len(groups) > 1:
+                rest.append(max(_by_chance(has[~of]) for of in own.values()))
+                # of one drive, or of one unit, it cannot be told whose it is
+                owners += [(len(groups) * _by_chance(has[of]), kind, name)
+                           for name, of in sorted(own.items())
+                           if len({each[other] for each, one in zip(logs, of) if one}) > 1]
+        whole = (max(rest), 'type', '') if len(rest) > 1 else (1.0, '', '')
+        chance, owner, name = whole if whole[0] < found.level else min([*owners, whole])
+        result.append(Counted(effect, int(has.sum()), len({
+            each['unit'] for each, one in zip(logs, has) if one}), len(logs), *(
+                (owner, name) if chance < found.level else ('', '')), min(chance, 1.0)))
+    return result
+
+
+def _by_chance(has: NDArray[np.bool_]) -> float:
+    """Return the chance that as many of some logs show one effect by false names."""
+    return float(binom.sf(has.sum() - 1, len(has), Diagnosis.false_alarm_rate))
+
+
+def _of_count(each: Counted, units: int) -> str:
+    whose = {'type': 'the model of the type lacks it', '': 'no more logs than false names explain',
+             'unit': f"the unit's, {plain(each.name)}",
+             'drive': f"the drive's, {plain(each.name)}: its reference's, or the vehicle's"}
+    return (f'{spoken(each.effect)}: established in {each.logs} of {each.of} logs, of '
+            f'{each.units} of {units} units: {whose[each.owner]}')
 
 
 # as data
@@ -310,7 +370,7 @@ def data(found: TypeFound) -> dict[str, Any]:
     return {'type': found.name, 'units': list(found.units), 'drives': list(found.drives),
             'logs': len(found.records), 'level': found.level,
             'values': {name: _value_data(found, each) for name, each in found.values.items()},
-            'effects': [{'effect': effect, 'said': text} for effect, text in diagnosed(found)],
+            'effects': [asdict(each) for each in counted(found)],
             'lacking': [each.name for each in lacking(found)],
             'sentences': list(sentences(found))}
 
@@ -318,7 +378,8 @@ def data(found: TypeFound) -> dict[str, Any]:
 def _value_data(found: TypeFound, each: Found) -> dict[str, Any]:
     held = {str(record['unit']) for record in each.records}
     spoken = {UNITS: 'between_units', POWER_ONS: 'between_power_ons', DRIVES: 'between_drives',
-              OWN: 'own_share_of_errors'}
+              OWN: 'own_share_of_errors',
+              **{name: f'between_units_over_{over}' for name, over in zip(SLOPES, each.slopes)}}
     return {
         'unit': each.unit, 'slow': each.slow, 'logs': len(each.records),
         **{spoken[name]: {'estimate': part.estimate, 'ci95': [part.low, part.high]}
@@ -327,7 +388,9 @@ def _value_data(found: TypeFound, each: Found) -> dict[str, Any]:
         'chance_of_zero_mean': each.chance,
         'units': {name: {**_interval(each.units, place),
                          'from_type': _interval(each.from_type, place),
-                         'next_power_on': _interval(each.next_log, place)}
+                         'next_power_on': _interval(each.next_log, place),
+                         'slopes': {over: _interval(slope, place)
+                                    for over, slope in each.unit_slopes.items()}}
                   for place, name in enumerate(found.units) if name in held},
         'drives': {name: _interval(each.drives, place)
                    for place, name in enumerate(found.drives)} if DRIVES in each.pooled.names

@@ -70,7 +70,10 @@ def _of_units(types: Sequence[TypeFound]) -> Iterable[Row]:
                        'from_type': float(each.from_type.value[place]),
                        'next_low': float(each.next_log.low[place]),
                        'next_high': float(each.next_log.high[place]),
-                       'stands_out': place in outlying}
+                       'stands_out': place in outlying,
+                       **{f'{over}_slope{end}': float(value[place])
+                          for over, slope in each.unit_slopes.items() for end, value in (
+                              ('', slope.value), ('_low', slope.low), ('_high', slope.high))}}
 
 
 def _parquet(columns: Sequence[str], rows: Sequence[Row]) -> bytes | None:

@@ -25,7 +25,7 @@ from gyro_calibration.fleet.pooling import Observed, Pooled
 from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.report import report
 from gyro_calibration.fleet.run import cluster, finished, Lost, processes
-from gyro_calibration.fleet.summary import data, sentences, summarized
+from gyro_calibration.fleet.summary import counted, data, sentences, summarized
 from gyro_calibration.fleet.table import described, entries, Entry, pattern
 from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import done, Task
@@ -227,6 +227,23 @@ def test_a_unit_that_stands_out_and_one_that_changes_are_named_and_no_other():
     assert (change.unit, change.since) == (7, 4) and change.size == pytest.approx(3.0, abs=0.5)
 
 
+def test_units_that_drift_apart_have_slopes_of_their_own():
+    """Over age, beside references that are off by far more on each drive."""
+    generator = np.random.default_rng(10)
+    unit, drive = np.indices((8, 6)).reshape(2, -1)
+    age, slopes = np.linspace(-1.5, 1.5, 6)[drive], np.linspace(-2.0, 4.0, 8)
+    values = (unit + slopes[unit] * age + 10.0 * generator.standard_normal(6)[drive]
+              + 0.1 * generator.standard_normal(48))
+    pooled = Pooled(Observed(values, np.full(48, 0.1), unit, drive, age[:, None], 1))
+    assert pooled.components['slopes_0'].low < np.std(slopes) < pooled.components['slopes_0'].high
+    apart = pooled.estimate(pooled.wanted(unit=np.arange(8), fixed=np.zeros((8, 2)), part=1))
+    assert apart.value - apart.value.mean() == pytest.approx(slopes - 1.0, abs=0.2)
+    whole = pooled.estimate(pooled.wanted(unit=np.arange(8), fixed=np.tile([0.0, 1.0], (8, 1)),
+                                          part=1))
+    # the mean slope is that of the references as well, what units differ by is not
+    assert (whole.high - whole.low).min() > 2.0 * (apart.high - apart.low).max()
+
+
 def records(ramp=0.0, wander=1.0):
     """Return records of five units on four drives, in which a ramp repeats or only wanders."""
     generator = np.random.default_rng(9)
@@ -250,6 +267,23 @@ def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
     assert "bias is the unit's" in told and "time offset is the reference's" in told
     assert said in told and 'differs from its type' not in told
     json.dumps(data(found), allow_nan=False)
+
+
+def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
+    shown = {'hysteresis': lambda unit, drive: True,
+             'bandwidth': lambda unit, drive: unit == '2',
+             'outliers': lambda unit, drive: drive == 'j',
+             'quantization': lambda unit, drive: (unit, drive) in (('1', 'h'), ('3', 'k')),
+             'bias': lambda unit, drive: True}
+    (found,) = summarized([{**each, 'diagnosis': {'findings': [
+        {'effect': name, 'status': 'established'} for name, of in shown.items()
+        if of(each['unit'], each['drive'])] + [{'effect': 'dead_zone', 'status': 'suspected'}]}}
+        for each in records()])
+    assert {each.effect: (each.owner, each.name, each.logs) for each in counted(found)} == {
+        'hysteresis': ('type', '', 20), 'bandwidth': ('unit', '2', 4),
+        'outliers': ('drive', 'j', 5), 'quantization': ('', '', 2)}
+    told = '; '.join(sentences(found))
+    assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
 
 
 # models
