@@ -12,6 +12,7 @@
 A fleet: predicted drives, variances, alarms, smallest effects, slow effects, scale and priors.
 
     python benchmarks/fleet.py drives FOLDER [OUT]    # rc_car_*.csv.gz of the wheeled drives
+    python benchmarks/fleet.py first FOLDER [OUT]     # 20 s of each, with and without a prior
     python benchmarks/fleet.py variances slopes alarms smallest slow scale prior
 
 """
@@ -30,13 +31,19 @@ from typing import Any
 
 from fleet_tasks import calibrate
 from gyro_calibration.calibration.self_calibration import Reference, self_calibrate
+from gyro_calibration.diagnosis.expected_output import bridged
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.fleet.pooling import DRIVES, Observed, Pooled, POWER_ONS, SLOPES, UNITS
+from gyro_calibration.fleet.prior import models
 from gyro_calibration.fleet.run import finished, Lost, processes
 from gyro_calibration.fleet.slow_effects import slow_effects
 from gyro_calibration.fleet.summary import counted, lacking, summarized
 from gyro_calibration.fleet.table import entries
 from gyro_calibration.fleet.work import done, Task
-from gyro_calibration.logs.log import Array, DEGREE, Log
+from gyro_calibration.heading.integration import integrate
+from gyro_calibration.heading.log_compensation import compensate_log
+from gyro_calibration.logs.log import Array, DEGREE, Log, part, read_log
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.motion import from_rates
 import numpy as np
 from numpy.random import Generator
@@ -126,6 +133,54 @@ def drives(folder: str, out: str = '') -> Iterator[str]:
                 for each in (apart, alone)]
         yield (f'| {name}, {spoken} | {rms[0]:.3g} | {rms[1]:.3g} | {hold[0]:.0f} % | '
                f'{rms[2]:.3g} | {hold[1]:.0f} % | {rms[2] / rms[0]:.2f} |')
+
+
+def first(folder: str, out: str = '') -> Iterator[str]:
+    """
+    Diagnose 20 s of each log without a model, and with those of a fleet of other drives.
+
+    The model of the type is that of the other units. The heading by the model that comes out is
+    compared with the course over the next 60 s.
+
+    """
+    with tempfile.TemporaryDirectory() as new:
+        records = [done(Task(entry, out or new)) for entry in entries([f'{folder}/rc_car_*'])]
+    error: dict[str, list[float]] = {}
+    for record in records:
+        log = read_log(record['log'])
+        offset = record['values']['time_offset']['value']
+        assert log.time is not None and log.reference_heading is not None
+        begin = log.time[np.isfinite(log.reference_heading)][0]
+        short = part(log, (log.time >= begin) & (log.time <= begin + 20.0))
+        others = [each for each in records if each['drive'] != record['drive']]
+        (of_type,), (of_unit,) = (summarized(each) for each in (
+            [each for each in others if each['unit'] != record['unit']], others))
+        given = {'none': None, 'type': dict(models(of_type))[''],
+                 'unit': dict(models(of_unit))[record['unit']]}
+        for name, model in given.items():
+            found = diagnose([short], np.random.default_rng(0), model).model
+            for how, used in (('20 s', found), ('model alone', model)):
+                if used is not None:
+                    error.setdefault(f'{name}, {how}', []).append(
+                        _error_over(log, used, begin + 20.0, offset))
+        print(record['log'], {name: each[-1] / DEGREE for name, each in error.items()},
+              file=sys.stderr)
+    yield '| prior, what was fitted | heading error after 60 s, rms, deg | median |'
+    yield '|---|---:|---:|'
+    for name, each in sorted(error.items()):
+        sizes = np.abs(each) / DEGREE
+        yield f'| {name} | {np.sqrt(np.mean(sizes ** 2)):.2f} | {np.median(sizes):.2f} |'
+
+
+def _error_over(log: Log, model: GyroModel, begin: float, offset: float) -> float:
+    """Return by how much the heading is off after 60 s, rad, as means over 5 s of course."""
+    assert log.time is not None and log.reference_heading is not None
+    turned = integrate(log.time, bridged(compensate_log(model, log)))
+    known = np.isfinite(log.reference_heading)
+    at, course = log.time[known], log.reference_heading[known]
+    left = np.interp(at + offset, log.time, turned) - course
+    ends = [left[(at >= start) & (at < start + 5.0)] for start in (begin, begin + 60.0)]
+    return float(np.mean(ends[1]) - np.mean(ends[0])) if all(map(len, ends)) else np.nan
 
 
 def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, known: bool
@@ -306,8 +361,8 @@ def prior(generator: Generator, runs: int = 40) -> Iterator[str]:
         driven = 1.0 + slip * generator.standard_normal()
         noise = 3e-3 * generator.standard_normal(len(times))
         rate = (1.0 + s) * driven * motion.rate_at(times) + b + noise
-        for name, covariance in (('without', None), ('with', np.diag(spread ** 2))):
-            fit = self_calibrate(times, rate, motion, reference=Reference(slip), prior=covariance)
+        for name, known in (('without', None), ('with', spread)):
+            fit = self_calibrate(times, rate, motion, reference=Reference(slip), prior=known)
             error = np.array([fit.scale_factor_error - s, fit.bias - b])
             found[name].append([*error, *(np.abs(error) < 1.96 * np.sqrt(
                 np.diag(fit.covariance)))])
@@ -324,12 +379,14 @@ PARTS = {each.__name__: each for each in (variances, slopes, alarms, smallest, s
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('what', nargs='+', help=f'drives FOLDER, or of {", ".join(PARTS)}')
+    parser.add_argument('what', nargs='+', help='drives FOLDER, first FOLDER, or of '
+                        f'{", ".join(PARTS)}')
     parser.add_argument('--seed', type=int, default=None, help='default: a fresh one')
     parser.add_argument('--fleets', type=int, help='as many, or runs')
     given = parser.parse_args(arguments)
-    if given.what[0] == 'drives':
-        print('\n'.join(drives(*given.what[1:])))
+    if given.what[0] in ('drives', 'first'):
+        of_drives = drives if given.what[0] == 'drives' else first
+        print('\n'.join(of_drives(*given.what[1:])))
         return
     for name in given.what:
         generator = np.random.default_rng(given.seed)

@@ -197,8 +197,9 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
         rates is driven by wheels that slip by up to 1 % of each turn, one of headings is exact
     output : of the gyro before its model, where that differs, shape (n,); it shows a gyro that is
         dead or at its limit
-    prior : covariance of (s, b) about zero before the run, as `GyroModel.prior` of a fleet, shape
-        (2, 2); what the run leaves open is drawn to it, in a method that gives a covariance
+    prior : standard deviations of (s, b) about zero before the run, as `GyroModel.prior` of a
+        fleet, shape (2,); what the run leaves open is drawn to it, in a method that gives a
+        covariance
 
     Raises
     ------
@@ -223,9 +224,9 @@ def self_calibrate(time: Array, rate: Array, motion: Motion, method: str = 'like
     fit = replace(fit, covariance=fit.covariance + hidden,
                   goodness=_goodness(fit, reference, noise))
     if prior is not None and np.isfinite(fit.covariance).all():
-        gain = prior @ np.linalg.inv(prior + fit.covariance)
-        s, b = (gain @ (fit.scale_factor_error, fit.bias)).tolist()
-        fit = replace(fit, scale_factor_error=s, bias=b, covariance=gain @ fit.covariance)
+        kept = np.linalg.inv(np.eye(2) + fit.covariance / prior[:, None] ** 2)
+        s, b = (kept.T @ (fit.scale_factor_error, fit.bias)).tolist()
+        fit = replace(fit, scale_factor_error=s, bias=b, covariance=fit.covariance @ kept)
     _refuse_fit(fit, run, motion, limits)
     return fit
 

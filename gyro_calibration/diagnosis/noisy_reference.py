@@ -28,7 +28,7 @@ from gyro_calibration.diagnosis.cross_validation import (
     WITHIN,
 )
 from gyro_calibration.diagnosis.data_quality import inspect
-from gyro_calibration.diagnosis.extended_model import with_terms
+from gyro_calibration.diagnosis.extended_model import origins_before, with_terms
 from gyro_calibration.diagnosis.findings import (
     Curve,
     Diagnosis,
@@ -53,7 +53,7 @@ from gyro_calibration.diagnosis.spans import (
 from gyro_calibration.heading.log_compensation import compensate_log
 from gyro_calibration.logs.log import Array, DEGREE, Log
 from gyro_calibration.model.effects import BIAS, CATALOGUE, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.noise import Noise
 import numpy as np
 from scipy.stats import t as student
@@ -105,8 +105,9 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference,
     record = inspect(replace(log, reference_heading=None, reference_rate=None))
     assert log.output is not None
     mended = replace(log, output=np.where(record.trusted, log.output, np.nan))
+    prior = None if model is None else model.prior
     plain = fit_spans(spans_of(mended if model is None else replace(
-        mended, output=compensate_log(model, mended)), reference.kind))
+        mended, output=compensate_log(model, mended)), reference.kind, prior))
     extended, found = search(plain, _OF_SEARCH * rate)
     gain = _gain(plain, extended)
     inside = extended
@@ -132,8 +133,11 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference,
     late = next((each for each in findings if each.effect == 'time_offset'
                  and each.status == 'established' and reference.kind in _SAME_CLOCK), None)
     base = _model(GyroModel(), plain, log) if model is None else model
-    after = (_model(model or GyroModel(), inside, log) if changed or late or model is None
-             else model)
+    after = (_model(model or GyroModel(), inside, log)
+             if changed or late or model is None or prior is not None else model)
+    if model is not None and prior is not None:
+        # what is known of this unit now takes the place of what is usual of its type
+        after = replace(after, tolerance=Tolerance(), origin=origins_before(model))
     if late:
         size = late.parameters['time_offset']
         deviation = (size.interval[1] - size.interval[0]) / (2.0 * 1.96)
@@ -145,7 +149,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference,
         Noise() if model is None else model.noise,
         None if not changed and model is not None else gain, base, after, _cannot_show(plain),
         [curve], heading_curve(parts, time), None,
-        (*record.remarks, *_remarks(reference, plain)), rate, trace=trace,
+        (*record.remarks, *_remarks(reference, plain, prior is not None)), rate, trace=trace,
         method=_METHOD.format(_SPOKEN[reference.kind]), reference=replace(reference, noise=noise),
         heading_shares=of_heading)
 
@@ -360,7 +364,10 @@ def _cannot_show(plain: SpanFit) -> dict[str, str]:
     return shown
 
 
-def _remarks(reference: Reference, plain: SpanFit) -> Iterator[str]:
+def _remarks(reference: Reference, plain: SpanFit, of_fleet: bool) -> Iterator[str]:
+    if of_fleet:
+        yield ('What the log leaves open of bias and scale factor error is drawn to what is usual '
+               'by the model, which is of a fleet.')
     yield (f'The reference is taken as {_SPOKEN[reference.kind]} ({reference.known}); say so with '
            '--reference-kind if it is another. It errs by '
            f'{plain.size("reference") / DEGREE:.2g} deg from point to point, and by '

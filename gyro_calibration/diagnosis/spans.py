@@ -164,7 +164,7 @@ class Spans:
     @property
     def fine(self) -> bool:
         """Tell whether the reference errs so little that lags and short events show."""
-        return self.treatment is not COURSE
+        return self.treatment.relative
 
     @property
     def stretches(self) -> NDArray[np.intp]:
@@ -286,11 +286,24 @@ class SpanFit:
         return float(self.fit.likely.get(name, 0.0))
 
 
-def spans_of(log: Log, kind: str = 'course') -> Spans:
-    """Lay a log with a reference out in spans."""
+def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Spans:
+    """
+    Lay a log with a reference out in spans.
+
+    Parameters
+    ----------
+    log : with output, time and a reference
+    kind : of the reference
+    prior : standard deviations of (s, b) as of `GyroModel.prior`, where the gyro's type is known
+
+    """
     assert log.time is not None and log.output is not None
     treatment = {'rate_command': RATE, 'encoder': HEADING, 'motion_capture': HEADING,
                  'gyro': HEADING}.get(kind, COURSE)
+    if prior is not None:
+        scale, bias, delay = treatment.prior
+        treatment = replace(treatment, prior=(min(scale, float(prior[0])),
+                                              min(bias, float(prior[1])), delay))
     time, output = log.time - log.time[0], bridged(log.output)
     white = white_noise(log.output)
     reference = log.reference_heading

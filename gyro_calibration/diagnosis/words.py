@@ -264,7 +264,7 @@ def _share(share: float) -> str:
 def offered(diagnosis: Diagnosis) -> bool:
     """Tell whether the model was extended: its effects, their values or its noise."""
     before, after = diagnosis.before, diagnosis.model
-    return (bool(diagnosis.findings)
+    return ((bool(diagnosis.findings) or before.prior is not None)
             and not (same_effects(before, after) and before.noise == after.noise))
 
 

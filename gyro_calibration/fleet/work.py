@@ -26,7 +26,7 @@ from gyro_calibration.calibration.dwells import dwells
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.selection import select_effects
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import rests
+from gyro_calibration.diagnosis.gates import gates, mismatch, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
@@ -175,6 +175,9 @@ def calibrate(log: Log, technology: str = 'mems'
     """
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
+    failed = None if log.time is None else mismatch(gates(log, None))
+    if failed is not None:
+        raise DataRefused(f'{failed.evidence}: {failed.remedy}')
     if log.time is not None and log.reference_rate is None and log.reference_heading is not None:
         found = calibrate_encoder(log, technology=technology)
         offset = {} if math.isnan(found.fit.time_offset) else {'time_offset': _value(

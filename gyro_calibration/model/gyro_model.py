@@ -251,7 +251,7 @@ class GyroModel:
     @cached_property
     def prior(self) -> Array | None:
         """
-        Return the covariance of (s, b) of a self-calibration before its run, shape (2, 2).
+        Return the standard deviations of (s, b) before a calibration, shape (2,); inf where open.
 
         A model of a fleet holds what is usual of its type, and by its tolerance how far a unit may
         be from that; other tolerances are those of one gyro in a laboratory, and no prior.
@@ -259,7 +259,8 @@ class GyroModel:
         """
         if 'fleet' not in self.origin:
             return None
-        return np.diag([self.tolerance.scale_factor_error ** 2, self.tolerance.bias ** 2])
+        return np.array([getattr(self.tolerance, name) or math.inf
+                         for name in ('scale_factor_error', 'bias')])
 
     def beyond(self, output: Number, temperature: Number) -> tuple[Number, Number]:
         """

@@ -11,6 +11,7 @@
 """A fleet: which log is of which unit, workers that die, and the verb on good and bad input."""
 
 import csv
+from dataclasses import replace
 import io
 import json
 import os
@@ -19,6 +20,7 @@ import struct
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
+from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.files import InputError
 from gyro_calibration.fleet.outliers import changes, outliers
 from gyro_calibration.fleet.pooling import Observed, Pooled
@@ -30,7 +32,8 @@ from gyro_calibration.fleet.table import described, entries, Entry, pattern
 from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import done, Task
 from gyro_calibration.logs.log import Log, write_log
-from gyro_calibration.model.gyro_model import GyroModel, Tolerance
+from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration.model.gyro_model import GyroModel, Term, Tolerance
 from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import from_rates
 import numpy as np
@@ -146,12 +149,23 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
     write_log(logs / 'b_unit1.csv', drive(0.01, 0))  # a double
     (logs / 'c_unit1.csv').write_text('time_s,gyro_dps\n0,x\n1,2\n')
     write_log(logs / 'nobody.csv', drive(0.01, 3))
+    rates = drive(0.01, 4)
+    write_log(logs / 'd_unit1.csv', replace(rates, output=rates.output / DEGREE))
+    write_log(logs / 'd_unit2.csv', replace(rates, time=1000.0 * rates.time))
+    (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n' + (
+        logs / 'a_unit2.csv').read_text())
     assert run(logs, '--out', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
     reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert told['logs'] == 5 and 'is a copy of' in reasons['b_unit1.csv']
+    assert told['logs'] == 8 and 'is a copy of' in reasons['b_unit1.csv']
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
-    assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv'}
+    assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
+    assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv', 'd_unit1.csv',
+                            'd_unit2.csv'}
+    assert not any('\n' in each for each in reasons.values())
+    # types are pooled apart
+    assert {each['type']: each['units']
+            for each in told['types']} == {'': ['1', '2'], 'FOG': ['3']}
 
 
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
@@ -297,7 +311,8 @@ def test_the_prior_of_a_type_and_of_a_unit_is_what_the_fleet_shows(tmp_path):
         write_model(tmp_path / 'model.yaml', said[name])
         model = read_model(tmp_path / 'model.yaml')
         values = {term.effect.name: term.values[0] for term in model.terms}
-        spread = np.sqrt(model.prior[1, 1])
+        assert np.isinf(model.prior[0])  # the logs do not show the scale
+        spread = model.prior[1]
         assert set(values) == {'bias'} and model.gyro['name'] == 'DOT'
         assert values['bias'] - 1.96 * spread == pytest.approx(interval.low[place])
         assert values['bias'] + 1.96 * spread == pytest.approx(interval.high[place])
@@ -311,10 +326,36 @@ def test_a_run_of_20_s_is_drawn_to_the_prior_as_far_as_it_leaves_the_values_open
     noise = 1e-3 * np.random.default_rng(3).standard_normal(len(time))
     rate = 1.01 * motion.rate_at(time) + 0.002 + noise
     alone, drawn = (self_calibrate(time, rate, motion, prior=prior)
-                    for prior in (None, np.diag([1e-3 ** 2, 0.01 ** 2])))
+                    for prior in (None, np.array([1e-3, np.inf])))
     assert np.sqrt(alone.covariance[0, 0]) > 5e-3 > 1e-3 > np.sqrt(drawn.covariance[0, 0])
     assert abs(drawn.scale_factor_error) < 0.05 * abs(alone.scale_factor_error)
     assert drawn.bias == pytest.approx(alone.bias, rel=0.05)
+
+
+def test_a_diagnosis_by_a_course_takes_what_is_usual_of_a_fleet_as_its_prior():
+    """20 s by a course that is off by 2 deg leave the bias open by more than a unit varies."""
+    generator = np.random.default_rng(4)
+    time = np.arange(0.0, 20.1, 0.05)
+    course = np.sin(2.0 * np.pi * time / 10.0)
+    output = np.gradient(course, time) + 0.0105 + 1e-3 * generator.standard_normal(len(time))
+    seen: np.ndarray = np.full(len(time), np.nan)
+    seen[::3] = course[::3] + 2.0 * DEGREE * generator.standard_normal(len(time[::3]))
+    log = Log(time=time, output=output, reference_heading=seen)
+    given = GyroModel((Term(CATALOGUE['bias'], (0.01,)),), np.zeros((1, 1)),
+                      tolerance=Tolerance(bias=5e-4), origin={'fleet': {'logs': 5}})
+    alone, drawn, kept = (diagnose([log], generator, model, kind='course').model
+                          for model in (None, given, replace(given, origin={})))
+    values, deviations = zip(*(_bias(model) for model in (alone, drawn)))
+    assert deviations[1] < 5e-4 < deviations[0]
+    assert abs(values[1] - 0.0105) < 3.0 * deviations[1]
+    assert drawn.prior is None and drawn.tolerance == Tolerance()
+    assert kept.terms == given.terms  # the tolerance of a laboratory is no prior
+
+
+def _bias(model):
+    """Return the bias of a model, and its standard deviation."""
+    (place,) = [place for place, each in enumerate(model.terms) if each.effect.name == 'bias']
+    return model.terms[place].values[0], np.sqrt(model.covariance[place, place])
 
 
 # pages, tables, clusters
