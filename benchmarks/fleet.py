@@ -317,19 +317,17 @@ def slow(generator: Generator, fleets: int = 6, logs: int = 10) -> Iterator[str]
 
 def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
     """Give the cost of a task, the memory of the coordinator, and what killed workers cost."""
-    begin = time.process_time()
-    for number in range(200):
-        calibrate(number)
-    single = (time.process_time() - begin) / 200.0
-    yield '| logs | killed workers | survived | CPU a log over that alone | memory, MB |'
+    yield ('| logs | killed workers | survived | CPU a log, ms: alone, worker, coordinator | '
+           'memory, MB |')
     yield '|---:|---:|---:|---:|---|'
     for count, fatal in ((logs, False), (logs // 10, True)):
         given = (range(count) if not fatal
                  else [-1 - number if number % (count // killed) == 7 else number
                        for number in range(count)])
+        alone = [_alone()]
         begin = time.process_time()
         done_, lost, memory, used = 0, 0, [], {}
-        with processes(2, preload=['gyro_calibration.cli.fleet', 'fleet_tasks']) as create:
+        with processes(2, preload=['fleet', 'fleet_tasks']) as create:
             for _, found in finished(calibrate, iter(given), 2, create):
                 lost += isinstance(found, Lost)
                 done_ += not isinstance(found, Lost)
@@ -337,9 +335,20 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
                     used[found[1]] = found[2]
                 if (done_ + lost) % (count // 4) == 0:
                     memory.append(_memory())
-        ratio = (time.process_time() - begin + sum(used.values())) / count / single
+        own = time.process_time() - begin
+        alone.append(_alone())  # a busy machine is slower at one time than at another
+        cost = [1e3 * each for each in (
+            np.mean(alone), sum(used.values()) / count, own / count)]
         yield (f'| {count} | {lost} | {done_} of {count - (killed if fatal else 0)} | '
-               f'{ratio:.2f} | {", ".join(f"{each:.0f}" for each in memory)} |')
+               f'{", ".join(f"{each:.2f}" for each in cost)} | {", ".join(f"{each:.0f}" for each in memory)} |')
+
+
+def _alone(logs: int = 500) -> float:
+    """Return the CPU time of a log in this process, s."""
+    begin = time.process_time()
+    for number in range(logs):
+        calibrate(number)
+    return (time.process_time() - begin) / logs
 
 
 def _memory() -> float:

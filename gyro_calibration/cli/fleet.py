@@ -201,7 +201,7 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
         memory = given.memory * _GIGABYTE if given.memory else 0.8 * machine / workers
-        with processes(workers, memory, ['gyro_calibration.cli.main']) as create:
+        with processes(workers, memory, ['gyro_calibration.fleet.work']) as create:
             yield workers, create
         return
     try:

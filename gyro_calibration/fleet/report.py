@@ -59,6 +59,8 @@ _STYLE = Markup("""<style>
 th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid; }
 input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-width: 20rem; }
 .scroll.tall { max-height: 40rem; }
+.sortable th, .sortable td { overflow-wrap: normal; word-break: normal; }
+.sortable td:nth-child(n + 2):not(:empty) { min-width: 4.5rem; }
 </style>""")
 
 
@@ -111,13 +113,14 @@ def _type(found: TypeFound, place: int) -> Iterator[Markup]:
 
 
 def _variances(found: TypeFound) -> Markup:
+    drifts = any(each.slopes for each in found.values.values())
     heads = ['value', 'mean of the type', 'one more unit', *(text for _, text in _SPREADS),
-             'drift']
+             *(['drift'] if drifts else [])]
     rows = [[_cell(spoken(each.name)), _estimate(each, each.mean, 0),
              _estimate(each, each.new_unit, 0),
              *(_spread(each, each.components.get(name)) for name, _ in _SPREADS),
-             _cell('; '.join(f'{_text(slope, 0, f"{each.unit}/{_per(name)}", each.name)}'
-                             for name, slope in each.slopes.items()))]
+             *([_cell('; '.join(_text(slope, 0, f'{each.unit}/{_per(name)}', each.name)
+                                for name, slope in each.slopes.items()))] if drifts else [])]
             for each in found.values.values()]
     return _table(heads, rows)
 
@@ -206,7 +209,8 @@ def _drives_chart(found: TypeFound, each: Found, name: str) -> Chart:
 def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,
            style: str) -> Chart:
     unit, factor = for_people(each.unit, each.name)
-    order = ', '.join(f'{place} {text}' for place, text in enumerate(names, 1))
+    order = ', '.join(text if text == str(place) else f'{place} {text}'
+                      for place, text in enumerate(names, 1))
     middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / _BAND
     return Chart(name, f'{spoken(each.name)} by {kind}', f'{kind}s: {order}', kind, '',
                  np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
