@@ -10,7 +10,7 @@ ROS := $(or $(ROS_DISTRO),wheels)
 # Stamps of their own for each ROS, so that a change of it is noticed.
 DEPENDENCIES := $(VENV)/.dependencies-$(ROS)
 INSTALLED := $(VENV)/.installed-$(ROS)
-SOURCES := package.xml $(shell find gyro_calibration gyro_calibration_reproduction config samples launch bin lib \
+SOURCES := package.xml $(shell find gyro_calibration gyro_calibration_bench gyro_calibration_reproduction config samples launch bin lib \
                                    -type f -not -name '*.pyc')
 PYTEST := $(BIN)/python -m pytest
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq
@@ -33,7 +33,7 @@ style:
 	@code=0; \
 	$(BIN)/python -m ruff check --quiet --output-format concise . || code=1; \
 	$(BIN)/python -m flake8 || code=1; \
-	$(BIN)/python -m mypy --no-error-summary gyro_calibration gyro_calibration_reproduction || code=1; \
+	$(BIN)/python -m mypy --no-error-summary gyro_calibration gyro_calibration_bench gyro_calibration_reproduction || code=1; \
 	exit $$code
 
 # what has to keep time: nodes, ports

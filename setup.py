@@ -69,7 +69,9 @@ setup(
     author=manifest.findtext('author'), author_email=manifest.find('author').get('email'),
     maintainer=manifest.findtext('maintainer'),
     maintainer_email=manifest.find('maintainer').get('email'),
-    packages=find_packages(include=[name, f'{name}.*', f'{name}_reproduction']), package_data={
+    packages=find_packages(include=[
+        name, f'{name}.*', f'{name}_reproduction', f'{name}_bench*'
+    ]), package_data={
         name: ['py.typed'], f'{name}.diagnosis': ['report.html']
     }, python_requires='>=3.10,<3.15', install_requires=[
         'numpy>=1.21', 'scipy>=1.8', 'pyserial', 'PyYAML', 'tqdm'

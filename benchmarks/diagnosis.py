@@ -14,11 +14,11 @@ Measure how well a diagnosis finds hidden effects: false alarms, names, sets, es
     python benchmarks/diagnosis.py [--logs N] [--part PART ...] [--processes 2] [--verbose]
                                    [--out CASES.jsonl] [--only TEXT] [--seed N] [--with-model]
 
-Each log has 15 min at 50 Hz of a random gyro in random motion, made by `test/hidden`, which shares
-nothing with the package. Sizes are multiples of the minimum detectable effect. Every case has a
-name, such as ``effects/warm_up/2/mixed/rate/0``, and its random numbers depend on its name and the
-seed alone: ``--only`` with a part of a name runs those cases again, ``--verbose`` prints each
-failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
+Each log has 15 min at 50 Hz of a random gyro in random motion, made by `gyro_calibration_bench`,
+which shares nothing with the package. Sizes are multiples of the minimum detectable effect. Every
+case has a name, such as ``effects/warm_up/2/mixed/rate/0``, and its random numbers depend on its
+name and the seed alone: ``--only`` with a part of a name runs those cases again, ``--verbose``
+prints each failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
 
         nothing   N logs of each noise: any finding is a false alarm
         effects   N logs of each effect of the catalogue at 1.2, 2 and 5 times the detectable size
@@ -26,13 +26,14 @@ failed one, and ``--out`` writes all of them as JSON, one a line. Parts:
         triples   the same with three
         outside   N logs of each effect outside the catalogue, at 3 times
         sets      N logs of each pair of twins, either of them hidden where they are confounded
+        separated the same, with a second log that separates them
         references
                   N logs of 10 min at 25 Hz for each reference that errs: with nothing hidden,
                   without a model, and with one that is right (its bias instability is the floor
                   of the Allan deviation); and N with effects at each multiple, in turn
 
     What is suspected only does not count, but for the column `suspected`, which has such names a
-    log; of what happens once (`ONCE`), which is never established, it does. The figures:
+    log; of what happens once (`methods.ONCE`), which is never established, it does. The figures:
     `detected`, something is reported; `first`, the strongest finding has the right name; `in
     set`, each hidden cause is a finding or in the set of one; `set size`, of the findings that
     hold a hidden cause; `extra`, findings that hold none, a log; `beyond`,
@@ -63,95 +64,17 @@ import re
 import sys
 import time
 from typing import Any
-import zlib
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).parent.parent / 'test'))
 
-from diagnosed import diagnosis_of, Judged, judged, won  # noqa: E402
+from diagnosed import diagnosis_of, judged_findings, won  # noqa: E402
 from gyro_calibration.diagnosis.findings import Finding  # noqa: E402
-from hidden import Cause, FORMS, HiddenLog, hide, OUTSIDE, twin, TWINS  # noqa: E402
-from hidden.effects import AGAINST_A_MODEL  # noqa: E402
-from hidden.reference import hide_beside, Imperfect  # noqa: E402
+from gyro_calibration_bench.cases import Case, cases, made, PARTS, source  # noqa: E402
+from gyro_calibration_bench.hidden import Cause  # noqa: E402
+from gyro_calibration_bench.methods import reported  # noqa: E402
+from gyro_calibration_bench.scores import Judged  # noqa: E402
 import numpy as np  # noqa: E402  (after the number of its threads is set)
-
-MULTIPLES = (1.2, 2.0, 5.0)
-#: The false alarms are counted in each of these; whatever else is hidden has them in turn.
-ALARMS = ('white', 'walk', 'flicker')
-NOISES = ('mixed', 'walk', 'flicker', 'white', 'gauss_markov')
-#: References in turn: a rate, a heading, and the heading of an encoder.
-REFERENCES = ('rate', 'heading', 'rate', 'encoder')
-ENCODER_STEP = 2.0 * math.pi / 65536
-#: References that err, and the effects that are hidden beside them in turn.
-IMPERFECT = {
-    f'{kind}_{size:g}': Imperfect(kind, size)
-    for kind, sizes in (
-        ('rate', (0.1, 0.3, 0.5)),
-        ('capture', (0.02, 0.05, 0.1)),
-        ('encoder', (0.09, 0.5)),
-        ('course', (1.0, 5.0, 10.0)),
-    )
-    for size in sizes
-}
-BESIDE = (
-    'scale_factor_asymmetry',
-    'cubic_nonlinearity',
-    'heading_sensitivity',
-    'bias_temperature',
-    'scale_factor_temperature',
-    'warm_up',
-    'time_offset',
-    'bandwidth',
-    'reference_once_per_rev',
-    'reference_slip',
-    'bias_step',
-    'acceleration_sensitivity',
-)
-#: What is true of references without being hidden.
-TRUE = {'encoder': ('reference_quantization',), 'course': ('time_offset',)}
-#: Causes that happen once; their names count even where they are suspected only.
-ONCE = ('bias_step', 'reference_slip')
-#: Not in pairs: findings against a model only, and a wrong unit, which changes other sizes.
-ALONE = {*AGAINST_A_MODEL, 'unit_error'}
-#: So much of its multiple each of several effects must keep beside the others.
-LEFT = 0.8
-
-
-@dataclass(frozen=True)
-class Case:
-    """One log to be diagnosed; its random numbers come of its name and a seed."""
-
-    part: str
-    names: tuple[str, ...]
-    multiple: float
-    noise: str
-    reference: str
-    number: int
-    twins: tuple[str, str] | None = None
-
-    def __str__(self) -> str:
-        what = '+'.join(self.names) or ('random' if self.multiple else 'nothing')
-        beside = '' if self.twins is None else f'({"|".join(self.twins)})'
-        return (f'{self.part}/{what}{beside}/{self.multiple:g}/{self.noise}/{self.reference}/'
-                f'{self.number}')
-
-    @property
-    def against_a_model(self) -> bool | None:
-        """Whether twins show only beside a model; None where what is hidden decides it."""
-        return True if self.twins is not None and TWINS[self.twins].against_a_model else None
-
-    @property
-    def row(self) -> str:
-        """Return the row of the table that it belongs to."""
-        if self.part == 'references':
-            kind, beside = self.reference, ', with a model' if self.noise == 'floor' else ''
-            return f'{kind}, ' + (f'{self.multiple:g} times' if self.names else 'nothing' + beside)
-        return {'nothing': f'nothing, {self.noise}',
-                'effects': f'one effect, {self.multiple:g} times',
-                'pairs': f'two effects, {self.multiple:g} times',
-                'triples': f'three effects, {self.multiple:g} times',
-                'outside': f'outside the catalogue, {self.multiple:g} times',
-                'sets': 'twins, not to be told apart'}[self.part]
 
 
 @dataclass(frozen=True)
@@ -170,90 +93,29 @@ class Answer:
     suspected: Sequence[str]
 
 
-# the cases
-
-def cases(part: str, logs: int) -> Iterator[Case]:
-    """Go through the cases of a part."""
-    if part == 'nothing':
-        yield from (Case(part, (), 0.0, noise, _turn(REFERENCES, number), number)
-                    for number in range(logs) for noise in ALARMS)
-    elif part == 'sets':
-        yield from (Case(part, (name,), 0.0, 'white', 'rate', number, pair)
-                    for number in range(logs) for pair in TWINS for name in pair)
-    elif part == 'references':
-        for place, reference in enumerate(IMPERFECT):
-            for number in range(logs):
-                yield Case(part, (), 0.0, _turn(NOISES, number), reference, number)
-                yield Case(part, (), 0.0, 'floor', reference, number)
-                for multiple in MULTIPLES:
-                    name = _turn(BESIDE, number * len(IMPERFECT) + place)
-                    yield Case(part, (name,), multiple, _turn(NOISES, number), reference, number)
-    else:
-        multiples = (3.0,) if part == 'outside' else MULTIPLES
-        names: Sequence[tuple[str, ...]] = (
-            [(name,) for name in {'effects': FORMS, 'outside': OUTSIDE}.get(part, ())] or [()])
-        yield from (Case(part, each, multiple, _turn(NOISES, number + place),
-                         _reference(each, number + place), number) for number in range(logs)
-                    for multiple in multiples for place, each in enumerate(names))
-
-
-def _turn(choices: Sequence[str], number: int) -> str:
-    return choices[number % len(choices)]
-
-
-def _reference(names: Sequence[str], number: int) -> str:
-    """Choose a reference; figures of the noise are sized without encoder steps."""
-    return 'rate' if any(name in FORMS and FORMS[name].stage == 'noise'
-                         for name in names) else _turn(REFERENCES, number)
-
-
-def made(case: Case, generator: np.random.Generator) -> HiddenLog:
-    """Hide what a case asks for."""
-    if case.part == 'references':
-        noise = 'gauss_markov' if case.noise == 'floor' else case.noise
-        return hide_beside(
-            case.names, case.multiple, generator, IMPERFECT[case.reference], noise)
-    if case.twins is not None:
-        return twin(case.twins, case.names[0], generator)
-    step = ({'reference': 'heading', 'encoder_step': ENCODER_STEP} if case.reference == 'encoder'
-            else {'reference': case.reference})
-    if case.part not in ('pairs', 'triples'):
-        return hide(case.names, case.multiple, generator, noise=case.noise, **step)[0]
-    choices = [name for name in FORMS if name not in ALONE]
-    while True:
-        names = [str(name) for name in generator.choice(choices, 2 if case.part == 'pairs' else 3,
-                                                        replace=False)]
-        log, = hide(names, case.multiple, generator, noise=case.noise, **step)
-        if all(not cause.apart < LEFT * cause.multiple for cause in log.truth.gyro.causes):
-            return log
-
-
 # the answers
 
 def answered(case: Case, seed: int, with_model: bool | None = None) -> Answer:
     """Run a case; one that fails in whatever way is a row of the table, and not the end of it."""
-    generator = np.random.default_rng([seed, zlib.crc32(str(case).encode())])
-    hidden = made(case, generator)
+    generator = source(case, seed)
+    logs = made(case, generator)
+    hidden = logs[0]
     begin, found, problem = time.process_time(), None, ''
     try:
-        found = diagnosis_of([hidden], generator, with_model or case.against_a_model
-                             or case.noise == 'floor' or None)
+        found = diagnosis_of(logs, generator, with_model or case.against_a_model)
     except Exception as raised:
         problem = f'{type(raised).__name__}: {raised}'
     seconds = time.process_time() - begin
-    findings, beyond = ((), []) if found is None else (found.findings,
-                                                       [each.along for each in found.unexplained])
-    findings = tuple(each for each in findings
-                     if each.status == 'established'
-                     or each.effect in ONCE and each.p_value < 0.01)
+    findings, beyond = ([], []) if found is None else (
+        reported(found.findings), [each.along for each in found.unexplained])
     suspected = [] if found is None else [each.effect for each in found.findings
                                           if each not in findings]
-    how = judged(hidden, findings, beyond, TRUE.get(case.reference.partition('_')[0], ()))
+    how = judged_findings(hidden, findings, beyond, case.allowed)
     return Answer(str(case), case.row,
                   {cause.name: _told(cause) for cause in hidden.truth.gyro.causes},
                   [_answer(each) for each in findings], problem, seconds, how,
                   won(hidden, found) if found is not None and hidden.truth.names
-                  and case.part != 'references' else {},
+                  and case.part not in ('references', 'separated') else {},
                   how.right and not problem, suspected)
 
 
@@ -328,8 +190,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--logs', type=int, default=2, help='of each kind; default: 2')
     parser.add_argument('--part', nargs='+',
-                        default=['nothing', 'effects', 'pairs', 'triples', 'outside', 'sets',
-                                 'references'])
+                        default=PARTS)
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--only', default='',
                         help='cases in whose names this regular expression is found')

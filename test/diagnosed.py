@@ -13,25 +13,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
-import itertools
 
 from gyro_calibration.diagnosis.findings import Diagnosis, Finding
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.logs.log import COLUMNS, Log
-from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
-from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.noise import Noise
-from hidden import Cause, HiddenLog, OUTSIDE
-from hidden.effects import AGAINST_A_MODEL, COUNTED, STEPPED, WITHOUT_COLUMN
+from gyro_calibration.model.gyro_model import GyroModel
+from gyro_calibration_bench import scores
+from gyro_calibration_bench.hidden import Cause, HiddenLog
+from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL, WITHOUT_COLUMN
+from gyro_calibration_bench.methods import known_model, named
+from gyro_calibration_bench.scores import Judged, judged
 import numpy as np
 
-#: What no log can part.
-SAME = {'reference_scale': 'scale_factor_error'}
-#: An answer with more names is no answer.
-LARGEST_SET = 3
-#: Without a size that an interval could hold: what is counted, steps, and what has no size.
-WITHOUT_SIZE = {*COUNTED, *STEPPED, 'unit_error', 'bias_instability'}
 #: A diagnosis holds out one of so many blocks, of so many s.
 EVERY, BLOCK = 3, 60.0
 
@@ -44,11 +37,7 @@ def log_of(hidden: HiddenLog) -> Log:
 
 def model_of(hidden: HiddenLog) -> GyroModel:
     """Return the model of who knows all but what is hidden."""
-    known = hidden.truth.expected
-    terms = (Term(BIAS, (known['bias'],)),
-             Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],)))
-    return GyroModel(terms, noise=Noise(known['angle_random_walk'], known['bias_instability'],
-                                        known['rate_random_walk']))
+    return known_model(hidden.truth.expected)
 
 
 def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
@@ -60,106 +49,23 @@ def diagnosis_of(hidden: Sequence[HiddenLog], generator: np.random.Generator,
                     model_of(hidden[0]) if wanted else None)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """
-    How right an answer is.
-
-    Attributes
-    ----------
-    detected : something is reported
-    first : the strongest finding has the right name
-    in_set : each hidden cause is a finding of its own, or in its set
-    set_sizes : of the findings that hold a hidden cause
-    extra : names of the findings that hold none
-    beyond : variables of structures without a name
-    right : each hidden cause is in a set of at most three, and nothing else is reported; a cause
-        outside the catalogue is reported as unexplained, and nothing is named
-    held : of each cause that is named with a number, whether its interval of 95 % holds the truth
-
-    """
-
-    detected: bool
-    first: bool
-    in_set: bool
-    set_sizes: tuple[int, ...]
-    extra: tuple[str, ...]
-    beyond: tuple[str, ...]
-    right: bool
-    held: dict[str, bool]
+def judged_findings(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str] = (),
+                    allowed: Collection[str] = ()) -> Judged:
+    """Compare findings with the truth."""
+    return judged(hidden.truth.gyro.causes, [named(each) for each in findings], beyond, allowed)
 
 
-def judged(hidden: HiddenLog, findings: Sequence[Finding], beyond: Sequence[str],
-           allowed: Collection[str] = ()) -> Judged:
-    """
-    Compare an answer with the truth.
-
-    Parameters
-    ----------
-    hidden : one of the logs
-    findings : the named causes
-    beyond : variables along which there is structure without a name
-    allowed : names of findings that are true though they were not hidden
-
-    """
-    wanted = {SAME.get(name, name) for name in hidden.truth.names}
-    findings = [each for each in findings if each.effect not in allowed or each.effect in wanted]
-    sets = [_names(each) for each in findings]
-    matched = _matched(sorted(wanted - set(OUTSIDE)), sets)
-    extra = tuple(each.effect for each, names in zip(findings, sets) if not names & wanted)
-    sizes = tuple(len(each) for each in sets if each & wanted)
-    complete = (len(matched) == len(wanted) == len(sizes) and max(sizes, default=0) <= LARGEST_SET
-                and not extra and not beyond)
-    right = bool(beyond) and not findings if wanted & set(OUTSIDE) else complete
-    return Judged(bool(findings or beyond),
-                  bool(findings) and SAME.get(findings[0].effect, findings[0].effect) in wanted,
-                  len(matched) == len(wanted), sizes, extra, tuple(beyond), right,
-                  held(hidden.truth.gyro.causes, findings))
-
-
-def judged_diagnosis(hidden: HiddenLog, found: Diagnosis, allowed: Collection[str] = ()) -> Judged:
+def judged_diagnosis(hidden: HiddenLog, found: Diagnosis,
+                     allowed: Collection[str] = ()) -> Judged:
     """Compare a diagnosis with the truth."""
-    return judged(hidden, found.findings, [each.along for each in found.unexplained], allowed)
-
-
-def _names(finding: Finding) -> set[str]:
-    """Return the set of a finding; what no log can part is one."""
-    return {SAME.get(name, name) for name in (finding.effect, *finding.ambiguous_with)}
-
-
-def _matched(wanted: Sequence[str], sets: Sequence[set[str]]) -> dict[str, int]:
-    """Give each hidden cause a finding of its own that holds it, to as many as can be."""
-    places: list[list[int | None]] = [
-        [*(place for place, each in enumerate(sets) if name in each), None] for name in wanted]
-    ways = (way for way in itertools.product(*places) if _once(way))
-    best = max(ways, key=lambda way: sum(place is not None for place in way))
-    return {name: place for name, place in zip(wanted, best) if place is not None}
-
-
-def _once(way: Sequence[int | None]) -> bool:
-    given = [place for place in way if place is not None]
-    return len(set(given)) == len(given)
+    return judged_findings(hidden, found.findings, [each.along for each in found.unexplained],
+                           allowed)
 
 
 def held(causes: Iterable[Cause], findings: Sequence[Finding],
          deviations: float = 1.96) -> dict[str, bool]:
-    """
-    Return for each cause named with a number whether its interval holds the truth.
-
-    Where the phase says the sign of a wave, the size has none. What is counted has no interval, a
-    wrong unit no size, and flicker beside a Gauss-Markov process none that an Allan deviation
-    would tell.
-
-    """
-    by_name = {each.effect: each.parameters.get(each.effect) for each in findings}
-    told = {}
-    for cause in causes:
-        estimate = None if cause.name in WITHOUT_SIZE else by_name.get(cause.name)
-        if estimate is not None:
-            half = 0.5 * (estimate.interval[1] - estimate.interval[0]) * deviations / 1.96
-            size = abs(cause.size) if 'phase' in cause.shapes else cause.size
-            told[cause.name] = bool(abs(estimate.estimate - size) <= half)
-    return told
+    """Return for each cause named with a number whether its interval holds the truth."""
+    return scores.held(causes, [named(each) for each in findings], deviations)
 
 
 def won(hidden: HiddenLog, found: Diagnosis) -> dict[str, tuple[float, float]]:

@@ -26,8 +26,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PARTS = ['package.xml', 'setup.py', 'setup.cfg', 'LICENSE',
-         'gyro_calibration', 'gyro_calibration_reproduction', 'config', 'launch', 'samples', 'bin',
-         'lib', 'resource']
+         'gyro_calibration', 'gyro_calibration_bench', 'gyro_calibration_reproduction', 'config',
+         'launch', 'samples', 'bin', 'lib', 'resource']
 EXECUTABLES = {'gyro_calibration', 'driver_node', 'compensation_node'}
 COLCON = shutil.which('colcon',
                       path=os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']]))

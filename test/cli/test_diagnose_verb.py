@@ -20,7 +20,7 @@ from gyro_calibration.cli.main import main
 from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.logs.log import COLUMNS, Log, read_log, write_log
 from gyro_calibration.model.model_file import read_model
-from hidden import hide
+from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
 

@@ -31,7 +31,7 @@ from gyro_calibration.logs.stamps import number_stamps
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise, simulate_noise
-from hidden.log import hide
+from gyro_calibration_bench.hidden.log import hide
 import numpy as np
 import pytest
 

@@ -29,7 +29,7 @@ from gyro_calibration.model.channels import channels_of
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration.model.model_file import model_text, read_model
 from gyro_calibration.model.simulation import respond
-from hidden import (
+from gyro_calibration_bench.hidden import (
     described,
     draw_gyro,
     FORMS,
@@ -40,7 +40,7 @@ from hidden import (
     record,
     session,
 )
-from hidden.effects import AGAINST_A_MODEL
+from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL
 import numpy as np
 import pytest
 

@@ -18,8 +18,8 @@ from gyro_calibration.diagnosis.causes import CAUSES
 from gyro_calibration.diagnosis.experiments import experiment
 from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.logs.log import DEGREE
-from hidden import hide
-from hidden.twins import twin, TWINS
+from gyro_calibration_bench.hidden import hide
+from gyro_calibration_bench.hidden.twins import twin, TWINS
 import numpy as np
 import pytest
 

@@ -28,7 +28,7 @@ from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import turns
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulation import simulate
-from hidden import hide
+from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
 

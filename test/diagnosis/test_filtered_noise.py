@@ -21,7 +21,7 @@ from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import QUANTIZATION
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.noise import Noise
-from hidden import hide
+from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter

@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from diagnosed import judged, log_of
+from diagnosed import judged_findings, log_of
 from gyro_calibration.diagnosis.data_quality import limits, reference_of
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.report import report
@@ -20,7 +20,7 @@ from gyro_calibration.diagnosis.words import lines
 from gyro_calibration.logs.log import DEGREE, Log
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from hidden.reference import hide_beside, Imperfect
+from gyro_calibration_bench.hidden.reference import hide_beside, Imperfect
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -160,7 +160,7 @@ def test_the_noise_of_a_reference_is_no_effect_of_the_gyro(reference):
 def test_an_effect_of_the_rate_is_established_beside_the_noise_of_a_reference(reference):
     hidden = hide_beside(['scale_factor_asymmetry'], 5.0, np.random.default_rng(1), reference)
     found, named = established(hidden)
-    assert judged(hidden, named, ()).right, lines(found)
+    assert judged_findings(hidden, named).right, lines(found)
     assert named[0].minimum_detectable > 0.0
 
 

@@ -30,7 +30,7 @@ from gyro_calibration.diagnosis.replay import replay
 from gyro_calibration.diagnosis.search import begin, evidence_of, searched
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
-from hidden import hide
+from gyro_calibration_bench.hidden import hide
 import numpy as np
 import pytest
 

@@ -25,8 +25,9 @@ import gzip
 import io
 import math
 from pathlib import Path
+from typing import Any
 
-from hidden.effects import (
+from gyro_calibration_bench.hidden.effects import (
     COUNTED,
     errors,
     Form,
@@ -40,11 +41,11 @@ from hidden.effects import (
     UNIT_FACTORS,
     WITHOUT_COLUMN,
 )
-from hidden.likeness import Likeness
-from hidden.motion import Session, session
-from hidden.noise import draw_figures, make, NoiseFigures
-from hidden.outside import OUTSIDE
-from hidden.size import DETECTABLE, Metric, solve_noise, solve_size
+from gyro_calibration_bench.hidden.likeness import Likeness
+from gyro_calibration_bench.hidden.motion import Session, session
+from gyro_calibration_bench.hidden.noise import draw_figures, make, NoiseFigures
+from gyro_calibration_bench.hidden.outside import OUTSIDE
+from gyro_calibration_bench.hidden.size import DETECTABLE, Metric, solve_noise, solve_size
 import numpy as np
 
 #: Recordings -> name of an effect -> what of it is not to be random.
@@ -200,7 +201,7 @@ def hide(names: Sequence[str], multiple: float | Mapping[str, float],
          generator: np.random.Generator, *, noise: str = 'mixed',
          reference: str = 'rate', duration: float = 900.0, sample_rate: float = 50.0,
          runs: int = 1, encoder_step: float = 0.0,
-         figures: NoiseFigures | None = None, conditions: Mapping[str, object] | None = None,
+         figures: NoiseFigures | None = None, conditions: Mapping[str, Any] | None = None,
          given: Given | None = None, against_a_model: bool = False) -> list[HiddenLog]:
     """
     Hide effects in recordings of a random gyro under random conditions.
@@ -315,7 +316,7 @@ def _draw_outside(name: str, multiple: float, generator: np.random.Generator,
                   sizing: _Sizing) -> Cause:
     """Draw shapes until no catalogued effect explains much of it, or keep the least explained."""
     form, likeness = OUTSIDE[name], Likeness(sizing.sessions, sizing.gyro.figures)
-    drawn = []
+    drawn: list[tuple[float, int, Shapes, list[np.ndarray]]] = []
     for _ in range(DRAWS):
         shapes = form.shapes(sizing.sessions, generator)
         column = errors(form, 1.0, shapes, sizing.sessions)

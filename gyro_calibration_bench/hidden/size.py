@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import math
 
-from hidden.motion import Session
-from hidden.noise import divergence, NoiseFigures, Whitening
+from gyro_calibration_bench.hidden.motion import Session
+from gyro_calibration_bench.hidden.noise import divergence, NoiseFigures, Whitening
 import numpy as np
 from scipy.optimize import brentq
 

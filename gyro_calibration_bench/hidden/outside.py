@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 
-from hidden.effects import _column, _phase, Form, Shapes, top_rate
-from hidden.motion import Session
+from gyro_calibration_bench.hidden.effects import _column, _phase, Form, Shapes, top_rate
+from gyro_calibration_bench.hidden.motion import Session
 import numpy as np
 
 

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from hidden.effects import Shapes
-from hidden.log import Given, HiddenLog, hide, record
-from hidden.motion import Session, session
-from hidden.noise import NoiseFigures
+from gyro_calibration_bench.hidden.effects import Shapes
+from gyro_calibration_bench.hidden.log import Given, HiddenLog, hide, record
+from gyro_calibration_bench.hidden.motion import Session, session
+from gyro_calibration_bench.hidden.noise import NoiseFigures
 import numpy as np
 
 
@@ -39,8 +40,8 @@ class Twins:
 
     """
 
-    alike: Mapping[str, object]
-    apart: Mapping[str, object] | None
+    alike: Mapping[str, Any]
+    apart: Mapping[str, Any] | None
     given: Given | None = None
     multiple: float = 4.0
     figures: NoiseFigures | None = None

@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import math
 
-from hidden.effects import errors, FORMS, Shapes, top_rate, WITHOUT_COLUMN
-from hidden.motion import Session
-from hidden.noise import NoiseFigures
-from hidden.size import Columns, Metric, thinned
+from gyro_calibration_bench.hidden.effects import errors, FORMS, Shapes, top_rate, WITHOUT_COLUMN
+from gyro_calibration_bench.hidden.motion import Session
+from gyro_calibration_bench.hidden.noise import NoiseFigures
+from gyro_calibration_bench.hidden.size import Columns, Metric, thinned
 import numpy as np
 
 #: A slip has any time, and a tone any frequency: enough of them explain anything.

@@ -25,8 +25,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 
-from hidden.filters import lag
-from hidden.motion import Session
+from gyro_calibration_bench.hidden.filters import lag
+from gyro_calibration_bench.hidden.motion import Session
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import norm

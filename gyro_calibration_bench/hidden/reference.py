@@ -24,10 +24,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
-from hidden.filters import autoregression
-from hidden.log import draw_gyro, HiddenLog, record
-from hidden.motion import session
-from hidden.noise import draw_figures
+from gyro_calibration_bench.hidden.filters import autoregression
+from gyro_calibration_bench.hidden.log import draw_gyro, HiddenLog, record
+from gyro_calibration_bench.hidden.motion import session
+from gyro_calibration_bench.hidden.noise import draw_figures
 import numpy as np
 
 #: White noise of a fix, side slip at rest and its growth with the rate, rad, rad and s, and time

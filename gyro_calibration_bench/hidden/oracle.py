@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hidden.log import HiddenLog
+from gyro_calibration_bench.hidden.log import HiddenLog
 import numpy as np
 
 

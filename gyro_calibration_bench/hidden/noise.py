@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from hidden.filters import autoregression
+from gyro_calibration_bench.hidden.filters import autoregression
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 

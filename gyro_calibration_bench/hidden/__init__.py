@@ -26,14 +26,23 @@ Reading order: `filters`, `motion`, `noise`, `effects`, `outside`, `size`, `like
 
 """
 
-from hidden.effects import FORMS
-from hidden.log import ALL, Cause, draw_gyro, Gyro, HiddenLog, hide, record, Truth
-from hidden.motion import described, Session, session
-from hidden.noise import KINDS, NoiseFigures
-from hidden.oracle import oracle_gain, OracleGain
-from hidden.outside import OUTSIDE
-from hidden.size import DETECTABLE
-from hidden.twins import part, twin, TWINS
+from gyro_calibration_bench.hidden.effects import FORMS
+from gyro_calibration_bench.hidden.log import (
+           ALL,
+           Cause,
+           draw_gyro,
+           Gyro,
+           HiddenLog,
+           hide,
+           record,
+           Truth,
+)
+from gyro_calibration_bench.hidden.motion import described, Session, session
+from gyro_calibration_bench.hidden.noise import KINDS, NoiseFigures
+from gyro_calibration_bench.hidden.oracle import oracle_gain, OracleGain
+from gyro_calibration_bench.hidden.outside import OUTSIDE
+from gyro_calibration_bench.hidden.size import DETECTABLE
+from gyro_calibration_bench.hidden.twins import part, twin, TWINS
 
 __all__ = ['ALL', 'DETECTABLE', 'FORMS', 'KINDS', 'OUTSIDE', 'TWINS', 'Cause', 'Gyro', 'HiddenLog',
            'NoiseFigures', 'OracleGain', 'Session', 'Truth', 'described', 'draw_gyro', 'hide',

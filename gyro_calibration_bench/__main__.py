@@ -1,0 +1,161 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+"""Make a bench, answer it by a method that is here, and score answers."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+import json
+import math
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+# the matrices are small; threads that wait for each other make it slower
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+# ruff: noqa: E402
+from gyro_calibration_bench.cases import Case, cases, made, PARTS, source
+from gyro_calibration_bench.hidden import FORMS
+from gyro_calibration_bench.hidden.effects import AGAINST_A_MODEL
+from gyro_calibration_bench.methods import METHODS
+from gyro_calibration_bench.scores import interval, scored, summary, table
+import numpy as np
+from tqdm import tqdm
+
+CASES, TRUTH, ANSWERS = (f'gyro_calibration_bench/{name}/1'
+                         for name in ('cases', 'truth', 'answers'))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run a command, and return 0, or 2 for a file that is not as it should be."""
+    parser = argparse.ArgumentParser(prog='python -m gyro_calibration_bench', description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar='COMMAND')
+    command = commands.add_parser('make', help='write logs, cases.json and truth.json')
+    command.add_argument('folder', type=Path, metavar='DIR')
+    command.add_argument('--seed', type=int, default=0)
+    command.add_argument('--cases', type=int, default=8, help='of each part; default: 8')
+    command.add_argument('--part', nargs='+', choices=PARTS, default=PARTS)
+    command.set_defaults(command=make)
+    command = commands.add_parser('answer', help='answer the cases by a method')
+    command.add_argument('folder', type=Path, metavar='DIR')
+    command.add_argument('--method', choices=METHODS, required=True)
+    command.add_argument('--out', type=Path, required=True, metavar='ANSWERS.json')
+    command.set_defaults(command=answer)
+    command = commands.add_parser('score', help='compare answers with the truth')
+    command.add_argument('folder', type=Path, metavar='DIR')
+    command.add_argument('answers', type=Path, metavar='ANSWERS.json')
+    command.add_argument('--json', action='store_true', help='print counts and intervals as JSON')
+    command.set_defaults(command=score)
+    given = parser.parse_args(words)
+    try:
+        given.command(given)
+    except (OSError, ValueError) as problem:
+        print(f'{parser.prog}: {problem}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def make(given: argparse.Namespace) -> None:
+    """Draw cases of each part, and write them in an order that does not tell the part."""
+    generator = np.random.default_rng(given.seed)
+    drawn: list[Case] = []
+    for part in given.part:
+        every = list(cases(part, given.cases))
+        drawn += [every[place] for place in generator.choice(len(every), given.cases,
+                                                             replace=False)]
+    given.folder.mkdir(parents=True, exist_ok=True)
+    public: dict[str, Any] = {}
+    truth: dict[str, Any] = {}
+    for number, place in enumerate(tqdm(generator.permutation(len(drawn)), 'logs are made',
+                                        disable=None)):
+        case, name = drawn[place], f'{number:04d}'
+        logs = made(case, source(case, given.seed))
+        paths = [each.write(given.folder / f'{name}{"ab"[run] if len(logs) > 1 else ""}.csv.gz')
+                 for run, each in enumerate(logs)]
+        causes = logs[0].truth.gyro.causes
+        wanted = case.against_a_model or any(each.name in AGAINST_A_MODEL for each in causes)
+        public[name] = {'logs': [path.name for path in paths],
+                        'model': dict(logs[0].truth.expected) if wanted else None}
+        truth[name] = {'case': str(case), 'part': case.part, 'look_alikes': case.twins,
+                       'allowed': case.allowed, 'causes': [asdict(each) for each in causes]}
+    effects = {name: form.unit for name, form in FORMS.items()}
+    _write(given.folder / 'cases.json', CASES, seed=given.seed, effects=effects, cases=public)
+    _write(given.folder / 'truth.json', TRUTH, seed=given.seed, cases=truth)
+    print(f'{len(drawn)} cases in {given.folder}; cases.json lists them, truth.json is for '
+          'scoring alone')
+
+
+def answer(given: argparse.Namespace) -> None:
+    """Answer all cases; one that fails has an empty answer, and its error."""
+    public, method = _read(given.folder / 'cases.json', CASES)['cases'], METHODS[given.method]
+    answers: dict[str, Any] = {}
+    begin = time.process_time()
+    for name, case in tqdm(public.items(), f'cases by {given.method}', disable=None):
+        try:
+            causes, unexplained = method([given.folder / log for log in case['logs']],
+                                         case['model'])
+            answers[name] = {'causes': [asdict(each) for each in causes],
+                             'unexplained': unexplained}
+        except Exception as problem:
+            answers[name] = {'causes': [], 'error': f'{type(problem).__name__}: {problem}'}
+    _write(given.out, ANSWERS, method=given.method, seconds=round(time.process_time() - begin, 1),
+           answers=answers)
+    failed = sum('error' in each for each in answers.values())
+    print(f'{len(answers)} answers in {given.out}, {failed} with an error')
+
+
+def score(given: argparse.Namespace) -> None:
+    """Print the table; a case without an answer counts as one in which nothing is reported."""
+    truth = _read(given.folder / 'truth.json', TRUTH)['cases']
+    said = _read(given.answers, ANSWERS)
+    answers = said['answers']
+    unknown = set(answers) - set(truth)
+    if unknown:
+        raise ValueError(f'{given.answers}: no such cases: {", ".join(sorted(unknown)[:5])}')
+    found = summary([scored(each, answers.get(name, {})) for name, each in sorted(
+        truth.items(), key=lambda item: PARTS.index(item[1]['part']))])
+    if given.json:
+        print(json.dumps({row: {column: {'good': good, 'of': count,
+                                         'interval': interval(good, count) if count else None}
+                                for column, (good, count) in counts.items()}
+                          for row, counts in found.items()}))
+        return
+    print(f'{said.get("method", "")}: {len(answers)} answers to {len(truth)} cases; %, with '
+          f'Wilson intervals of 95 %\n\n{table(found)}')
+
+
+def _write(path: Path, schema: str, **content: Any) -> None:
+    path.write_text(json.dumps({'schema': schema, **_finite(content)}, indent=1, allow_nan=False)
+                    + '\n')
+
+
+def _finite(value: Any) -> Any:
+    """Return what JSON can hold: null for what is not finite."""
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _read(path: Path, schema: str) -> Any:
+    content = json.loads(path.read_text())
+    if not isinstance(content, dict) or content.get('schema') != schema:
+        raise ValueError(f'{path}: "schema" is not "{schema}"')
+    return content
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,285 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+"""
+Methods to compare with: gyro_calibration, greedy selection by BIC, and the lasso.
+
+A method takes the paths of the logs of a case and the model that is known, or None, and returns
+the causes that it names and whether there is structure that none explains.
+
+The two baselines take the formulas of the generator itself, on means over half a second, and take
+the noise for white. They have no columns for faults of samples, figures of the noise, saturation,
+steps, slips, tones, and a wrong unit.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any
+
+from gyro_calibration_bench.hidden import FORMS, Session
+from gyro_calibration_bench.hidden.effects import Shapes, WITHOUT_COLUMN
+from gyro_calibration_bench.hidden.motion import Motion
+from gyro_calibration_bench.scores import Named
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+#: Bias, scale_factor_error, angle_random_walk, bias_instability and rate_random_walk, in SI.
+Known = Mapping[str, float]
+Answer = tuple[list[Named], bool]
+
+#: Causes that happen once, which one log suggests and cannot establish.
+ONCE = ('bias_step', 'reference_slip')
+
+#: Length of the means, s.
+BLOCK = 0.5
+#: Small sizes at which effects that are not linear are in proportion to them.
+SMALL = {'time_offset': 0.02, 'bandwidth': 0.02, 'clock_rate': 1e-4}
+#: Columns with a larger correlation are ambiguous.
+ALIKE = 0.99
+WITHOUT = {*WITHOUT_COLUMN, 'saturation', 'interference_tone', 'reference_slip'}
+FOLDS = 5
+
+
+# gyro_calibration
+
+def named(finding: Any) -> Named:
+    """Return a finding of gyro_calibration as an answer of the bench."""
+    size = finding.parameters.get(finding.effect)
+    return Named(finding.effect, tuple(finding.ambiguous_with), size and size.estimate,
+                 size and tuple(size.interval))
+
+
+def reported(findings: Sequence[Any]) -> list[Any]:
+    """Return the findings that are established, and what happens once if it is suspected."""
+    return [each for each in findings if each.status == 'established'
+            or each.effect in ONCE and each.p_value < 0.01]
+
+
+def known_model(known: Known) -> Any:
+    """Return what is known of a gyro as a model."""
+    from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
+    from gyro_calibration.model.gyro_model import GyroModel, Term
+    from gyro_calibration.model.noise import Noise
+    terms = (Term(BIAS, (known['bias'],)),
+             Term(SCALE_FACTOR_ERROR, (known['scale_factor_error'],)))
+    return GyroModel(terms, noise=Noise(known['angle_random_walk'], known['bias_instability'],
+                                        known['rate_random_walk']))
+
+
+def gyro_calibration(logs: Sequence[Path], known: Known | None) -> Answer:
+    """Diagnose."""
+    from gyro_calibration import read_log
+    from gyro_calibration.diagnosis.pipeline import diagnose
+    found = diagnose([read_log(path) for path in logs], np.random.default_rng(0),
+                     None if known is None else known_model(known))
+    return [named(each) for each in reported(found.findings)], bool(found.unexplained)
+
+
+# the baselines
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    Least squares, after bias of each log and scale are taken out where no model gives them.
+
+    Attributes
+    ----------
+    error : output less reference, shape (n,), rad/s
+    columns : shape (n, m)
+    owners : for each column the effect and the size that its coefficient 1 has, nan if none
+    nuisances : how many were taken out
+
+    """
+
+    error: np.ndarray
+    columns: np.ndarray
+    owners: tuple[tuple[str, float], ...]
+    nuisances: int
+
+
+def recorded(path: Path) -> tuple[Session, np.ndarray, np.ndarray]:
+    """Return what a log knows of the conditions, at even times, and the means of the error."""
+    columns: Any = np.genfromtxt(path, delimiter=',', names=True)
+    stamps = columns['time_s']
+    interval = float(np.median(np.diff(stamps)))
+    time = np.arange(stamps[0], stamps[-1], interval)
+
+    def evenly(name: str) -> np.ndarray:
+        known = np.isfinite(columns[name])
+        return np.interp(time, stamps[known], columns[name][known])
+    if 'reference_rate_rad_s' in columns.dtype.names:
+        rate = evenly('reference_rate_rad_s')
+        heading = np.cumsum(rate) * interval
+        missing = np.zeros(len(time), dtype=bool)
+    else:
+        heading = evenly('reference_heading_rad')
+        rate = uniform_filter1d(np.gradient(heading, interval), round(BLOCK / interval))
+        missing = np.interp(time, stamps, columns['reference_heading_rad']) != heading
+    force = evenly('acceleration_mps2')
+    slow = uniform_filter1d(force, round(1.0 / interval))
+    motion = Motion(lambda at: np.interp(at, time, rate), lambda at: np.interp(at, time, heading))
+    moving = np.abs(rate) > 1e-9
+    each = Session(motion, time - time[0], rate, heading, evenly('temperature_degc'),
+                   evenly('supply_v'), slow, force - slow, moving)
+    error = blocks(evenly('gyro_rad_s') - rate, interval)
+    return each, error, blocks(missing.astype(float), interval) == 0.0
+
+
+def blocks(values: np.ndarray, interval: float) -> np.ndarray:
+    """Return means over `BLOCK`."""
+    size = round(BLOCK / interval)
+    return values[:len(values) // size * size].reshape(-1, size).mean(axis=1)
+
+
+def choices(each: Session) -> list[tuple[str, float, Shapes, float]]:
+    """Return candidates: effect, size, shapes, and the size of coefficient 1, nan if none."""
+    duration, top = float(each.time[-1]), float(np.abs(each.rate).max())
+    found: list[tuple[str, float, Shapes, float]] = []
+    grids: dict[str, list[Shapes]] = {
+        'heading_sensitivity': [{'phase': 0.0}, {'phase': 0.5 * math.pi}],
+        'reference_once_per_rev': [{'phase': 0.0}, {'phase': 0.5 * math.pi}],
+        'thermal_lag': [{'time_constant': part * duration} for part in (0.03, 0.1, 0.3)],
+        'warm_up': [{'time_constant': part * duration} for part in (0.03, 0.06, 0.12, 0.25)],
+        'bias_step': [{'run': 0, 'step_time': part * duration}
+                      for part in np.linspace(0.15, 0.85, 29)]}
+    for name in FORMS:
+        if name in WITHOUT:
+            continue
+        if name == 'dead_zone':
+            found += [(name, part * top, {}, math.nan) for part in (0.003, 0.01, 0.03, 0.1, 0.3)]
+        elif name == 'sine_response':
+            found.append((name, 1.0 / top, {}, math.nan))
+        else:
+            size = SMALL.get(name, 1.0)
+            # a wave has two columns, and a shape between those of the grid: no size
+            found += [(name, size, shapes, math.nan if shapes else size)
+                      for shapes in grids.get(name, [{}])]
+    return found
+
+
+def problem(logs: Sequence[Path], known: Known | None) -> Problem:
+    """Read the logs of a case; with a model, its bias and scale are candidates like others."""
+    read = [recorded(path) for path in logs]
+    wanted = choices(read[0][0])
+    tables, errors = [], []
+    for number, (each, error, kept) in enumerate(read):
+        columns = [FORMS[name].error(each, each.rate, size, shapes) * (
+                       not (number and FORMS[name].once)) for name, size, shapes, _ in wanted]
+        plain = [blocks(each.rate, each.interval), np.ones(len(error))]
+        own = [plain[0]] + [plain[1] * (place == number) for place in range(len(read))]
+        if known is not None:
+            error = error - known['bias'] - known['scale_factor_error'] * plain[0]
+        table = np.column_stack([*own, *(blocks(column, each.interval) for column in columns)])
+        tables.append(table[kept])
+        errors.append(error[kept])
+    table, error = np.concatenate(tables), np.concatenate(errors)
+    count, lengths = 1 + len(read), np.linalg.norm(table, axis=0)
+    owners = [(name, unit) for name, _, _, unit in wanted]
+    if known is None:
+        base = np.linalg.qr(table[:, :count])[0]
+        table, error = (each - base @ (base.T @ each) for each in (table[:, count:], error))
+        lengths = lengths[count:]
+    else:
+        owners = [('scale_factor_error', 1.0), *[('bias', 1.0)] * len(read), *owners]
+        count = 0
+    # a constant, or no temperature that changes, leaves nothing
+    seen = np.linalg.norm(table, axis=0) > 1e-6 * lengths
+    return Problem(error, table[:, seen], tuple(
+        owner for owner, each in zip(owners, seen) if each), count)
+
+
+def greedy(logs: Sequence[Path], known: Known | None) -> Answer:
+    """Add the column that lowers the Bayesian information criterion most, until none does."""
+    given = problem(logs, known)
+    count = len(given.error)
+    chosen: list[int] = []
+    best = count * math.log(float(given.error @ given.error) / count)
+    while True:
+        scores = []
+        for place in set(range(given.columns.shape[1])) - set(chosen):
+            columns = given.columns[:, [*chosen, place]]
+            left = given.error - columns @ np.linalg.lstsq(columns, given.error, rcond=None)[0]
+            scores.append((count * math.log(float(left @ left) / count)
+                           + (len(chosen) + 1) * math.log(count), place))
+        if not scores or min(scores)[0] >= best:
+            return answered(given, chosen), False
+        best, place = min(scores)
+        chosen.append(place)
+
+
+def lasso(logs: Sequence[Path], known: Known | None) -> Answer:
+    """Take the largest penalty whose error is within a standard error of the least."""
+    given = problem(logs, known)
+    columns = given.columns / np.linalg.norm(given.columns, axis=0) * math.sqrt(len(given.error))
+    fold = np.arange(len(given.error)) * FOLDS // len(given.error)
+    top = float(np.abs(columns.T @ given.error).max()) / len(given.error)
+    penalties = top * np.geomspace(1.0, 1e-3, 25)
+    errors = []
+    for out in range(FOLDS):
+        inside, outside = fold != out, fold == out
+        errors.append([np.mean((given.error[outside] - columns[outside] @ weights) ** 2)
+                       for weights in descend(columns[inside], given.error[inside], penalties)])
+    mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0) / math.sqrt(FOLDS)
+    least = int(np.argmin(mean))
+    place = int(np.flatnonzero(mean <= mean[least] + spread[least])[0])
+    weights = descend(columns, given.error, penalties[:place + 1])[-1]
+    return answered(given, list(np.flatnonzero(weights))), False
+
+
+def descend(columns: np.ndarray, error: np.ndarray, penalties: np.ndarray) -> list[np.ndarray]:
+    """Return the weights of the lasso at falling penalties, by coordinate descent."""
+    gram, toward = columns.T @ columns / len(error), columns.T @ error / len(error)
+    weights, path = np.zeros(len(toward)), []
+    for penalty in penalties:
+        for _ in range(300):
+            before = weights.copy()
+            # a step has no column in a fold that does not hold it
+            for place in np.flatnonzero(np.diag(gram) > 1e-9):
+                pull = toward[place] - gram[place] @ weights + gram[place, place] * weights[place]
+                weights[place] = (math.copysign(max(abs(pull) - penalty, 0.0), pull)
+                                  / gram[place, place])
+            if np.abs(weights - before).max() < 1e-3 * penalties[0]:
+                break
+        path.append(weights.copy())
+    return path
+
+
+def answered(given: Problem, chosen: Sequence[int]) -> list[Named]:
+    """Name each chosen effect once, with size and interval by least squares of all chosen."""
+    if not chosen:
+        return []
+    columns = given.columns[:, chosen]
+    inverse = np.linalg.pinv(columns.T @ columns)
+    weights = inverse @ columns.T @ given.error
+    left = given.error - columns @ weights
+    variance = float(left @ left) / max(1, len(left) - len(chosen) - given.nuisances)
+    deviations = np.sqrt(variance * np.diag(inverse))
+    unit = given.columns / np.linalg.norm(given.columns, axis=0)
+    effects: dict[str, list[int]] = {}
+    for place in np.argsort(-np.abs(weights) / deviations):
+        effects.setdefault(given.owners[chosen[place]][0], []).append(int(place))
+    answer = []
+    for name, places in effects.items():
+        first = places[0]
+        like = np.abs(unit.T @ unit[:, chosen[first]]) > ALIKE
+        others = {owner for (owner, _), each in zip(given.owners, like) if each} - set(effects)
+        size = given.owners[chosen[first]][1] * weights[first]
+        half = 1.96 * abs(given.owners[chosen[first]][1]) * deviations[first]
+        sized = math.isfinite(size)
+        answer.append(Named(name, tuple(sorted(others)), size if sized else None,
+                            (size - half, size + half) if sized else None))
+    return answer
+
+
+METHODS = {'gyro_calibration': gyro_calibration, 'greedy': greedy, 'lasso': lasso}
