@@ -87,7 +87,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(terms, table, runs)
                      for each in zip(*(run(terms, table, generator) for _ in range(runs))))
     for errors in (values, rates):
         held = (np.abs(errors) <= 1.96).sum(axis=0)
-        # Wandering sweeps take up to 3 % off (docs/how_to/rate_table.md); all columns share RARE.
+        # Wandering sweeps take up to 3 % off (docs/benchmarks.md); all columns share RARE.
         assert held.min() >= binom.ppf(RARE / errors.shape[1], runs, 0.92)
         # Nor are they too wide: the values of a run hang together, so a run counts once.
         assert chi2.ppf(RARE, runs) / runs < np.mean(errors ** 2) < chi2.ppf(1 - RARE, runs) / runs
