@@ -188,7 +188,8 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         raise UsageError('a reference heading determines bias and scale_factor_error only; for '
                          'other effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
-    found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
+    found = calibrate_encoder(log, given.method, technology=given.technology or 'mems',
+                              progress=partial(bar, what='delay of the reference'))
     model = _written(given, found.model)
     if given.picture:
         plots.draw_reference(given.picture, *headings(log, found))

@@ -153,8 +153,12 @@ def picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    log = (_recorded(given) if is_recording(given.log)
-           else read_log(given.log, _sensitivity(given), given.rate, given.names, given.axis))
+    if is_recording(given.log):
+        log = _recorded(given)
+    else:
+        with _bytes_of(given.log) as on_progress:
+            log = read_log(given.log, _sensitivity(given), given.rate, given.names, given.axis,
+                           on_progress)
     if given.unwrap and log.reference_heading is not None:
         time = time_of(given, log)
         log = replace(log, reference_heading=unwrapped(

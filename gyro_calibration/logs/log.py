@@ -141,7 +141,8 @@ class Log:
 
 
 def read_log(path: str | Path, sensitivity: float | None = None, rate: float | None = None,
-             columns: Mapping[str, str] = {}, axis: str = 'z') -> Log:
+             columns: Mapping[str, str] = {}, axis: str = 'z',
+             on_progress: Callable[[int], object] | None = None) -> Log:
     """
     Read a log file (.csv or .csv.gz).
 
@@ -155,14 +156,15 @@ def read_log(path: str | Path, sensitivity: float | None = None, rate: float | N
     columns : names of columns that are not those of the log format: time, gyro, counts,
         temperature, rate, heading, acceleration, supply or moving -> name, or name:unit
     axis : x, y or z, of columns such as gyro_x_dps
+    on_progress : as for `read_log_blocks`
 
     Raises
     ------
     LogError : the file cannot be read, or is not a log; names file, row and column
 
     """
-    blocks = list(_while_it_fits(path, read_log_blocks(path, sensitivity, rate, columns=columns,
-                                                       axis=axis)))
+    blocks = list(_while_it_fits(path, read_log_blocks(
+        path, sensitivity, rate, on_progress=on_progress, columns=columns, axis=axis)))
     first = blocks[0]
     present = [quantity for quantity in QUANTITIES if getattr(first, quantity) is not None]
     arrays = {quantity: np.concatenate([getattr(block, quantity) for block in blocks])

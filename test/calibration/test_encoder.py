@@ -63,6 +63,18 @@ def test_a_late_gyro_is_found_late_and_nothing_else():
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
 
 
+def test_the_offsets_that_are_tried_are_its_progress():
+    tried = []
+
+    def progress(offsets):
+        for offset in offsets:
+            tried.append(float(offset))
+            yield offset
+    found = calibrate_encoder(CLEAN, progress=progress).fit
+    assert found.bias == calibrate_encoder(CLEAN).fit.bias
+    assert len(tried) > 10 and min(tried) < -0.2 and max(tried) > 0.2
+
+
 def test_the_model_holds_what_was_found():
     found = calibrate_encoder(CLEAN)
     assert {term.effect.name: term.values[0] for term in found.model.terms} == {
