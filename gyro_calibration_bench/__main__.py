@@ -45,7 +45,7 @@ def main(words: Sequence[str] | None = None) -> int:
     command = commands.add_parser('make', help='write logs, cases.json and truth.json')
     command.add_argument('folder', type=Path, metavar='DIR')
     command.add_argument('--seed', type=int, default=0)
-    command.add_argument('--cases', type=int, default=8, help='of each part; default: 8')
+    command.add_argument('--cases', type=int, default=2, help='of each part; default: 2')
     command.add_argument('--part', nargs='+', choices=PARTS, default=PARTS)
     command.set_defaults(command=make)
     command = commands.add_parser('answer', help='answer the cases by a method')
