@@ -59,7 +59,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class _Likeness:
-    """What is said of an effect beside its entry in the catalogue of effects."""
+    """What the diagnosis knows of an effect in addition to the catalogue of effects."""
 
     along: str
     confounders: tuple[str, ...] = ()
@@ -145,11 +145,12 @@ def _other(name: str, sentence: str, unit: str, of: str, along: str,
 _WITH_REFERENCE = ('time', 'reference')
 
 _OTHERS = (
-    _other('outliers', 'Single samples are wild, as from a disturbed line or a mended checksum.',
-           '1', 'record', 'time'),
+    _other('outliers',
+           'Single samples are outliers, as from a disturbed line or a corrected checksum.', '1',
+           'record', 'time'),
     _other('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record',
            'time', confounders=('quantization',),
-           separate_by='turn without rest: an honest code does not stay then'),
+           separate_by='turn without rest: the code of a gyro that works changes then'),
     _other('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time'),
     _other('reference_once_per_rev',
            'The reference errs once in a revolution, as an eccentric encoder or a wobbling table '
@@ -159,7 +160,7 @@ _OTHERS = (
            'rate', _WITH_REFERENCE, ('scale_factor_error',),
            'close whole turns on a mark, or take a second reference'),
     _other('reference_slip',
-           'The motion slipped: the reference tells of a turn that the gyro did not make.', 'rad',
+           'The motion slipped: the reference shows a turn that the gyro did not make.', 'rad',
            'reference', 'rate_change', _WITH_REFERENCE, (), ''),
     _other('reference_quantization',
            'The reference counts in steps, and its rate between samples is as coarse.', 'rad',
@@ -168,12 +169,13 @@ _OTHERS = (
            'The output is in another unit, or of the other sign, than its name says.', '1',
            'record', 'rate', ('reference',), ('scale_factor_error', 'time_offset'),
            'look up what the wire carries: the number itself is the evidence'),
-    _other('angle_random_walk', 'The white noise of the rate is not the one simulated.',
+    _other('angle_random_walk', 'The angle random walk differs from the simulated one.',
            'rad/√s', 'noise', 'frequency'),
-    _other('bias_instability', 'The bias flickers otherwise than simulated.', 'rad/s', 'noise',
-           'frequency', confounders=('rate_random_walk',), separate_by='record at rest for hours'),
-    _other('rate_random_walk', 'The bias walks otherwise than simulated.', 'rad/s/√s', 'noise',
-           'frequency', confounders=('bias_instability', 'rate_ramp'),
+    _other('bias_instability', 'The bias instability differs from the simulated one.', 'rad/s',
+           'noise', 'frequency', confounders=('rate_random_walk',),
+           separate_by='record at rest for hours'),
+    _other('rate_random_walk', 'The rate random walk differs from the simulated one.',
+           'rad/s/√s', 'noise', 'frequency', confounders=('bias_instability', 'rate_ramp'),
            separate_by='record at rest for hours, and again: a walk does not repeat'),
 )
 

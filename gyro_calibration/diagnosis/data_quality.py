@@ -112,7 +112,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     model : what the simulation knows already: its steps and its limit are no findings
 
     """
-    log, said = prepared(log)
+    log, notes = prepared(log)
     output, rate = output_of(log), reference_rate(evened(log))
     known = np.isfinite(output)
     line = None if rate is None else line_between(log.time, rate, output)
@@ -130,7 +130,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
                 f'the output is {ratio:.5g} +- {deviation:.2g} times what the reference says, and '
                 f'{name} is {FACTORS[name]:.5g}',
                 () if is_far(ratio) else ('scale_factor_error',))]
-    found = DataQuality(tuple(units), said, known, factor)
+    found = DataQuality(tuple(units), notes, known, factor)
     if log.time is None:
         return found
     found = _of_stamps(found, log, known)
@@ -145,15 +145,15 @@ def decided(clean: DataQuality) -> DataQuality:
     if clean.factor == 1.0:
         return clean
     if is_far(clean.factor):
-        said = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for '
+        note = (f'The output was multiplied by {clean.factor:.6g} first, and a new model is for '
                 'an output so mended: mend the unit or the sign of the log (its column, '
                 '--sensitivity, --invert) before it is compensated.')
-        return replace(clean, remarks=(*clean.remarks, said))
-    said = (f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: '
+        return replace(clean, remarks=(*clean.remarks, note))
+    note = (f'The output was not multiplied by {clean.factor:.6g}, for that may be of the gyro: '
             'a new model has it as a scale factor error.')
     return replace(clean, factor=1.0, step=clean.step / clean.factor,
                    limit=None if clean.limit is None else clean.limit / clean.factor,
-                   remarks=(*clean.remarks, said))
+                   remarks=(*clean.remarks, note))
 
 
 def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str,
@@ -220,10 +220,10 @@ def _of_reference(found: DataQuality, log: Log) -> DataQuality:
         return found
     step = encoder_step(values) if heading else 0.0
     update = update_interval(log.time, values, step)
-    said = [f'The reference is renewed every {1000.0 * update:.4g} ms only, and held in between; '
+    note = [f'The reference is renewed every {1000.0 * update:.4g} ms only, and held in between; '
             'it is interpolated.'] if update else []
     return replace(found, heading_step=step, update_interval=update,
-                   remarks=(*found.remarks, *said))
+                   remarks=(*found.remarks, *note))
 
 
 def encoder_step(heading: Array) -> float:
@@ -257,11 +257,11 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
     limit = limit_of(codes, seen, LEVEL)
     at_limit = np.zeros(len(output), dtype=bool) if limit is None else limit.reached(seen.output)
     good, band = known & ~at_limit, dead_band(codes, seen.output)
-    stuck = repeated_samples(seen, codes, band, good, LEVEL)
-    if stuck is not None and stuck.has_one_more(at_limit):
+    repeated = repeated_samples(seen, codes, band, good, LEVEL)
+    if repeated is not None and repeated.has_one_more(at_limit):
         limit, at_limit, good = None, np.zeros_like(at_limit), known
-        stuck = repeated_samples(seen, codes, band, good, LEVEL)
-    good = good if stuck is None else good & ~stuck.repeats
+        repeated = repeated_samples(seen, codes, band, good, LEVEL)
+    good = good if repeated is None else good & ~repeated.repeats
     # Samples beside those that a dead band holds are the tail of the noise that gets out of it.
     outlying = outlying_samples(seen, good if band is None else good & ~binary_dilation(
         band.holds(seen.output), iterations=SIDE), 0.5 * codes.step, LEVEL)
@@ -272,7 +272,7 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
         near = _NEAR_LIMIT * max(seen.white, seen.scatter)
         free = ~((seen.expected > limit.high - near) | (seen.expected < limit.low + near))
     findings = (*found.findings, *_of_codes(codes, seen, limit, at_limit, model),
-                *_of_single_samples(stuck, outlying, log, found.heading_step, seen.white))
+                *_of_single_samples(repeated, outlying, log, found.heading_step, seen.white))
     matters = codes.step >= STEP * seen.white
     return replace(found, findings=findings, trusted=good & free,
                    limit=None if limit is None else limit.size,
@@ -305,17 +305,17 @@ def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
                       f'have the extreme code {" or ".join(sides)}')
 
 
-def _of_single_samples(stuck: RepeatedSamples | None, outlying: Outliers | None, log: Log,
+def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | None, log: Log,
                        step: float, white: float) -> Iterator[Finding]:
     """Give repeated samples and outliers, and the step of the reference if it adds variance."""
     assert log.time is not None
-    if stuck is not None:
-        count = int(np.count_nonzero(stuck.repeats))
-        first = log.time[int(np.argmax(stuck.repeats))]
-        yield _counted('stuck_samples', count, stuck.p_value,
-                       f'{count} samples in {stuck.runs} runs repeat the one before, the first at '
-                       f'{first:.3f} s; codes and noise explain {stuck.explained:.2g} repeats in '
-                       'the whole log')
+    if repeated is not None:
+        count = int(np.count_nonzero(repeated.repeats))
+        first = log.time[int(np.argmax(repeated.repeats))]
+        yield _counted('stuck_samples', count, repeated.p_value,
+                       f'{count} samples in {repeated.runs} runs repeat the one before, the first '
+                       f'at {first:.3f} s; codes and noise explain {repeated.explained:.2g} '
+                       'repeats in the whole log')
     if outlying is not None:
         count = int(np.count_nonzero(outlying.samples))
         first = log.time[int(np.argmax(outlying.samples))]

@@ -146,8 +146,8 @@ def beside(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) ->
 
 def technology(model: GyroModel) -> str | None:
     """Return what the instrument is, if the model says so and physics has an answer."""
-    said = model.gyro.get('technology')
-    return said if said in TECHNOLOGIES else None
+    stated = model.gyro.get('technology')
+    return stated if stated in TECHNOLOGIES else None
 
 
 # naming
@@ -426,9 +426,9 @@ def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
     known, error = columns_of(used, fit.terms), fit.residual[fit.scatter.kept]
     found, gains, tried = [], {}, len(probes)
     while probes:
-        judged = [_judged(name, fit, known, columns, error, by_model)
+        tested = [_tested(name, fit, known, columns, error, by_model)
                   for name, columns in probes.items()]
-        best, gain = min(judged, key=lambda each: (each[0].p_value, -each[1]))
+        best, gain = min(tested, key=lambda each: (each[0].p_value, -each[1]))
         chance = min(1.0, tried * best.p_value)
         if chance >= level:
             break
@@ -438,7 +438,7 @@ def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
     return Left(tuple(found), gains)
 
 
-def _judged(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
+def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
             by_model: Array) -> tuple[Unexplained, float]:
     """Return what a curve explains beside what is known, its chance, and the misfit it saves."""
     used = take(fit.dwells, fit.scatter.kept)
@@ -563,9 +563,9 @@ def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
               if (sigmas := _sigmas(fit, effect, columns)) < DISTINGUISHED]
     if not found:
         return Alternatives()
-    said = [_experiment(fit, steady[0][1])] if steady else []
-    said += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
-    return Alternatives(tuple(name for _, name in sorted(found)), '; '.join(said))
+    experiments = [_experiment(fit, steady[0][1])] if steady else []
+    experiments += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
+    return Alternatives(tuple(name for _, name in sorted(found)), '; '.join(experiments))
 
 
 def sigmas_of(fit: Calibration, other: Calibration) -> float:

@@ -95,14 +95,14 @@ def model_gate(log: Log, model: GyroModel) -> Gate:
     try:
         _refuse_units(prepared(log)[0], output_of(log), model)
     except DataRefused as refusal:
-        said, _, remedy = str(refusal).partition('; ')
-        return Gate('model', False, said, remedy)
+        evidence, _, remedy = str(refusal).partition('; ')
+        return Gate('model', False, evidence, remedy)
     return Gate('model', True, 'the model is of the units of the log')
 
 
 def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
     """
-    Return a log with the reference that is used, and what is to be said of that.
+    Return a log with the reference that is used, and the remarks on that.
 
     The rate is dropped if it is known in less than half as many samples as the heading. A rate
     that is nothing but noise becomes that of a rest.
@@ -113,16 +113,16 @@ def prepared(log: Log) -> tuple[Log, tuple[str, ...]]:
     counts = [0 if values is None else int(np.isfinite(values).sum())
               for values in (log.reference_rate, log.reference_heading)]
     by_rate = counts[0] > 0 and 2 * counts[0] >= counts[1]
-    said = () if by_rate or not counts[0] else (
+    notes = () if by_rate or not counts[0] else (
         f'The reference rate is known in {counts[0]} samples only; '
         f'the heading, known in {counts[1]}, is used.',)
     log = replace(log, reference_rate=log.reference_rate if by_rate else None,
                   reference_heading=log.reference_heading if counts[1] else None)
     rate = reference_rate(log)
     if rate is None or not np.nanmax(np.abs(rate)) > 0.0 or not rests(log):
-        return log, said
+        return log, notes
     return replace(log, reference_rate=0.0 * rate, reference_heading=None), (
-        *said, 'What the reference shows is its noise, which the gyro does not see; '
+        *notes, 'What the reference shows is its noise, which the gyro does not see; '
         'it is taken to be at rest.')
 
 
@@ -285,7 +285,7 @@ _SPANS, _LAGS = 1000, 25
 #: Spans that are put together, for the noise of a reference fades over longer ones.
 _TOGETHER = (1, 4, 16)
 #: The least spans; how far a reference must turn in all, and how far gyro and reference must be
-#: apart over the longest spans, rad, for a gyro that does not follow to be told so.
+#: apart over the longest spans, rad, for a gyro that does not follow to be detected.
 _FEWEST, _TURNED, _APART = 12, 30.0 * DEGREE, 10.0 * DEGREE
 #: Shares of the variance in common: above the first the factor between both is known; below the
 #: second they are different motions.
@@ -356,23 +356,23 @@ def _checked(log: Log, model: GyroModel | None) -> Iterator[Gate]:
 
 
 def _same_motion(found: Agreement, log: Log) -> Gate:
-    said = (f'{100.0 * found.coherence:.3g} % of the variance of the heading over spans is common '
+    seen = (f'{100.0 * found.coherence:.3g} % of the variance of the heading over spans is common '
             'to gyro and reference')
     wanders = (found.grown[0] > _WANDERED and found.grown[1] > _GROWN
                and found.long < found.short - 0.5 * _DIFFERENT)
     if found.coherence >= _DIFFERENT and not wanders:
-        return Gate('motion', True, said)
+        return Gate('motion', True, seen)
     if not wanders and (found.grown[0] < _APART or found.range < _TURNED):
         return Gate('motion', None,
-                    f'{said}; what differs is as small as the errors of a reference')
+                    f'{seen}; what differs is as small as the errors of a reference')
     others = [name for name in log.others if 'gyro' in name.lower()]
     axis = f'; or take another axis of the gyro ({", ".join(others[:3])})' if others else ''
     turned = 'turn the rates of all three axes into the frame of the reference first'
     if wanders:
-        return Gate('tilt', False, f'{said} over short spans, and {100.0 * found.long:.2g} % over '
+        return Gate('tilt', False, f'{seen} over short spans, and {100.0 * found.long:.2g} % over '
                     f'longer ones, where {found.grown[0] / DEGREE:.3g} deg are left: the axis of '
                     'the gyro tilts', f'{turned}, or keep the sensor level{axis}')
-    return Gate('motion', False, said, 'give a reference of this motion and this axis, with '
+    return Gate('motion', False, seen, 'give a reference of this motion and this axis, with '
                 f'stamps of the same clock; where the sensor tumbles, {turned}{axis}')
 
 
@@ -380,15 +380,15 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
     """Give the gates of sense and unit, by the factor of the output over the reference."""
     assert log.time is not None
     factor, deviation = 1.0 / (found.factor * own), found.deviation / found.factor ** 2 / abs(own)
-    said = f'the output is {factor:.4g} times what the reference says'
+    seen = f'the output is {factor:.4g} times what the reference says'
     size = factor, (factor - 1.96 * deviation, factor + 1.96 * deviation)
     if not is_far(factor):
-        yield Gate('sense', True, f'{said}: the same sense')
-        yield Gate('unit', True, f'{said}: the same unit')
+        yield Gate('sense', True, f'{seen}: the same sense')
+        yield Gate('unit', True, f'{seen}: the same unit')
         return
     name = unit_of_scale(factor, deviation)
     if name == '-1' or name is None and is_far(-factor) is False:
-        yield Gate('sense', False, f'{said}: the two count in opposite senses',
+        yield Gate('sense', False, f'{seen}: the two count in opposite senses',
                    'give --invert, or change the sign of the column of the gyro', size)
         return
     power, interval = round(math.log10(abs(factor))), float(np.median(np.diff(log.time)))
@@ -396,7 +396,7 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
     if (name is None and power and abs(abs(factor) / slower - 1.0) < 0.3
             and log.reference_rate is None
             and _INTERVALS[0] < interval / slower < _INTERVALS[1]):
-        yield Gate('time_unit', False, f'{said}: the stamps run {slower:g} times too fast, '
+        yield Gate('time_unit', False, f'{seen}: the stamps run {slower:g} times too fast, '
                    f'{interval:.4g} s between samples where {interval / slower:.4g} s would agree',
                    f'divide time_s by {slower:g}, or give --rate {slower / interval:.6g}'
                    + (' (the stamps are in ms)' if power == 3 else ''), size)
@@ -409,8 +409,8 @@ def _units(found: Agreement, own: float, log: Log) -> Iterator[Gate]:
         either = log.reference_heading is not None and 0.1 <= fastest <= 4000.0
         remedy = ('mend the unit of the column of the gyro (gyro_dps or gyro_rad_s)'
                   + (', or that of the reference heading (deg or rad)' if either else ''))
-    yield Gate('unit', False, f'{said}, and {name} is {FACTORS[name]:.5g}' if name
-               else f'{said}, which is the factor of no gyro', remedy, size)
+    yield Gate('unit', False, f'{seen}, and {name} is {FACTORS[name]:.5g}' if name
+               else f'{seen}, which is the factor of no gyro', remedy, size)
 
 
 def integral(log: Log) -> Array:

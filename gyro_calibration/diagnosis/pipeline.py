@@ -99,7 +99,7 @@ _POWER, _DEVIATIONS = 0.95, 1.96
 #: Names of what has no other.
 _SHAPES = {'reference_slip': ('width', *(f'slip_time_{place}' for place in range(MOST_SLIPS)))}
 _ONCE = 'look for what caused it; it is of this log alone, and in no model for others'
-#: What is said of a channel that is constant, and the variable that is constant with it.
+#: Reasons for a channel that is constant, and the variable that is constant with it.
 _HARDLY = {'temperature': 'the temperature hardly changes',
            'supply': 'the supply voltage does not change',
            'specific_force': 'the specific force does not change'}

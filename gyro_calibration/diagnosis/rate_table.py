@@ -77,7 +77,7 @@ from scipy.stats import t as student
 #: Parts of the false-alarm rate: of structure without a name, and of outlying dwells; the rest is
 #: that of causes.
 _LEFT, _OUTLYING = 0.2, 0.05
-#: An effect of the smallest size that is said is found with this probability.
+#: An effect of the smallest size that is stated is found with this probability.
 _POWER = 0.95
 _METHOD = (
     'The rates and temperatures of the dwells were put through the simulation, and what the '

@@ -174,7 +174,7 @@ def noise_grid(interval: float, duration: float, reference: float = 0.0) -> list
                     for corner in corners]
 
 
-#: More points of the grid than this are averaged in neighbours: causes are told apart with fewer.
+#: More points of the grid than this are averaged in neighbours: causes differ with fewer, too.
 MOST_POINTS = 50_000
 #: Towards the highest frequencies the power of jumps falls to 0.18 between the second and the last
 #: quarter, that of noise to no less; what falls below this was smoothed before it was recorded. It

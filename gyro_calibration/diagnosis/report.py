@@ -251,7 +251,7 @@ def _rate_unit(values: Array) -> tuple[str, float]:
 
 
 def _predicted(curve: Curve, place: int) -> Chart | None:
-    """Return what the simulation said that the gyro errs by, and what it did."""
+    """Return the error of the gyro as simulated and as measured."""
     if curve.simulated is None or curve.along == SPECTRUM:
         return None
     measured = curve.simulated + curve.before

@@ -205,7 +205,7 @@ def _held_back(seen: Compared, sign: float, top: float, step: float) -> bool:
             or (fine and (runs >= _SEPARATE or middle > -3.0 * deviation)))
 
 
-#: Motions that are told apart, by the change that is expected from one sample to the next.
+#: Motions that are distinguished, by the change that is expected from one sample to the next.
 _CLASSES = 8
 #: From this share of repeats on, single ones of so coarse an output mean nothing; runs may.
 _COARSE = 0.3
@@ -385,7 +385,7 @@ SIDE = 3
 _SOON = 10
 #: Samples in which the scatter is taken to be the same.
 _BLOCK = 256
-#: Kinds of motion that are told apart, by how much the expectation changes about a sample.
+#: Kinds of motion that are distinguished, by how much the expectation changes about a sample.
 _KINDS = 16
 #: Shares of the farthest samples at which the scatter is measured, for the tail of rough motion.
 _TAILS = (0.05, 0.01)
@@ -426,7 +426,7 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     ----------
     seen : output and expectation
     good : samples that count; beside three and more of six that do not, as after a stuck run, one
-        is not judged
+        is not tested
     floor : the scatter is at least this, rad/s: half a code
     level : chance of a false alarm
 
@@ -444,10 +444,10 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
         # near a jump of the reference of half the size: a jolt, or the reference is outlying
         jumps = maximum_filter1d(_off(expected), 2 * _SOON + 1)
         far[jumps > 0.5 * np.minimum(_off(output), _off(output - expected))] = 0.0
-    judged = good & (np.count_nonzero(_neighbours(~good, SIDE), axis=1) < SIDE)
-    outlying = _single((far > limit) & judged)
+    tested = good & (np.count_nonzero(_neighbours(~good, SIDE), axis=1) < SIDE)
+    outlying = _single((far > limit) & tested)
     count, near = (int(np.count_nonzero(outlying)),
-                   int(np.count_nonzero((far > _NEAR) & (far <= limit) & judged)))
+                   int(np.count_nonzero((far > _NEAR) & (far <= limit) & tested)))
     if (not count or near > 0.5 * count + stats.poisson.isf(
             0.01, 2.0 * len(output) * stats.norm.sf(_NEAR))
             or _due_to_motion(outlying, moved, seen)):
