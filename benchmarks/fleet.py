@@ -340,7 +340,8 @@ def scale(_: Generator, logs: int = 10_000, killed: int = 20) -> Iterator[str]:
         cost = [1e3 * each for each in (
             np.mean(alone), sum(used.values()) / count, own / count)]
         yield (f'| {count} | {lost} | {done_} of {count - (killed if fatal else 0)} | '
-               f'{", ".join(f"{each:.2f}" for each in cost)} | {", ".join(f"{each:.0f}" for each in memory)} |')
+               f'{", ".join(f"{each:.2f}" for each in cost)} | '
+               f'{", ".join(f"{each:.0f}" for each in memory)} |')
 
 
 def _alone(logs: int = 500) -> float:

@@ -23,8 +23,7 @@ from gyro_calibration.cli.verb import (
     add_log,
     Answer,
     origin_of,
-    output_of,
-    read,
+    read_each,
     UsageError,
     verb,
     whole,
@@ -66,18 +65,11 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _diagnose(given: argparse.Namespace) -> Answer:
-    logs = [_read(given, path) for path in given.log]
+    logs = list(read_each(given))
     model = None if given.model is None else read_model(given.model)
     found = _found(given, logs, model)
     written = _written(given.out, found) if given.out else []
     return Answer('\n'.join([*lines(found), *written]), found.figures())
-
-
-def _read(given: argparse.Namespace, path: str) -> Log:
-    one = argparse.Namespace(**{**vars(given), 'log': path})
-    log = read(one)
-    output_of(one, log)
-    return log
 
 
 def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | None) -> Diagnosis:

@@ -28,6 +28,7 @@ from gyro_calibration.cli.verb import (
     output_of,
     positive,
     read,
+    sensitivity,
     time_of,
     UsageError,
     verb,
@@ -36,7 +37,7 @@ from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
 from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.files import plain
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE
+from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 
 
@@ -117,10 +118,9 @@ def _handle_signals(handler: Any) -> None:
 
 
 def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
-    sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
     try:
         protocol, settings = find(given.protocol), Settings(
-            sensitivity=sensitivity, columns=tuple(given.columns.split(',')))
+            sensitivity=sensitivity(given), columns=tuple(given.columns.split(',')))
         protocol.check(settings)
     except ValueError as error:
         raise UsageError(str(error)) from None

@@ -44,9 +44,8 @@ from gyro_calibration.cli.verb import (
     Answer,
     bar,
     origin_of,
-    output_of,
     picture_file,
-    read,
+    read_each,
     UsageError,
     verb,
 )
@@ -111,16 +110,10 @@ def _orders(text: str) -> list[Effect]:
 
 
 def _fit(given: argparse.Namespace) -> Answer:
-    logs = dict(_read(argparse.Namespace(**{**vars(given), 'log': path})) for path in given.log)
+    logs = dict(zip(given.log, read_each(given)))
     if _method(given, logs) == 'dwells':
         return _fit_dwells(given, logs)
     return _fit_heading(given, logs)
-
-
-def _read(given: argparse.Namespace) -> tuple[str, Log]:
-    log = read(given)
-    output_of(given, log)
-    return given.log, log
 
 
 def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:

@@ -22,7 +22,7 @@ import threading
 import time
 from typing import Any
 
-from gyro_calibration.cli.verb import Answer, positive, say, UsageError, verb
+from gyro_calibration.cli.verb import Answer, positive, say, sensitivity, UsageError, verb
 from gyro_calibration.driver.connection import AUTO, Connection, State
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.csv_lines import CSV
@@ -39,7 +39,7 @@ from gyro_calibration.driver.recorder import (
 from gyro_calibration.driver.timestamps import steady
 from gyro_calibration.files import plain
 from gyro_calibration.logs.cdr import NSEC_PER_SEC
-from gyro_calibration.logs.log import DataRefused, DEGREE
+from gyro_calibration.logs.log import DataRefused
 from gyro_calibration.logs.ros_bag import Message
 from tqdm import tqdm
 
@@ -241,11 +241,11 @@ class _PortSession(_Session):
             raise UsageError(f'--baud is {given.baud}, but must be from 0 to {_LARGEST_BAUD}; '
                              'leave it out for that of the protocol')
         columns = tuple(given.columns.split(',')) if given.columns else Settings().columns
-        sensitivity = None if given.sensitivity is None else given.sensitivity * DEGREE
         try:
             self._settings = Settings(
-                sensitivity=sensitivity, invert=given.invert, axis=given.axis, columns=columns,
-                increments=_INCREMENTS[given.increments], sample_rate=given.sample_rate)
+                sensitivity=sensitivity(given), invert=given.invert, axis=given.axis,
+                columns=columns, increments=_INCREMENTS[given.increments],
+                sample_rate=given.sample_rate)
             self._connection = Connection(given.port, given.protocol or AUTO, given.baud,
                                           self._settings, on_change=self._report)
         except ValueError as error:

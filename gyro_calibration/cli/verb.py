@@ -157,13 +157,22 @@ def read(given: argparse.Namespace) -> Log:
         log = _recorded(given)
     else:
         with _bytes_of(given.log) as on_progress:
-            log = read_log(given.log, _sensitivity(given), given.rate, given.names, given.axis,
+            log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
     if given.unwrap and log.reference_heading is not None:
         time = time_of(given, log)
         log = replace(log, reference_heading=unwrapped(
             time, log.reference_heading, time, output_of(given, log))[0])
     return _turned(given, next(_inside(given, [log])))
+
+
+def read_each(given: argparse.Namespace) -> Iterator[Log]:
+    """Read the logs of a verb that takes several; each has an output."""
+    for path in given.log:
+        one = argparse.Namespace(**{**vars(given), 'log': path})
+        log = read(one)
+        output_of(one, log)
+        yield log
 
 
 def _inside(given: argparse.Namespace, logs: Iterable[Log]) -> Iterator[Log]:
@@ -214,7 +223,7 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
         yield from blocks_of(read(given))
         return
     with _bytes_of(given.log) as on_progress:
-        blocks = read_log_blocks(given.log, _sensitivity(given), given.rate,
+        blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _inside(given, blocks):
             yield _turned(given, log)
@@ -236,7 +245,8 @@ def _recorded(given: argparse.Namespace) -> Log:
         return read_recording(given.log, topics, given.rate, on_progress, say)
 
 
-def _sensitivity(given: argparse.Namespace) -> float | None:
+def sensitivity(given: argparse.Namespace) -> float | None:
+    """Return --sensitivity, rad/s per count."""
     return None if given.sensitivity is None else given.sensitivity * DEGREE
 
 

@@ -98,7 +98,8 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     else:
         other = second if ambiguous else None
         protocol, (explained, words) = None, _not_found(best, other, data, settings)
-    return Recognition(protocol, explained, best.frames, runner_up and runner_up.protocol, words)
+    return Recognition(protocol, explained, best.frames,
+                       None if runner_up is None else runner_up.protocol, words)
 
 
 def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
