@@ -187,7 +187,7 @@ def test_no_stream_leaves_an_estimator_with_something_that_is_no_number(
     for step, output, degc, force in samples:
         time = time + step if math.isfinite(time + step) else step
         if degc is not None:
-            live.hear_temperature(time, degc)
+            live.take_temperature(time, degc)
         live.add(time, output, NOW, force)
         assert is_sound(live.tracker) and math.isfinite(live.corrected)
     live.learn(NOW, ending=True)
@@ -214,7 +214,7 @@ def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(
     rate = 0.5 * np.sin(np.arange(1500) * INTERVAL) + REST
     for place, output in enumerate((rate + 1e-3 * rate ** 3).tolist()):
         other, degc, temperature_alone = places.get(place, (output, 25.0, False))
-        live.hear_temperature(INTERVAL * place, 25.0 if degc is None else degc)
+        live.take_temperature(INTERVAL * place, 25.0 if degc is None else degc)
         live.add(INTERVAL * place, output if temperature_alone else other, NOW)
     assert (live.refused == sum(not each[2] for each in places.values())
             and live.tracker.rebuilt == 0)

@@ -52,7 +52,7 @@ _CHANCE = 0.05
 _MISFITS = (0.0, *(0.01 * 2.0 ** (step / 2.0) for step in range(11)))
 #: The least number of octaves that shows a slope and its end.
 _FEWEST_OCTAVES = 4
-#: Places of the parts; beside them, what a filter takes from the variance: over times beyond its
+#: Places of the parts; then what a filter takes from the variance: over times beyond its
 #: memory that has the slope of quantization, with the other sign.
 _N, _B, _K, _Q, _R = range(len(PARTS))
 _BEND = len(PARTS)

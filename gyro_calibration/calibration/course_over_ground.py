@@ -13,7 +13,7 @@ Calibrate against a course over ground: the direction of travel by satellites.
 
 A course is no heading. It is off by the side slip, smoothed, late or early against the gyro, lost
 below some speed, and for seconds at a time much worse than usual. The gyro's own noise is small
-beside that, so the course is regressed on the gyro, over spans of some seconds::
+compared with that, so the course is regressed on the gyro, over spans of some seconds::
 
     Δcourse = p Δ(integral of the output) - q Δt + d Δrate + c Δacceleration + noise
     s = 1 / p - 1,  b = q / p

@@ -195,14 +195,14 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
         raise DataRefused('the log holds no reference heading over time: '
                           'it needs the columns time_s, gyro_dps and reference_heading_deg')
     refuse_wrapped(log)
-    heard, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
-    for known, name in ((heard, 'gyro'), (seen, 'reference')):
+    answered, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
+    for known, name in ((answered, 'gyro'), (seen, 'reference')):
         if known.sum() < max(100, 0.1 * len(log)):
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
                               'at least a tenth and 100 are needed: '
                               'mend its line and record again')
     start = log.time[seen][0]
-    return (log.time[heard] - start, log.output[heard],
+    return (log.time[answered] - start, log.output[answered],
             from_headings(log.time[seen], log.reference_heading[seen]))
 
 

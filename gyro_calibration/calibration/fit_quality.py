@@ -116,9 +116,9 @@ def _walk(windows: _Windows, ratio: float) -> Array:
     They come of a random walk of unit variance per second, and of errors of the window means.
 
     """
-    beside = np.eye(len(windows.time) - 1, k=1) + np.eye(len(windows.time) - 1, k=-1)
-    return windows.length * ((2.0 / 3.0 + 2.0 * ratio) * np.eye(len(beside))
-                             + (1.0 / 6.0 - ratio) * beside)
+    neighbours = np.eye(len(windows.time) - 1, k=1) + np.eye(len(windows.time) - 1, k=-1)
+    return windows.length * ((2.0 / 3.0 + 2.0 * ratio) * np.eye(len(neighbours))
+                             + (1.0 / 6.0 - ratio) * neighbours)
 
 
 def _line(windows: _Windows, covariance: Array) -> tuple[float, float, float, Array]:

@@ -58,10 +58,10 @@ class Goodness:
 
     def __str__(self) -> str:
         """Return a sentence for people."""
-        told = ('what the noise explains' if self.probability > UNLIKELY else
-                'more than the noise explains: the robot follows the profile less well than the '
-                'gyro measures, or shakes')
-        return (f'The residual is {told} (chi-square {self.chi_square:.1f} with '
+        amount = ('what the noise explains' if self.probability > UNLIKELY else
+                  'more than the noise explains: the robot follows the profile less well than the '
+                  'gyro measures, or shakes')
+        return (f'The residual is {amount} (chi-square {self.chi_square:.1f} with '
                 f'{self.freedom:.0f} degrees of freedom, probability {self.probability:.2g}; '
                 f'noise {self.noise_ratio:.2f} times what is known)')
 
@@ -219,7 +219,8 @@ class _Pairing:
                                         prepend=-1.0))
         precision = np.add.reduceat(weight, begins)
         weight = weight / np.repeat(precision, np.diff(begins, append=len(time)))
-        known = np.column_stack([points.heading[kept], time, *self._heard(at[kept], constant),
+        known = np.column_stack([points.heading[kept], time,
+                                 *self._rate_and_integral(at[kept], constant),
                                  points.shared[kept]])
         means = np.add.reduceat(weight[:, None] * known, begins)
         columns = np.diff(np.delete(means, 4, axis=1), axis=0)
@@ -241,7 +242,7 @@ class _Pairing:
                               'record the whole motion')
         return data
 
-    def _heard(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
+    def _rate_and_integral(self, at: Array, constant: float) -> tuple[Array, Array, Array]:
         """
         Return rate, acceleration and integral of the rate, linear between the samples.
 
@@ -274,8 +275,8 @@ class _Pairing:
         step = 0.02 if self.sampled else 0.04
         offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
         misfits = np.array([self._misfit(offset) for offset in progress(offsets)])
-        beside = np.pad(misfits, 1, constant_values=math.inf)
-        bottoms = offsets[(misfits <= np.minimum(beside[:-2], beside[2:]))
+        padded = np.pad(misfits, 1, constant_values=math.inf)
+        bottoms = offsets[(misfits <= np.minimum(padded[:-2], padded[2:]))
                           & (misfits <= 6.0 * misfits.min())]
         if len(bottoms) < 2 or math.isinf(misfits.min()):
             return float(offsets[misfits.argmin()])
@@ -422,7 +423,7 @@ def _stands(motion: Motion, step: float, block: float) -> _Points:
     Return the readings that last longer than a block, single ones, and the first and last.
 
     All samples of one that lasts count as one reading. At the first and the last the gyro rests if
-    they last much longer than the readings beside them; then their samples share one error.
+    they last much longer than the readings next to them; then their samples share one error.
 
     """
     run = np.cumsum(np.abs(np.diff(motion.heading, prepend=motion.heading[0])) > 0.5 * step)
@@ -433,8 +434,8 @@ def _stands(motion: Motion, step: float, block: float) -> _Points:
     stays[[0, -1]] = True
     rests = np.zeros((len(begins), 2))
     if len(begins) > 2:
-        rests[0, 0], rests[-1, 1] = (lasts[end] > max(block, 2.0 * lasts[beside])
-                                     for end, beside in ((0, 1), (-1, -2)))
+        rests[0, 0], rests[-1, 1] = (lasts[end] > max(block, 2.0 * lasts[next_to])
+                                     for end, next_to in ((0, 1), (-1, -2)))
     variance = np.where(rests.any(axis=1), 1.0, np.bincount(run))
     kept = stays[run]
     return _Points(motion.time[kept], motion.heading[kept], variance[run[kept]], rests[run[kept]])
@@ -827,14 +828,14 @@ def unlikeliest(columns: Array, steps: Array, turned: Array) -> Stretch:
     norms, wholes = (np.add.outer(np.diag(matrix), np.diag(matrix)) - 2.0 * matrix
                      for matrix in (products, whole))
     # not one that scale and bias explain nearly as well, nor one of no length
-    told = np.triu(norms > _APART * wholes, 1)
-    gains = np.where(told, differences ** 2 / np.where(told, norms, 1.0), 0.0)
+    distinct = np.triu(norms > _APART * wholes, 1)
+    gains = np.where(distinct, differences ** 2 / np.where(distinct, norms, 1.0), 0.0)
     first, last = np.unravel_index(int(gains.argmax()), gains.shape)
     gain = float(gains[first, last])
     return Stretch(int(first), int(last),
                    float(differences[first, last] / max(norms[first, last], 1e-300)), gain,
                    float(turned @ turned - np.sum((left.T @ turned) ** 2)) - gain,
-                   gains[told], norms[told])
+                   gains[distinct], norms[distinct])
 
 
 #: Part of a stretch that the columns of a fit must leave, so that the two are distinguishable;

@@ -74,7 +74,7 @@ from scipy.linalg.lapack import dpttrf, dpttrs
 #: Points of the grid a size: first over its whole range, and in each further pass around what is
 #: likely.
 POINTS, PASSES = 5, 4
-#: Cosines that describe a wandering bias; what is faster is hardly told from white noise.
+#: Cosines that describe a wandering bias; what is faster is hardly distinguished from white noise.
 COSINES = 24
 
 
@@ -279,7 +279,7 @@ def wander(
     ``K²/ω²``; for the random walk this is its expansion by Karhunen and Loève. A bias among the
     values of the regression is the mean over the log. How far that is from the bias where the log
     began has the variance ``2/π B²`` and ``K² T / 3``, which no log shows: `noise_grid` adds it to
-    the variance of the value that is told to wander.
+    the variance of the value `wandering`.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ from scipy.linalg import solve_triangular
 LARGEST_CONDITION = 1e3
 
 
-class EffectsNotParted(DataRefused):
+class EffectsUnidentifiable(DataRefused):
     """
     Some effects look alike in these data.
 
@@ -193,7 +193,7 @@ def fit_effects(dwells: Dwells, effects: Sequence[Effect],
 
     Raises
     ------
-    EffectsNotParted : some of the effects look alike in these dwells
+    EffectsUnidentifiable : some of the effects look alike in these dwells
     DataRefused : too few dwells
 
     """
@@ -312,7 +312,7 @@ def _factor(dwells: Dwells, terms: Sequence[Term],
     lengths = np.linalg.norm(columns, axis=0)
     orthogonal, triangle = np.linalg.qr(columns / np.where(lengths > 0.0, lengths, 1.0))
     if not np.linalg.cond(triangle) < LARGEST_CONDITION:
-        raise _not_parted(terms, triangle)
+        raise _unidentifiable(terms, triangle)
     return orthogonal, triangle, lengths
 
 
@@ -368,16 +368,16 @@ def _refuse_unseen(dwells: Dwells, effects: Sequence[Effect]) -> None:
         return
     unseen = f'{", ".join(thermal)} cannot be seen'
     if dwells.temperature is None:
-        raise EffectsNotParted(f'{unseen}: the log holds no temperature; '
-                               'record temperature_degc too', thermal)
+        raise EffectsUnidentifiable(
+            f'{unseen}: the log holds no temperature; record temperature_degc too', thermal)
     spread = float(np.ptp(dwells.temperature))
     if spread < SMALLEST_TEMPERATURE_SPREAD:
-        raise EffectsNotParted(f'{unseen}: the temperature varies by {spread:.2g} K, wanted at '
-                               f'least {SMALLEST_TEMPERATURE_SPREAD:g} K; '
-                               'repeat the rates at another temperature', thermal)
+        raise EffectsUnidentifiable(
+            f'{unseen}: the temperature varies by {spread:.2g} K, wanted at least '
+            f'{SMALLEST_TEMPERATURE_SPREAD:g} K; repeat the rates at another temperature', thermal)
 
 
-def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
+def _unidentifiable(terms: Sequence[Term], triangle: Array) -> EffectsUnidentifiable:
     """Return the refusal with the effects whose columns nearly cancel, and their remedies."""
     direction = np.abs(np.linalg.svd(triangle)[2][-1])
     owners = [term.effect for term in terms for _ in term.fitted]
@@ -386,12 +386,13 @@ def _not_parted(terms: Sequence[Term], triangle: Array) -> EffectsNotParted:
              > 0.1 * direction.max()]
     names = [effect.name for effect in alike]
     if len(names) == 1:
-        return EffectsNotParted(f'{names[0]} cannot be determined from these dwells; '
-                                f'{alike[0].shown_by}', names)
+        return EffectsUnidentifiable(
+            f'{names[0]} cannot be determined from these dwells; {alike[0].shown_by}', names)
     advice = '; '.join(dict.fromkeys(effect.shown_by for effect in alike[::-1]
                                      if effect.shown_by))
-    return EffectsNotParted(f'{", ".join(names)} look alike in these dwells and cannot be '
-                            f'distinguished; {advice}, or leave one out', names)
+    return EffectsUnidentifiable(
+        f'{", ".join(names)} look alike in these dwells and cannot be distinguished; {advice}, or '
+        'leave one out', names)
 
 
 # looking at it

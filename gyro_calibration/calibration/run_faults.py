@@ -142,7 +142,7 @@ def refuse_robot(run: Pieces, motion: Motion, largest_offset: float, slip: str =
 
     Parameters
     ----------
-    slip : what is said of a slip, where more is known of it than its pieces show
+    slip : message on a slip, where more is known of it than its pieces show
 
     Raises
     ------

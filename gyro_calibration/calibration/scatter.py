@@ -17,7 +17,7 @@ that the sensor does not show). Their sizes are found by restricted likelihood, 
 dwells of one sweep do not count as thirty independent ones.
 
 The sizes are found about a smooth surface over rate and temperature, before any effect is fitted.
-Found beside too few effects, they would absorb what a missing effect leaves.
+Found with too few effects, they would absorb what a missing effect leaves.
 
 """
 
@@ -152,7 +152,7 @@ def find_scatter(dwells: Dwells) -> Scatter:
     used = take(dwells, kept)
     error, surface = used.output - used.rate, _surface(used)
     # The likelihood does not depend on what the surface explains; errors near zero would be lost
-    # in rounding beside it.
+    # in rounding otherwise.
     error = error - surface @ (surface.T @ error)
     size = rms(error) * math.sqrt(len(used) / max(len(used) - surface.shape[1], 1)) + 1e-15
     relative = size / max(float(np.abs(used.rate).max()), 1e-9)

@@ -172,7 +172,7 @@ def with_slopes(fit: Calibration) -> Calibration:
 
 
 def _tried(effects: Sequence[Effect]) -> int:
-    """Return how many effects were tried beside those that belong to every model."""
+    """Return how many effects were tried apart from those that belong to every model."""
     return len(STEADY) - sum(effect in effects for effect in (BIAS, SCALE_FACTOR_ERROR))
 
 
@@ -279,10 +279,11 @@ def _decide(first: tuple[Calibration, Effect], second: tuple[Calibration, Effect
         (fit, taken), (swapped, other), sigmas = (swapped, other), (fit, taken), -sigmas
         reason = (f'{taken.name} fits worse by {abs(sigmas):.1f} standard deviations only, and '
                   'its error stays bounded beyond the rates that were seen')
-    return fit, Confounders(taken.name, other.name, sigmas, _parting_rate(fit, swapped), reason)
+    return fit, Confounders(taken.name, other.name, sigmas, _distinguishing_rate(fit, swapped),
+                            reason)
 
 
-def _parting_rate(fit: Calibration, swapped: Calibration) -> float | None:
+def _distinguishing_rate(fit: Calibration, swapped: Calibration) -> float | None:
     """Return the slowest new rate, rad/s, at which two dwells each way distinguish two fits."""
     fastest = float(np.abs(fit.dwells.rate).max())
     for rate in fastest * np.arange(1.05, 3.0, 0.05):

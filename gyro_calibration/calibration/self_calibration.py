@@ -124,7 +124,7 @@ _SLIPPING = 0.01
 
 
 def usual_reference(motion: Motion) -> Reference:
-    """Return what is not known of a motion of which nothing is said: commanded rates slip."""
+    """Return the usual errors of a reference whose errors are not given: commanded rates slip."""
     commanded = motion.rate is not None
     return Reference(_SLIPPING / math.sqrt(3.0)) if commanded else Reference()
 

@@ -34,7 +34,7 @@ import numpy as np
 
 #: Standard deviations of what gyros have, by data sheets: the change of the bias with temperature,
 #: rad/s/K (L3G4200D: 0.03 deg/s/K), that of the scale factor, 1/K (L3G4200D: 2 % over 60 K), and
-#: the nonlinearity at the fastest rate that is left beside the fitted one, 1 (L3G4200D: 0.2 %).
+#: the nonlinearity at the fastest rate that is left by the fitted one, 1 (L3G4200D: 0.2 %).
 BIAS_SLOPE, SCALE_SLOPE, NONLINEARITY = Prior().coefficient, 3e-4, 2e-3
 
 #: dwells at rates, rad/s, and temperatures, degC -> change of the output for each value, (n, m)
@@ -44,7 +44,7 @@ Columns = Callable[[Array, Array], Array]
 def tolerance_of(dwells: Dwells, whitener: Whitener, sweeps: Array, columns: Columns,
                  covariance: Array) -> Tolerance:
     """
-    Return what a rate may be off by beside the covariance of the values.
+    Return what a rate may be off by beyond the covariance of the values.
 
     Beyond what was seen the error is that of a fit with more columns, less that of the values, at
     half a width beyond.

@@ -45,7 +45,7 @@ _PART, _MOVING = 0.25, 0.5 * DEGREE
 AMBIGUOUS = 0.35
 #: Scale factor error up to which the turns are counted by the gyro itself, 1.
 COUNTED = 0.05
-#: How often two rests of one bias are said to differ.
+#: How often two rests of one bias are refused as different.
 _FALSE_REFUSALS = 1e-4
 
 

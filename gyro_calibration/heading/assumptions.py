@@ -9,7 +9,7 @@
 # under the License.
 
 """
-Assumptions for values that nobody calibrated, and for temperatures without data.
+Assumptions for uncalibrated values, and for temperatures without data.
 
 A tracker believes what it is given. So it is given all that may be wrong: scale factor error and
 bias where nothing says how well they are known, and the change of the bias from the temperature
@@ -40,7 +40,7 @@ class Assumptions:
 
     Attributes
     ----------
-    bias : of a gyro that nobody calibrated, rad/s
+    bias : of an uncalibrated gyro, rad/s
     scale_factor_error : alike, 1
     bias_temperature_coefficient : rad/s/K; 0 for a gyro that compensates its temperature by itself
 

@@ -523,7 +523,7 @@ def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: floa
 
 def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
            temperature: float | None) -> Carried:
-    """Return a calibration of which nobody knows how good it is, at another temperature."""
+    """Return a calibration without a covariance, at another temperature."""
     here = calibration.temperature
     change = (0.0 if here is None or temperature is None
               else table.difference(here, temperature, time)[0])
@@ -563,9 +563,9 @@ _HEADER = ('# Biases of a gyro at rest, rad/s, behind the model with this digest
 
 def model_digest(model: GyroModel) -> str:
     """Return a name for models with `same_effects` and one serial number: they share biases."""
-    told = ([[term.effect.name, list(term.values)] for term in model.terms],
-            model.gyro.get('serial_number', ''))
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
+    content = ([[term.effect.name, list(term.values)] for term in model.terms],
+               model.gyro.get('serial_number', ''))
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def read_bias_table(path: str | Path, model: GyroModel,
@@ -584,9 +584,9 @@ def read_bias_table(path: str | Path, model: GyroModel,
     except FileNotFoundError:
         return BiasTable(model, prior), ''
     except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        said = (f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, '
-                'and the file is kept')
-        return BiasTable(model, prior), plain(said)
+        message = (f'{path} cannot be read as a bias table ({reason(error)}): it is learned anew, '
+                   'and the file is kept')
+        return BiasTable(model, prior), plain(message)
     if digest != model_digest(model):
         return BiasTable(model, prior), plain(f'the bias table in {path} belongs to another '
                                               'model: it is learned anew, and the file is kept')
@@ -610,10 +610,10 @@ def write_bias_table(path: str | Path, table: BiasTable,
     OSError : the folder cannot be written to; the old file is as it was, or has its other name
 
     """
-    said = _keep_aside(Path(path), table.digest)
+    message = _keep_aside(Path(path), table.digest)
     written = write_atomically(path, (_HEADER + settings_text(_content(table))).encode())
     table.kept(now)
-    return said, written
+    return message, written
 
 
 def _keep_aside(path: Path, digest: str) -> str:

@@ -17,8 +17,8 @@ from that of the samples to `_LONGEST`: c = r(t) - (r(t - h) + r(t + h)) / 2. A 
 a mean square of q h / 2 there, and after a gap of T = 2 h its integral has the variance
 q T³ / 12 = T² / 3 E(c²). Means over neighbouring blocks of length h have half of that mean square.
 
-The two samples beside a gap stand for all of it, and so does their noise: with N² / dt for each of
-them, T² N² / (2 dt) instead of N² T.
+The two samples at the ends of a gap stand for all of it, and so does their noise: with N² / dt
+for each of them, T² N² / (2 dt) instead of N² T.
 
 """
 
@@ -67,7 +67,7 @@ class Gap:
     ----------
     lost : how many
     duration : of what they stood for, s
-    motion : variance of what may have been turned beside the straight line, rad²
+    motion : variance of what may have been turned off the straight line, rad²
     noise : what the variance of the noise is beyond that of a time with all samples, rad²
 
     """

@@ -106,7 +106,7 @@ class HeadingEstimator:
     table : of biases at rest
     temperature : the last that came, degC; None before
     rate : the last, rad/s; zero at rest
-    corrected : the same before the tracker saw it
+    corrected : the same before the tracker
     last : what the compensation made of the last sample
     beginnings : how often the tracker began anew
     refused : samples that were not used, as no such gyro reports them; they count as lost
@@ -122,7 +122,7 @@ class HeadingEstimator:
         Parameters
         ----------
         model : with its stored self-calibration, if it has one
-        assumptions : of what nobody calibrated
+        assumptions : of uncalibrated values
         settings : of the tracker
         temperature_timeout : an older temperature is held, and counts as less and less known, s
         now : s since 1970
@@ -132,7 +132,7 @@ class HeadingEstimator:
         self._assumptions, self._settings, self._timeout, self._keep = (
             assumptions, settings, temperature_timeout, keep)
         self.temperature: float | None = None
-        self._heard_temperature, self._anchored, self._this_run, self._other_age = (
+        self._temperature_time, self._anchored, self._this_run, self._other_age = (
             -math.inf, False, False, False)
         self.rate = self.corrected = 0.0
         self.last, self.beginnings = Compensated(0.0, 0.0, 0.0, False, False), 0
@@ -140,7 +140,7 @@ class HeadingEstimator:
         self._refused, self.refused_temperatures = 0, 0
         self._stretch: _Stretch | None = None
         self._pending: deque[_Stretch] = deque(maxlen=8)
-        self._table_said = ''
+        self._table_message = ''
         self.model, self.table = model, table
         self._tracker: HeadingTracker | None = None
         self._history = model.history()
@@ -210,7 +210,7 @@ class HeadingEstimator:
             self._tracker.use(self.used.noise, self.covariance, age)
         self._begun = now
         self._anchor(now)
-        self._unheard_since = self._time if fresh and not self._anchored else math.inf
+        self._unknown_since = self._time if fresh and not self._anchored else math.inf
         self._shift, self._astray, self._other_age = 0.0, 0.0, False
         self._sensitivity: Array = np.zeros(len(self.covariance))
         self._still: Array = self._sensitivity
@@ -227,7 +227,7 @@ class HeadingEstimator:
         self._way = (Way(self.table, here, now, coefficient)
                      if here is not None and coefficient else None)
 
-    def _hear_again(self, now: float, around: Channels | None) -> None:
+    def _resume_temperature(self, now: float, around: Channels | None) -> None:
         """
         Go on from the temperature of now with what was calibrated in this run without one.
 
@@ -239,7 +239,7 @@ class HeadingEstimator:
         before = None if around is None else replace(around, temperature=self.last.temperature)
         held = compensate(self.used, 0.0, self.last.temperature, before).modelled
         self._shift, self._astray = (float(here) - float(held),
-                                     _unheard(self._time - self._unheard_since))
+                                     _drifted_unseen(self._time - self._unknown_since))
         self._anchor(now)
 
     def _carried(self, now: float) -> tuple[GyroModel, float | None]:
@@ -275,7 +275,7 @@ class HeadingEstimator:
                 if self.tracker.bias[1] > 0.5 * math.sqrt(self.covariance[-1, -1]) else '')
 
     def age(self, now: float) -> float:
-        """Return how long ago the bias was calibrated, s; a year where nobody knows."""
+        """Return how long ago the bias was calibrated, s; a year where it is unknown."""
         age = self._dated(now)
         return _YEAR if age is None or age < -_OLDER else max(age, 0.0)
 
@@ -298,9 +298,9 @@ class HeadingEstimator:
         """Return the calibration at this temperature; an unknown scale has infinite variance."""
         used = (self.used.self_calibration
                 or SelfCalibration(covariance=((math.inf, 0.0), (0.0, 0.0))))
-        assert used.covariance is not None  # where nobody knows it, it is assumed
+        assert used.covariance is not None  # an unknown one is assumed
         variance = self.bias_variance / used.scale ** 2
-        return replace(used, bias=used.bias + self._gone(self._time)[0],
+        return replace(used, bias=used.bias + self._bias_change(self._time)[0],
                        covariance=((used.covariance[0][0], 0.0), (0.0, variance)))
 
     @property
@@ -310,11 +310,11 @@ class HeadingEstimator:
 
     # Samples
 
-    def hear_temperature(self, time: float, temperature: float) -> None:
+    def take_temperature(self, time: float, temperature: float) -> None:
         """Take a temperature, degC, with its stamp, s; one that is not plausible is refused."""
         coldest, hottest = self.model.temperature_limits
         if coldest <= temperature <= hottest and abs(time) <= _LATEST:
-            self.temperature, self._heard_temperature = temperature, time
+            self.temperature, self._temperature_time = temperature, time
         else:
             self.refused_temperatures += 1
 
@@ -326,7 +326,7 @@ class HeadingEstimator:
     @property
     def temperature_is_lost(self) -> bool:
         """Tell whether the last temperature is too old at the last sample."""
-        return abs(self._time - self._heard_temperature) > self._timeout
+        return abs(self._time - self._temperature_time) > self._timeout
 
     @property
     def _known_temperature(self) -> float | None:
@@ -344,7 +344,7 @@ class HeadingEstimator:
         output : rad/s
         now : s since 1970
         force : specific force, m/s², if it came
-        wheels : whether wheels or commands move the robot; None where nobody says so
+        wheels : whether wheels or commands move the robot; None where unknown
         supply : voltage, V, if it came
 
         Returns
@@ -357,28 +357,28 @@ class HeadingEstimator:
             self._refused += 1
             return ''
         last, self._time = self._time, time
-        heard, goes_on = (not self._anchored and self._known_temperature is not None,
-                          self._this_run and last > -math.inf)
-        if self._other_age or heard and not goes_on:
+        known_again, goes_on = (not self._anchored and self._known_temperature is not None,
+                                self._this_run and last > -math.inf)
+        if self._other_age or known_again and not goes_on:
             self._begin(now)
         around = (self._look_around(time - last, force, supply)
                   if self.used.looks_around else None)
-        if heard and goes_on:
-            self._hear_again(now, around)
+        if known_again and goes_on:
+            self._resume_temperature(now, around)
         self.last = result = compensate(self.used, output, self.temperature, around)
-        gone, distance = self._gone(time)
+        change, distance = self._bias_change(time)
         calibration, tracker = self.used.self_calibration, self.tracker
         rate = float(result.rate)
-        if gone:
-            rate -= gone * (1.0 if calibration is None else calibration.scale)
+        if change:
+            rate -= change * (1.0 if calibration is None else calibration.scale)
         if abs(time - self._still_at) > _STILL + CLOSE:
             self._still, self._still_at = self._sensitive(output, 0.0, around, distance), time
         self._look_at(time, output, float(result.rate), around, distance)
-        said = tracker.add(time, rate, self._sensitivity, wheels, self._still)
+        message = tracker.add(time, rate, self._sensitivity, wheels, self._still)
         self.corrected, self.rate = rate, tracker.rate
-        self._gather(time, bool(said))
+        self._gather(time, bool(message))
         self._learn_at_rest(now)
-        return said
+        return message
 
     def plausible(self, time: float, output: float, force: float | None = None) -> bool:
         """Tell whether such a gyro may report that; `add` refuses other samples, and any nan."""
@@ -408,21 +408,21 @@ class HeadingEstimator:
         return sensitive(self.used, rate_sensitivity(
             self.used, output, rate, self.last.temperature, around), distance)
 
-    def _gone(self, time: float) -> tuple[float, float]:
+    def _bias_change(self, time: float) -> tuple[float, float]:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
         if self.temperature is None:
             return 0.0, 0.0
         if self._way is None:
-            return self._shift, _unheard(time - self._unheard_since)
-        gone, distance = self._way.at(self.temperature)
-        late = abs(time - self._heard_temperature) - self._timeout
-        return (self._shift + gone,
-                self._astray + distance + math.copysign(_unheard(late), distance))
+            return self._shift, _drifted_unseen(time - self._unknown_since)
+        change, distance = self._way.at(self.temperature)
+        late = abs(time - self._temperature_time) - self._timeout
+        return (self._shift + change,
+                self._astray + distance + math.copysign(_drifted_unseen(late), distance))
 
     def _look_around(self, interval: float, force: float | None,
                      supply: float | None) -> Channels:
         """
-        Return what effects look at beside rate, output and temperature.
+        Return what effects look at apart from rate, output and temperature.
 
         Time goes on with the stamps, also over gaps, and stands while they jump back. The heading
         is that of the tracker without its resets, and goes on at the last rate up to this sample.
@@ -452,7 +452,7 @@ class HeadingEstimator:
 
         Returns
         -------
-        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker saw it,
+        heading, its variance, rate, its variance, 1 at rest, the rate before the tracker,
         and 1 where the temperature was clipped and where the output is beyond the range of the
         model, shape (n, 8)
 
@@ -468,7 +468,7 @@ class HeadingEstimator:
             else:
                 end = place + 1
                 if temperature is not None and temperature[place] == temperature[place]:
-                    self.hear_temperature(float(time[place]), float(temperature[place]))
+                    self.take_temperature(float(time[place]), float(temperature[place]))
                 self.add(float(time[place]), float(output[place]), begun + float(time[place]),
                          None if force is None else float(force[place]),
                          None if wheels is None else wheels[place],
@@ -506,18 +506,18 @@ class HeadingEstimator:
         used, tracker, last = self.used, self.tracker, self._time
         self._time = float(time[-1])
         result = compensate(used, output, temperature)
-        gone, distance = np.zeros(len(time)), np.zeros(len(time))
+        change, distance = np.zeros(len(time)), np.zeros(len(time))
         if temperature is not None:
-            self.temperature, self._heard_temperature = float(temperature[-1]), self._time
-            gone += self._shift
+            self.temperature, self._temperature_time = float(temperature[-1]), self._time
+            change += self._shift
             distance += self._astray
             if self._way is not None:
-                change, far = self._way.along(temperature)
-                gone, distance = gone + change, distance + far
+                on_way, far = self._way.along(temperature)
+                change, distance = change + on_way, distance + far
             else:
-                gone[:], distance[:] = self._gone(self._time)
+                change[:], distance[:] = self._bias_change(self._time)
         calibration = used.self_calibration
-        rate = np.asarray(result.rate) - gone * (
+        rate = np.asarray(result.rate) - change * (
             1.0 if calibration is None else calibration.scale)
         still = self._stills(time, output, result, distance)
         found[:, :5] = tracker.follow(
@@ -628,13 +628,13 @@ class HeadingEstimator:
 
         Returns
         -------
-        '', or what the table said since the last call
+        '', or the message of the table since the last call
 
         """
-        said, self._table_said = self._table_said, ''
+        message, self._table_message = self._table_message, ''
         while len(self._pending) > (self.tracker.resting and not ending):
-            said = self._teach(self._pending.popleft(), now) or said
-        return said
+            message = self._add_to_table(self._pending.popleft(), now) or message
+        return message
 
     def _end_rest(self) -> None:
         for each in self._pending:
@@ -643,32 +643,33 @@ class HeadingEstimator:
     def _learn_at_rest(self, now: float) -> None:
         """Teach the table as soon as the next stretch is complete; `learn` may come later."""
         while len(self._pending) > 1 and self.tracker.resting:
-            self._table_said = self._teach(self._pending.popleft(), now) or self._table_said
+            message = self._add_to_table(self._pending.popleft(), now)
+            self._table_message = message or self._table_message
 
-    def _teach(self, stretch: _Stretch, now: float) -> str:
+    def _add_to_table(self, stretch: _Stretch, now: float) -> str:
         bias, temperature = stretch.mean()
         variance = self.used.noise.angle_random_walk ** 2 / STRETCH
         expected, deviation = self._believed(temperature, stretch.seen)
         if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
             return ''
-        said = self.table.add(temperature, bias, variance, now)
+        message = self.table.add(temperature, bias, variance, now)
         if (self._way is not None and self.tracker.resting and not stretch.over
                 and abs(temperature - self._way.begin) > _AWAY):
             self._begin(now)
-        return said
+        return message
 
     def _believed(self, temperature: float, seen: Array) -> tuple[float, float]:
         """
         Return bias at a temperature and its standard deviation by the tracker as it is now, rad/s.
 
-        It is that after the model and before the self-calibration. When a stretch is judged, its
+        It is that after the model and before the self-calibration. When a stretch is examined, its
         rest may be over, and the temperature may have changed.
 
         """
         calibration = self.used.self_calibration or SelfCalibration()
-        gone = self._shift + (0.0 if self._way is None else self._way.at(temperature)[0])
+        change = self._shift + (0.0 if self._way is None else self._way.at(temperature)[0])
         off, deviation = self.tracker.bias_by(seen)
-        return calibration.bias + gone + off / calibration.scale, deviation / calibration.scale
+        return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 
     def missing(self, brought: Collection[str]) -> list[str]:
         """Return the channels that the model looks at and no message brings."""
@@ -676,6 +677,6 @@ class HeadingEstimator:
                 if self.used.looks_at(channel) and channel not in brought]
 
 
-def _unheard(late: float) -> float:
-    """Return how far a temperature that has not been heard for some time, s, may have gone, K."""
+def _drifted_unseen(late: float) -> float:
+    """Return how far a temperature may have drifted while none came for some time, s, in K."""
     return min(max(late, 0.0) * _LOST_RATE, _LOST)

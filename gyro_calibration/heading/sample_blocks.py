@@ -128,7 +128,7 @@ class EvenSamples:
         return np.asarray(np.add.reduceat(values, self.begins))
 
     def moved(self, number: int) -> Sequence[bool | None]:
-        """Return what the wheels said in a block."""
+        """Return what is known of the wheels in a block."""
         wheels = self._given.wheels
         return () if wheels is None else wheels[self._first + self.begins[number]:
                                                 self._first + self.ends[number]]

@@ -39,9 +39,9 @@ _SAMPLES = 8
 #: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
 #: of the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
-#: A robot that nobody saw yet: so many rests and straight ways that pass for rests, so much
-#: scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for so
-#: long, s.
+#: What is assumed of a robot at first: so many rests and straight ways that pass for rests, so
+#: much scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for
+#: so long, s.
 _RESTS, _STRAIGHT, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
 #: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
 #: squared standard deviations.
@@ -276,7 +276,7 @@ class StraightWays:
 
 
 @dataclass
-class DoubtfulTurn:
+class SlowTurn:
     """
     A turn that was seen late, and is so slow that the bias may have moved instead.
 

@@ -32,13 +32,13 @@ from gyro_calibration.heading.stationary import (
     BEGINS,
     BLOCK,
     Block,
-    DoubtfulTurn,
     Energy,
     LAGS,
     most_scatter,
     SCATTER_MOST,
     SCATTERED,
     sigmas,
+    SlowTurn,
     Snapshot,
     StraightWays,
     WINDOW,
@@ -56,14 +56,14 @@ _STEP = 1.0
 _FAR = 4.0
 #: A rest that is over sooner was none, s.
 _BRIEF = 2.0
-#: While the wheels stand, nobody turns the robot, and the bias may have moved by so much, rad/s.
+#: While the wheels stand, the robot does not turn, and the bias may have moved by so much, rad/s.
 _UNSEEN = 0.2 * DEGREE
 #: Noise of the samples counts from this factor over that of the model on; a mean may be off by so
 #: much more, for noise figures are not better known.
 _ALLOWED = 1.25
 #: A steady turn slower than so many times the slowest that is noticed may be a bias that moved;
 #: it is taken for one after so long, s.
-_DOUBTFUL, _DECIDED = 1.5, 2.0 * LAGS[-1]
+_SLOW_TURN, _DECIDED = 1.5, 2.0 * LAGS[-1]
 #: Where rests are looked for anew, a pending correction waits so much longer, s, until a rest that
 #: goes on is found again.
 _RECOGNIZED = 1.0
@@ -141,7 +141,7 @@ class HeadingTracker:
         self.renewed = list[tuple[int, Drift]]()
         self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
         self._known: float | None = None
-        self._doubt: DoubtfulTurn | None = None
+        self._slow: SlowTurn | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
         self._ways, self.outliers, self._taken = StraightWays(), 0, 0
@@ -214,10 +214,10 @@ class HeadingTracker:
         self._settle()
         self.heading = self.deleted = 0.0
         self._drift = self._drift.turned_to(0.0)
-        if self._doubt:
+        if self._slow:
             # if the robot has stood since, it had this direction then
-            self._doubt.before = replace(
-                self._doubt.before, drift=self._doubt.before.drift.turned_to(0.0), deleted=0.0)
+            self._slow.before = replace(
+                self._slow.before, drift=self._slow.before.drift.turned_to(0.0), deleted=0.0)
         self._take()
         if self.resting:
             self._rest()
@@ -226,7 +226,7 @@ class HeadingTracker:
         """Go back to a heading, rad, with its variance, rad²; the bias stays."""
         self._settle()
         self._recognize()
-        self.heading, self._doubt = heading, None
+        self.heading, self._slow = heading, None
         self._drift = self._drift.turned_to(heading, variance)
         self._take()
 
@@ -493,7 +493,7 @@ class HeadingTracker:
         self._block, self._driven = Block(), False
 
     def _judge(self, quiet: bool | None, wheels: bool | None) -> None:
-        """Decide at the end of a block; one that cannot yet be told from a rest ends none."""
+        """Decide at the end of a block; one that may still be a rest ends none."""
         part, self._part, self._known = self._part, self._none(), None
         self._open += part
         if self.resting:
@@ -504,7 +504,7 @@ class HeadingTracker:
                 self._compare(wheels)
             return
         if not quiet or wheels:
-            self._wanted, self._doubt = WINDOW, None
+            self._wanted, self._slow = WINDOW, None
         if wheels:
             # an even turn has no more energy than a rest: nothing is held back while wheels move
             self._move(WINDOW)
@@ -546,21 +546,21 @@ class HeadingTracker:
         otherwise make the heading drift at rest for ever.
 
         """
-        doubt, held = self._doubt, self._at_rest(self._held)
-        if doubt is None:
+        slow, held = self._slow, self._at_rest(self._held)
+        if slow is None:
             return False
-        start = doubt.before.drift.uncertain(WALK, doubt.rate ** 2)
-        moved = start.rested(self._at_rest(doubt.turn))
-        if (doubt.turn.duration + held.duration < _DECIDED
+        start = slow.before.drift.uncertain(WALK, slow.rate ** 2)
+        moved = start.rested(self._at_rest(slow.turn))
+        if (slow.turn.duration + held.duration < _DECIDED
                 or abs(self._surprise(moved, held)) > self._sigmas[self._wanted]):
-            doubt.turn += held
+            slow.turn += held
             return False
         if self._keep:
             assert self._last is not None
-            del self.steps[doubt.before.steps:]
-            self.steps.append(Step(start, self._at_rest(doubt.turn), True,
+            del self.steps[slow.before.steps:]
+            self.steps.append(Step(start, self._at_rest(slow.turn), True,
                                    self._last[0] - self._part.duration - held.duration))
-        self._drift, self._open, self._doubt = moved, self._held, None
+        self._drift, self._open, self._slow = moved, self._held, None
         self._rest()
         self._take()
         return True
@@ -646,7 +646,7 @@ class HeadingTracker:
         if self._rested.duration < _BRIEF - CLOSE:
             before = self._snapshots[0]
         turn = self._rested - before.turn
-        self._doubt = (self._doubtful(before, turn) if lag >= LAGS[0] and not scattered else None)
+        self._slow = (self._slow_turn(before, turn) if lag >= LAGS[0] and not scattered else None)
         if self._snapshots[-1].means:
             self._ways.learn(self._snapshots[-1])
         self._drift, self.deleted, self._open = before.drift, before.deleted, turn
@@ -654,20 +654,20 @@ class HeadingTracker:
         self._move(max(lag, WINDOW))
         self._advance()
 
-    def _doubtful(self, before: Snapshot, turn: Turn) -> DoubtfulTurn | None:
+    def _slow_turn(self, before: Snapshot, turn: Turn) -> SlowTurn | None:
         """Return what was noticed, where it is so slow that the bias may have moved."""
         longest = replace(self._nothing, duration=LAGS[-1])
         least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
         rate = (turn.turned - before.drift.expected(turn)[0]) / turn.duration
-        return (DoubtfulTurn(before, rate, turn + self._nothing) if abs(rate) < _DOUBTFUL * least
+        return (SlowTurn(before, rate, turn + self._nothing) if abs(rate) < _SLOW_TURN * least
                 else None)
 
     def _restart(self, interval: float, fastest: float, unseen: bool) -> str:
         """
         Begin anew after a gap or a jump back, over which nothing is integrated.
 
-        Where nothing saw that the robot stood, it may have turned to any direction meanwhile, also
-        from one rest to another. The stamps do not tell how much time a jump back hides.
+        Where the robot is not known to have stood, it may have turned to any direction meanwhile,
+        also from one rest to another. The stamps do not tell how much time a jump back hides.
 
         """
         self._settle()
@@ -761,7 +761,7 @@ class HeadingTracker:
         covariance, age = self._calibrated
         self._begin(self._claimed, np.nan_to_num(covariance), heading, variance + math.tau ** 2,
                     age)
-        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._doubt = (
+        self.heading, self.rate, self.deleted, self._hesitates, self._still, self._slow = (
             heading, 0.0, 0.0, 0.0, None, None)
         if self._last is not None:
             self._last = (*self._last[:3], np.zeros(len(covariance)))

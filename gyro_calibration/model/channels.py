@@ -133,7 +133,7 @@ class _Piece:
         return branch
 
     def ended(self) -> Known:
-        """Return what the next piece has to know, also of lags that nobody asked for now."""
+        """Return what the next piece has to know, also of lags that were not asked for now."""
         for key in self._state.keys() - self._ended.keys():
             (self.heating if key[0] == 'heating' else self.ahead)(*key[-2:])
         return self._ended

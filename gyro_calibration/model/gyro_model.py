@@ -150,7 +150,7 @@ class SelfCalibration:
 @dataclass(frozen=True)
 class Tolerance:
     """
-    What a rate may be off by beside the covariance of the values: standard deviations.
+    What a rate may be off by beyond the covariance of the values: standard deviations.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class GyroModel:
     gyro : name, serial_number, technology, as text
     origin : files, date and program that it comes from
     self_calibration : the last one
-    tolerance : what a rate may be off by beside the covariance
+    tolerance : what a rate may be off by beyond the covariance
 
     """
 
@@ -206,10 +206,10 @@ class GyroModel:
 
     def steepness(self, channels: Channels) -> Number:
         """Return the derivative of rate plus error by the rate, 1; at least 0.1 (see `rate`)."""
-        sought = self._parted_by_rate[1]
+        sought = self._terms_by_rate[1]
         if not sought:
             return 1.0
-        # rad/s; small beside what bends an effect, and large beside the rounding of its error
+        # rad/s; small against what bends an effect, and large against the rounding of its error
         step = 1e-5
         below, above = (_sum(sought, channels.moving(channels.rate + change, channels.output))
                         for change in (-step, step))
@@ -291,7 +291,7 @@ class GyroModel:
 
     def _monotone(self, centre: float, side: float) -> float:
         """Return how far from a rate to one side the output grows with the rate, rad/s."""
-        _, sought = self._parted_by_rate
+        _, sought = self._terms_by_rate
         low, high = self.used_temperatures
         distances = self.rate_limit / _FLATTEST * np.geomspace(1e-6, 1.0, 160)
 
@@ -345,7 +345,7 @@ class GyroModel:
 
     def output_in(self, channels: Channels) -> Number:
         """Return the output, rad/s, without noise, at the rate and surroundings of channels."""
-        rate, (known, sought) = channels.rate, self._parted_by_output
+        rate, (known, sought) = channels.rate, self._terms_by_output
         given = rate + _sum(known, channels)
         return (_repeated(lambda output: given + _sum(sought, channels.moving(rate, output)),
                           rate)[0] if sought else given)
@@ -367,7 +367,7 @@ class GyroModel:
         the correction at the end of the domain is held there.
 
         """
-        output, (known, sought) = channels.output, self._parted_by_rate
+        output, (known, sought) = channels.output, self._terms_by_rate
         given = output - _sum(known, channels)
         if not sought:
             return given, False
@@ -396,19 +396,19 @@ class GyroModel:
         return time
 
     @cached_property
-    def _parted_by_output(self) -> Parted:
-        return _parted(self.terms, 'output')
+    def _terms_by_output(self) -> Split:
+        return _split(self.terms, 'output')
 
     @cached_property
-    def _parted_by_rate(self) -> Parted:
-        return _parted([term for term in self.terms if not term.effect.undone], 'rate')
+    def _terms_by_rate(self) -> Split:
+        return _split([term for term in self.terms if not term.effect.undone], 'rate')
 
 
 #: Effects that do not look at what is sought, which need no repetition to solve for it; others.
-Parted = tuple[list[Term], list[Term]]
+Split = tuple[list[Term], list[Term]]
 
 
-def _parted(terms: Sequence[Term], channel: str) -> Parted:
+def _split(terms: Sequence[Term], channel: str) -> Split:
     known = [term for term in terms if channel not in term.effect.looks_at]
     return known, [term for term in terms if channel in term.effect.looks_at]
 

@@ -96,10 +96,10 @@ class Noise:
         constants, of_each = self.flicker()
         for constant in constants:
             within, shared = known_mean(constant)
-            gone = constant * (1.0 - np.exp(-duration / constant))
-            variance = variance + of_each * (2.0 * constant * (duration - gone)
+            decayed = constant * (1.0 - np.exp(-duration / constant))
+            variance = variance + of_each * (2.0 * constant * (duration - decayed)
                                              + duration ** 2 * within
-                                             - 2.0 * duration * gone * shared)
+                                             - 2.0 * duration * decayed * shared)
         return variance
 
     def heading_variance(self, duration: Number) -> Number:
@@ -116,8 +116,8 @@ def known_mean(constant: Number) -> tuple[Number, Number]:
 
     """
     ratio = CALIBRATED / constant
-    gone = 1.0 - np.exp(-ratio)
-    return 2.0 * (ratio - gone) / ratio ** 2, gone / ratio
+    decayed = 1.0 - np.exp(-ratio)
+    return 2.0 * (ratio - decayed) / ratio ** 2, decayed / ratio
 
 
 def increment_covariance(noise: Noise, edges: Array) -> Array:

@@ -260,7 +260,7 @@ class Pipeline:
         time = self._time(stamp)
         if time - self._last > TEMPERATURE_TIMEOUT and self._last > -math.inf:
             time = self._last
-        self.estimator.hear_temperature(time, value)
+        self.estimator.take_temperature(time, value)
         refused = self.estimator.refused_temperatures
         if refused > self.journal.counts['refused_temperatures']:
             self.journal.counts['refused_temperatures'] = refused

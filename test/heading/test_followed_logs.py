@@ -110,7 +110,7 @@ def test_a_log_has_the_heading_of_single_samples_also_where_it_warms_up(calibrat
     expected = np.empty((len(time), 6))
     for place, (at, degc) in enumerate(zip(time.tolist(), temperature.tolist())):
         if degc == degc:
-            single.hear_temperature(at, degc)
+            single.take_temperature(at, degc)
         single.add(at, float(output[place]), NOW + at)
         tracker = single.tracker
         expected[place] = (tracker.heading, tracker.variance, single.rate, tracker.rate_variance,

@@ -45,7 +45,7 @@ def begun(model=MODEL, table=None, assumptions=None, settings=None, now=NOW, tem
     live = HeadingEstimator(model, table or BiasTable(model), assumptions or Assumptions(),
                             settings or Settings(), 10.0, now)
     if temperature is not None:
-        live.hear_temperature(0.0, temperature)
+        live.take_temperature(0.0, temperature)
     return live
 
 
@@ -67,7 +67,7 @@ class Gyro:
         for degc, wandering in zip(known, noise):
             self.time += INTERVAL
             if temperature is not None:
-                self.live.hear_temperature(self.time, degc)
+                self.live.take_temperature(self.time, degc)
             offset = self._bias + self._coefficient * (0.0 if temperature is None else degc - 25.0)
             now = self.now + self.time
             self.said.append(self.live.add(self.time, rate + offset + wandering, now,
@@ -333,7 +333,7 @@ def test_the_longer_no_temperature_came_since_a_calibration_the_less_its_bias_is
         gyro.live.use(MODEL, gyro.now + gyro.time)
         gyro.live.add(gyro.time + seconds, 0.0, NOW)
         known.append(gyro.live.bias_variance)
-        gyro.live.hear_temperature(gyro.time + seconds + INTERVAL, 25.0)
+        gyro.live.take_temperature(gyro.time + seconds + INTERVAL, 25.0)
         gyro.live.add(gyro.time + seconds + INTERVAL, 0.0, NOW)
         assert gyro.live.bias_variance == pytest.approx(known[-1], rel=0.01)
     assert known[0] < 1.1 * (0.01 * DEGREE) ** 2 and 9.0 * known[0] < known[1] < known[2]
@@ -359,7 +359,7 @@ def test_a_temperature_that_comes_no_more_is_less_and_less_known_on_either_side(
     live, known = begun(), []
     for second in range(0, 1200, 60):
         if second < 120:
-            live.hear_temperature(second, 25.0 + away * (second > 0))
+            live.take_temperature(second, 25.0 + away * (second > 0))
         live.add(second, 0.0, NOW + second)
         known.append(live.bias_variance)
     assert (np.diff(known) >= 0.0).all() and known[-1] > known[1]
@@ -374,7 +374,7 @@ def test_what_is_claimed_of_the_bias_has_followed_the_temperature(known):
     live.use(MODEL, NOW)
     assert live.claimed.bias == pytest.approx(CALIBRATED.bias)
     for index in range(100):
-        live.hear_temperature(INTERVAL * index, 35.0)
+        live.take_temperature(INTERVAL * index, 35.0)
         live.add(INTERVAL * index, 0.4 * DEGREE, NOW)
     warm = replace(CALIBRATED, bias=0.4 * DEGREE, temperature=35.0)
     assert (not changed(live.claimed, warm, NOISE, 300.0)
