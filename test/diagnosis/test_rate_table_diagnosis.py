@@ -19,7 +19,7 @@ import runpy
 from gyro_calibration.calibration.dwells import join
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.scatter import rms, Scatter
-from gyro_calibration.diagnosis import dwell_structure
+from gyro_calibration.diagnosis import dwell_fit
 from gyro_calibration.diagnosis import rate_table as diagnosis
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.logs.log import DataRefused, DEGREE, Log
@@ -244,11 +244,11 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     table = replace(table, output=table.output + 0.03 * DEGREE * np.sin(6.0 * table.rate + 1.0))
     fit = fit_effects(table, [term.effect for term in LINEAR])
     certain = np.zeros((np.count_nonzero(fit.scatter.kept), 1))
-    probes = dwell_structure._probes(table)
-    found = dwell_structure.what_is_left(fit, 1e-3, certain).found[0]
-    monkeypatch.setattr(dwell_structure, '_probes',
+    probes = dwell_fit._probes(table)
+    found = dwell_fit.what_is_left(fit, 1e-3, certain).found[0]
+    monkeypatch.setattr(dwell_fit, '_probes',
                         lambda dwells: {found.along: probes[found.along]})
-    alone = dwell_structure.what_is_left(fit, 1e-3, certain).found[0]
+    alone = dwell_fit.what_is_left(fit, 1e-3, certain).found[0]
     tried = sum(columns.shape[1] > 0 for columns in probes.values())
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 
