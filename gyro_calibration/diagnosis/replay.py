@@ -213,7 +213,7 @@ class Replay:
     place : number of each kept sample on the even grid
     interval : of the grid, s
     every : so many points of the grid are averaged into one
-    filling : white noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
+    filling : noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
     rounded : step of the heading that the reference is the derivative of, rad; 0 where it has none
     has : names of the channels that the log has
     added : what the simulation adds to the rate, rad/s, shape (n,); `channels.output` is without
@@ -270,6 +270,14 @@ class Replay:
             whole[lost] += filling * self.filling[lost]
         whole = whole[:self.points * self.every]
         return whole.reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
+
+    @property
+    def bridged(self) -> Mask:
+        """Mark points of the grid that have lost samples in them or beside, shape (points,)."""
+        lost = np.ones(int(self.place[-1]) + 1, dtype=bool)
+        lost[self.place] = False
+        of_points = lost[:self.points * self.every].reshape(-1, self.every).any(axis=1)
+        return np.asarray(maximum_filter1d(of_points, 3))
 
     def noisy(self, values: Array) -> Array:
         """Return the cosine transform of a residual; bridges get the white noise of the rest."""
@@ -336,7 +344,11 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
                     if getattr(log, name) is not None)
     rounded = step if shown.reference_rate is None else 0.0
-    filling = generator.standard_normal(place[-1] + 1)
+    filling = generator.standard_normal(place[-1] + 2)
+    white, whole = (white_noise((log.output - rate)[kept]) for rate in (smooth, reference))
+    # the error that a rounded heading leaves does not grow across a gap
+    own = min(white / whole, 1.0) if rounded and whole else 1.0
+    filling = own * filling[1:] + math.sqrt((1.0 - own ** 2) / 2.0) * np.diff(filling)
     foreseen = _rounding(log.output, smooth, kept, codes) if codes else np.zeros(len(time))
     coarse = max(codes ** 2 / 12.0 - float(np.var(foreseen[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place,

@@ -77,7 +77,7 @@ def _lagged(signal: Array, time: Array, time_constant: float) -> Array:
 
 BANDWIDTH = Effect(
     'bandwidth', 'The output follows the rate through a first-order lag.',
-    frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-5, 10.0)),),
+    frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-7, 10.0)),),
     _FAST_REVERSALS, distortion=_lagged, stage='rate',
     undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
 
