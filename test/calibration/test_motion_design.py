@@ -275,7 +275,7 @@ def test_the_verb_speaks_to_people(run, limits, tmp_path, monkeypatch):
     code, text, _ = run('plan', '--limits', limits(), '--seconds', 10,
                         '--motion', tmp_path / 'drive.csv', '--drive', 30)
     assert (code == 0 and 'planned, 12 s:' in text and 'heading over 30 s' in text
-            and text.count('mean heading error') == 4)
+            and text.count('mean heading error') == 5)
 
 
 WRONG = {

@@ -147,7 +147,7 @@ def test_as_many_values_as_dwells_are_fitted_but_nothing_says_how_sure_they_are(
      'record '
      'temperature_degc'),
     ('0,0.1\n10,10\n', ['--polynomial', '3,0'], 1, '2 dwells do not determine 4 values'),
-    ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is no effect"),
+    ('0,0.1\n10,10\n', ['--effects', 'bias,charm'], 2, "'charm' is an unknown effect"),
     ('0,0.1\n10,10\n', ['--polynomial', '3'], 2, 'is not two orders'),
     ('0,0.1\n10,10\n', ['--polynomial', '3,2', '--effects', 'bias'], 2, 'not allowed with'),
     ('0,0.1\n10,10\n', ['--method', 'likelihood'], 1, 'no reference heading'),

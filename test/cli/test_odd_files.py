@@ -287,8 +287,8 @@ STORED = 'self_calibration: {scale_factor_error: 0.2, bias: 0.3}\n'
 
 
 @pytest.mark.parametrize('model, calibration, hint', [
-    ('', 'effects: {}\n', 'holds none'),
-    ('effects: {}\n' + STORED, 'effects: {}\n', 'holds none'),
+    ('', 'effects: {}\n', 'the file has none'),
+    ('effects: {}\n' + STORED, 'effects: {}\n', 'the file has none'),
     ('', 'effects: {}\nself_calibration:\n  scale_factor_error: 0.1\n', 'self_calibration.bias'),
     ('', '', 'the file'),
 ])

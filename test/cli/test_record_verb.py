@@ -172,7 +172,7 @@ def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
         notes, before = read(tmp_path / 'a.csv').notes, (tmp_path / 'a.csv').read_bytes()
         assert 'inverted: no' in notes and not any('sensitivity' in note for note in notes)
         code, _, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
-    assert (code == 2 and 'is there already' in error
+    assert (code == 2 and 'exists already' in error
             and (tmp_path / 'a.csv').read_bytes() == before)
 
 
