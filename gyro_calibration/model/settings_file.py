@@ -26,6 +26,7 @@ import reprlib
 from typing import Any
 
 from gyro_calibration.files import LARGEST, plain, read_bytes
+import numpy as np
 import yaml
 
 #: Bytes of such a file: a model with the covariance of 150 values has half of it.
@@ -207,6 +208,10 @@ def _number(dumper: Any, value: float) -> Any:
     return yaml.SafeDumper.represent_float(dumper, value)
 
 
+def _numpy_scalar(dumper: Any, value: np.generic) -> Any:
+    return dumper.represent_data(float(value) if isinstance(value, np.floating) else value.item())
+
+
 def _refuse(problem: str, at: Any) -> None:
     raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
 
@@ -231,6 +236,7 @@ _KINDS: dict[str, tuple[str, list[str], Any]] = {
 }
 _Dumper.add_representer(str, _Dumper.represent_str)
 _Dumper.add_representer(float, _number)
+_Dumper.add_multi_representer(np.generic, _numpy_scalar)
 for _name, (_pattern, _first, _constructor) in _KINDS.items():
     _tag = f'tag:yaml.org,2002:{_name}'
     _Loader.add_constructor(_tag, _constructor)

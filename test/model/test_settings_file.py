@@ -16,6 +16,7 @@ import time
 
 from gyro_calibration.files import read_bytes
 from gyro_calibration.model.settings_file import read_settings, settings_text
+import numpy as np
 import pytest
 
 LAUGHS = 'a0: &a0 [ha, ha]\n' + ''.join(f'a{i + 1}: &a{i + 1} [*a{i}, *a{i}, *a{i}]\n'
@@ -82,6 +83,14 @@ def test_texts_are_read_back_whatever_they_look_like(tmp_path):
                'yes': [[], {}, None, True, -1, 1e22]}
     content['again'] = content['texts']
     assert read_settings(written(tmp_path, settings_text(content))) == content
+
+
+def test_numbers_of_numpy_are_written_as_those_of_python(tmp_path):
+    content = {'a': [np.float64(1e-7), np.float32(0.5), np.longdouble(2.0), np.int64(3), np.True_]}
+    assert read_settings(written(tmp_path, settings_text(content))) == {
+        'a': [1e-7, 0.5, 2.0, 3, True]}
+    with pytest.raises(ArithmeticError):
+        settings_text({'a': np.float64(math.nan)})
 
 
 @pytest.mark.parametrize('path', ['pipe', '/dev/zero', '/dev/null', '/dev/tty', '.', 'missing'])
