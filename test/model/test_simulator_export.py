@@ -154,7 +154,8 @@ def test_the_verb_writes_a_file_and_lists_what_is_missing(run, tmp_path):
 
 
 @pytest.mark.parametrize(('arguments', 'wanted'), [
-    (('--to', 'unity'), 'invalid choice'), (('--to', 'sdf', '--span', '0.001'), 'is shorter than two samples'),
+    (('--to', 'unity'), 'invalid choice'),
+    (('--to', 'sdf', '--span', '0.001'), 'is shorter than two samples'),
     (('--to', 'sdf', '--sample-rate', '0'), 'is out of range')])
 def test_a_wrong_use_is_answered_in_a_sentence(run, tmp_path, arguments, wanted):
     (tmp_path / 'model.yaml').write_text(GYRO)
