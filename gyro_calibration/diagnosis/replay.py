@@ -213,7 +213,7 @@ class Replay:
     place : number of each kept sample on the even grid
     interval : of the grid, s
     every : so many points of the grid are averaged into one
-    filling : noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
+    filling : white noise of variance 1 for lost points of the grid, shape (place[-1] + 1,)
     rounded : step of the heading that the reference is the derivative of, rad; 0 where it has none
     has : names of the channels that the log has
     added : what the simulation adds to the rate, rad/s, shape (n,); `channels.output` is without
@@ -268,20 +268,35 @@ class Replay:
             lost = np.ones(len(whole), dtype=bool)
             lost[self.place] = False
             whole[lost] += filling * self.filling[lost]
+        return self._averaged(whole)
+
+    def _averaged(self, whole: Array) -> Array:
         whole = whole[:self.points * self.every]
         return whole.reshape(-1, self.every).mean(axis=1) if self.every > 1 else whole
 
-    @property
-    def bridged(self) -> Mask:
-        """Mark points of the grid that have lost samples in them or beside, shape (points,)."""
-        lost = np.ones(int(self.place[-1]) + 1, dtype=bool)
-        lost[self.place] = False
-        of_points = lost[:self.points * self.every].reshape(-1, self.every).any(axis=1)
-        return np.asarray(maximum_filter1d(of_points, 3))
+    def _rounding(self) -> Array:
+        """Return what rounding adds to the reference, rad/s, also where no output is kept."""
+        rows = np.flatnonzero(self.kept)
+        rows = np.arange(rows[0], rows[-1] + 1)
+        at = np.interp(rows, np.flatnonzero(self.kept), self.place)
+        added = (self.reference - self.channels.rate)[rows]
+        known = np.isfinite(added) & (at == np.rint(at))
+        whole = np.zeros(int(self.place[-1]) + 1)
+        whole[at[known].astype(int)] = added[known]
+        return self._averaged(whole)
 
     def noisy(self, values: Array) -> Array:
-        """Return the cosine transform of a residual; bridges get the white noise of the rest."""
-        return transform(self.on_grid(values, white_noise(values[self.kept])))
+        """
+        Return the cosine transform of a residual; bridges get the white noise of the rest.
+
+        The error of a rounded heading is bounded. A bridge would carry what it has at the ends of
+        a gap on as a jump, so it is taken from the reference, which has no gap there.
+
+        """
+        if not self.rounded:
+            return transform(self.on_grid(values, white_noise(values[self.kept])))
+        smooth = values + (self.reference - self.channels.rate)
+        return transform(self.on_grid(smooth, white_noise(smooth[self.kept])) - self._rounding())
 
     def coefficients(self, values: Array) -> Array:
         """Return the cosine transform of samples on the even grid, shape (points - 1,)."""
@@ -344,11 +359,7 @@ def replay(log: Log, trusted: Mask, generator: np.random.Generator, update: floa
     has = frozenset(name for name in ('temperature', 'specific_force', 'supply')
                     if getattr(log, name) is not None)
     rounded = step if shown.reference_rate is None else 0.0
-    filling = generator.standard_normal(place[-1] + 2)
-    white, whole = (white_noise((log.output - rate)[kept]) for rate in (smooth, reference))
-    # the error that a rounded heading leaves does not grow across a gap
-    own = min(white / whole, 1.0) if rounded and whole else 1.0
-    filling = own * filling[1:] + math.sqrt((1.0 - own ** 2) / 2.0) * np.diff(filling)
+    filling = generator.standard_normal(place[-1] + 1)
     foreseen = _rounding(log.output, smooth, kept, codes) if codes else np.zeros(len(time))
     coarse = max(codes ** 2 / 12.0 - float(np.var(foreseen[kept])), 0.0)
     plain = Replay(replace(channels, output=log.output - foreseen), reference, kept, place,
@@ -521,15 +532,17 @@ def _corners(rate: Array, output: Array, kept: Mask, rounding: float) -> Mask:
     """
     Return where the rate of a heading bends too sharply to be known from samples, shape (n,).
 
-    A spline through the heading and the integral of the output by trapezoids differ by a twelfth
-    of the second difference of the rate. Where a motion begins or ends, that passes for a dead
-    zone or for a slip. A reference that bends everywhere is noise, and is left to its treatment;
-    steps of a heading alone do not bend its rate by six times `rounding`, step over interval.
+    At a kink of the rate a spline through the heading and the integral of the output by trapezoids
+    differ by a twelfth of the second difference, which is a 24th of the fourth; where a motion
+    begins or ends, that passes for a dead zone or for a slip. Of a smooth motion, which splines
+    follow, the fourth difference is small, however fast it accelerates. A reference that bends
+    everywhere is noise, and is left to its treatment; steps of a heading alone do not make a
+    fourth difference of 24 times `rounding`, step over interval.
 
     """
-    bend = np.abs(np.diff(rate, 2, prepend=rate[:1], append=rate[-1:])) / 12.0
+    bend = np.abs(np.diff(np.pad(rate, 2, mode='edge'), 4)) / 24.0
     white = white_noise((output - rate)[kept])
-    sharp = maximum_filter1d(bend > _BENT * white + 0.5 * rounding, 5)
+    sharp = maximum_filter1d(bend > _BENT * white + rounding, 5)
     rounded = rounding ** 2 / 12.0 > 0.5 * white ** 2  # most of what looks white is of the steps
     return np.zeros_like(sharp) if rounded or sharp[kept].mean() > _FEW_CORNERS else sharp
 

@@ -351,8 +351,7 @@ def slips(done: Fitted) -> list[_First]:
     for run in _runs(done, 'reference_slip'):
         each, white, factor = done.problem.replays[run], left[run], divided[run]
         acceleration = np.abs(np.gradient(each.on_grid(each.channels.rate), each.step))
-        # across lost samples a jump of the reference is one of the bridge
-        moments = np.flatnonzero((acceleration > 0.2 * acceleration.max()) & ~each.bridged)
+        moments = np.flatnonzero(acceleration > 0.2 * acceleration.max())
         if acceleration.max() > 0.0 and len(moments):
             tried = [_slipped(each, run, white, factor, moments, max(width, 0.5 * each.step))
                      for width in WIDTHS]
