@@ -35,22 +35,29 @@ class RosTime:
 
     Attributes
     ----------
-    standing : for how long it has stood still, s of the steady clock; 0 where it is not simulated
+    standing : for how long it has stood still, s of the steady clock; 0 where it is not
+        simulated, and inf before a simulation starts
 
     """
 
     def __init__(self) -> None:
         """Begin with nothing seen."""
         self.standing = 0.0
-        self._last, self._changed = -1.0, 0.0
+        self._last: float | None = -1.0
+        self._changed = self._polled = 0.0
 
-    def poll(self, clock: Clock) -> float:
-        """Compare with the last poll, and return `standing`; inf before a simulation starts."""
+    def poll(self, clock: Clock) -> None:
+        """
+        Compare with the last poll; by one timer.
+
+        Only the time up to that poll counts: after a pause of this process, the messages of
+        /clock that wait in its queue come after its timers.
+        """
         now, time = clock.steady(), clock.simulated()
-        if time is not None and time != self._last:
-            self._last, self._changed = time, now
+        if time != self._last:
+            self._last, self._changed, self._polled = time, now, now
         if time is None:
             self.standing = 0.0
         else:
-            self.standing = now - self._changed if time else math.inf
-        return self.standing
+            self.standing = self._polled - self._changed if time else math.inf
+        self._polled = now

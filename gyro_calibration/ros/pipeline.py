@@ -457,7 +457,7 @@ class Pipeline:
     def obstacle(self) -> str:
         """Return why the robot must not be driven now; '' where nothing stands against it."""
         now = self._clock.steady()
-        if self.ros_time.poll(self._clock) > BLIND:
+        if self.ros_time.standing > BLIND:
             return STANDING_TIME
         if conflict := self.conflict or self.several:
             return conflict
@@ -486,10 +486,10 @@ class Pipeline:
 
     def watch(self, receivers: int) -> None:
         """Check that time and samples advance; to be called several times a second."""
-        standing = self.ros_time.poll(self._clock) > BLIND
+        self.ros_time.poll(self._clock)
         # A robot is not driven by samples that may be those of another gyro in a moment.
         conflict = self.conflict or (self.several if self.session.drives else '')
-        self.session.watch(self.values, receivers, standing, conflict)
+        self.session.watch(self.values, receivers, self.ros_time.standing > BLIND, conflict)
 
     def learn(self, ending: bool = False) -> None:
         """Let the bias table learn from rests; to be called once a second, and at the end."""

@@ -241,9 +241,12 @@ def test_a_drive_goes_on_between_samples_that_are_rare_or_come_in_bursts(
     assert rig.stopped_after(begin) <= max(0.25, 4.0 * interval) + 2.1 * Drive.INTERVAL
 
 
-def test_a_pause_of_the_node_ends_no_drive_whose_samples_wait_behind_the_timers(tmp_path):
-    rig = rested(tmp_path, calibration_drive=True)
+@pytest.mark.parametrize('simulated', [{}, {'ros': 1000.0}], ids=['no /clock', '/clock'])
+def test_a_pause_of_the_node_ends_no_drive_whose_messages_wait_behind_the_timers(
+        tmp_path, simulated):
+    rig = rested(tmp_path, calibration_drive=True, **simulated)
     rig.drive_to()
+    rig.pipeline.watch(1)
     rig.clock.now += 0.4
     rig.pipeline.watch(1)
     rig.step()
@@ -277,6 +280,14 @@ def test_a_drive_does_not_begin_while_ros_time_stands(tmp_path, ros):
     rig.ros_speed = 0.0
     rig.go(2.0)
     assert 'ROS time stands still' in rig.begin() and not rig.commands
+
+
+def test_a_drive_begins_after_a_pause_of_the_node_though_the_clock_waits_behind_it(tmp_path):
+    rig = rested(tmp_path, calibration_drive=True, ros=1000.0)
+    rig.pipeline.watch(1)
+    rig.clock.now += 0.4
+    rig.pipeline.watch(1)
+    assert not rig.begin()
 
 
 def test_a_turn_that_only_the_gyro_shows_keeps_a_drive_from_beginning(tmp_path):
