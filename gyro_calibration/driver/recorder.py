@@ -32,7 +32,6 @@ import os
 from typing import Any
 
 from gyro_calibration import __version__
-from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.driver.protocols import Sample
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSUMED_NOISE
 from gyro_calibration.driver.timestamps import MessageClock
@@ -59,7 +58,7 @@ from gyro_calibration.logs.cdr import (
 )
 from gyro_calibration.logs.log import LogError
 from gyro_calibration.logs.recording import wrong_kind
-from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, Message
+from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, McapWriter, Message
 import numpy as np
 
 KINDS = '.csv', '.csv.gz', '.mcap'

@@ -12,8 +12,8 @@
 
 import io
 
-from gyro_calibration.driver.mcap_writer import McapWriter
 from gyro_calibration.logs.cdr import DEFINITIONS, IMU, RATE_Z, serialize, TEMPERATURE
+from gyro_calibration.logs.ros_bag import McapWriter
 import pytest
 
 NOTES = {'recorded by': 'a test', 'gyro': '12°'}
