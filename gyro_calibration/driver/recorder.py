@@ -19,7 +19,6 @@ piece, and none before the first. A file that is there already is never written 
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -37,6 +36,7 @@ from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE, ASSU
 from gyro_calibration.driver.timestamps import MessageClock
 from gyro_calibration.heading.gaps import Intervals
 from gyro_calibration.logs.cdr import (
+    along_z,
     DEFINITIONS,
     FORCE_COVARIANCE,
     FORCE_Z,
@@ -44,6 +44,7 @@ from gyro_calibration.logs.cdr import (
     IMU,
     LAYOUTS,
     MessageError,
+    NO_COVARIANCE,
     NOT_REPORTED,
     NSEC_PER_SEC,
     ODOMETRY,
@@ -54,10 +55,9 @@ from gyro_calibration.logs.cdr import (
     serialize,
     TEMPERATURE,
     TWIST,
-    UNMEASURED_VARIANCE,
 )
 from gyro_calibration.logs.log import LogError
-from gyro_calibration.logs.recording import wrong_kind
+from gyro_calibration.logs.recording import interpolated, wrong_kind
 from gyro_calibration.logs.ros_bag import ABOUT, MCAP_END, McapWriter, Message
 import numpy as np
 
@@ -184,23 +184,17 @@ class McapRecorder:
 
     def add_sample(self, stamp: int, sample: Sample) -> None:
         """Write a sample of a port as messages on the topics of the driver; the stamp is in ns."""
-        numbers = 37 * [0.0]
-        numbers[3], numbers[ORIENTATION_COVARIANCE] = 1.0, NOT_REPORTED
-        numbers[RATE_Z] = sample.output
-        other_axes = UNMEASURED_VARIANCE, UNMEASURED_VARIANCE
-        numbers[RATE_COVARIANCE:FORCE_Z - 2:4] = *other_axes, self.variance
-        if sample.specific_force is None:
-            numbers[FORCE_COVARIANCE] = NOT_REPORTED
-        else:
-            numbers[FORCE_Z] = sample.specific_force
-            numbers[FORCE_COVARIANCE::4] = *other_axes, ASSUMED_FORCE_NOISE ** 2
-        if sample.temperature is not None:
-            self._add_numbers('/imu/temperature', TEMPERATURE, stamp, [sample.temperature, 0.0])
-        self._add_numbers('/imu/data_raw', IMU, stamp, numbers)
-
-    def _add_numbers(self, topic: str, kind: str, stamp: int, numbers: Sequence[float]) -> None:
-        data = serialize(stamp, 'gyro', numbers)
-        self.add_message(Message(topic, kind, stamp, data), DEFINITIONS[kind])
+        force, temperature = sample.specific_force, sample.temperature
+        of_force = NO_COVARIANCE if force is None else along_z(ASSUMED_FORCE_NOISE ** 2)
+        messages = [] if temperature is None else [
+            ('/imu/temperature', TEMPERATURE, [temperature, 0.0])]
+        messages.append(('/imu/data_raw', IMU, [
+            0.0, 0.0, 0.0, 1.0, *NO_COVARIANCE,
+            0.0, 0.0, sample.output, *along_z(self.variance),
+            0.0, 0.0, force or 0.0, *of_force]))
+        for topic, kind, numbers in messages:
+            data = serialize(stamp, 'gyro', numbers)
+            self.add_message(Message(topic, kind, stamp, data), DEFINITIONS[kind])
 
     def add_message(self, message: Message, definition: str) -> None:
         """Write a message with the definition of its kind, as text."""
@@ -395,25 +389,15 @@ class _Reference:
 
     def at(self, times: Sequence[int]) -> list[dict[str, float]]:
         """Return the columns at some times: on the line between two values, nan where lost."""
-        stamps = [time for time, _, _ in self._known]
-        steps = np.diff(stamps[-256:])
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        longest = max(5.0 * usual, 0.1 * NSEC_PER_SEC) if len(steps) else 0.0
-        return [self._between(bisect_left(stamps, time), time, longest) for time in times]
-
-    def _between(self, after: int, time: int, longest: float) -> dict[str, float]:
-        if not self.names:
-            return {}
-        values: Sequence[float] = (np.nan, np.nan)
-        if after < len(self._known) and self._known[after][0] == time:
-            values = self._known[after][1:]
-        elif 0 < after < len(self._known):
-            (begin, *low), (end, *high) = self._known[after - 1], self._known[after]
-            share = (time - begin) / (end - begin)
-            values = [a + share * (b - a) if end - begin <= longest else np.nan
-                      for a, b in zip(low, high)]
-        return {name: float(value)
-                for name, value in zip(_REFERENCE_COLUMNS, values) if name in self.names}
+        if not self.names or not times:
+            return [{} for _ in times]
+        at = np.array([time - times[0] for time, *_ in self._known]) / NSEC_PER_SEC
+        wanted = np.array([time - times[0] for time in times]) / NSEC_PER_SEC
+        _, headings, rates = zip(*self._known)
+        columns = {name: interpolated(wanted, at, np.array(values)).tolist()
+                   for name, values in zip(_REFERENCE_COLUMNS, (headings, rates))
+                   if name in self.names}
+        return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
 
 _REFERENCE_COLUMNS = 'reference_heading_rad', 'reference_rate_rad_s'

@@ -45,6 +45,15 @@ All zeros would say that the whole covariance is unknown, z included. A standard
 
 """
 
+
+def along_z(variance: float) -> tuple[float, ...]:
+    """Return the covariance of a quantity that is measured about or along z only, shape (9,)."""
+    return (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, variance)
+
+
+#: Covariances of quantities that the message does not report, and that are not measured.
+NO_COVARIANCE, UNMEASURED = (NOT_REPORTED, *8 * (0.0,)), along_z(UNMEASURED_VARIANCE)
+
 #: Most parts of a message, how deep they may be nested, and characters of a definition.
 _MOST, _DEEPEST, _LONGEST = 5000, 10, 100_000
 _LINE = '=' * 80

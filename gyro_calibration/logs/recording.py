@@ -423,7 +423,7 @@ class _Reader:
             self._notes.append('the rates of the reference are all zero, and were left out')
             rate = None
         found: dict[str, Any] = {
-            name: _at(time, at, values)
+            name: interpolated(time, at, values)
             for name, values in (('reference_heading', heading), ('reference_rate', rate))
             if values is not None and np.isfinite(values).sum() > 1}
         if not any(np.isfinite(values).any() for values in found.values()):
@@ -471,9 +471,11 @@ def _rates(course: _Course) -> Array | None:
     return np.where(np.isfinite(rate), rate, np.nan)
 
 
-def _at(time: Array, at: Array, values: Array) -> Array:
+def interpolated(time: Array, at: Array, values: Array) -> Array:
     """Return values interpolated at other times; nan where two values are too far apart."""
     at, values = at[np.isfinite(values)], values[np.isfinite(values)]
+    if len(at) < 2:
+        return np.full(len(time), np.nan)
     longest = max(_LOST_INTERVALS * float(np.median(np.diff(at))), _LOST_TIME)
     place = np.clip(np.searchsorted(at, time, 'right') - 1, 0, len(at) - 2)
     inside = (time >= at[0]) & (time <= at[-1])

@@ -35,7 +35,14 @@ from geometry_msgs.msg import (
     TwistWithCovarianceStamped,
 )
 from gyro_calibration.driver.timestamps import steady
-from gyro_calibration.logs.cdr import NOT_REPORTED, NSEC_PER_SEC, UNMEASURED_VARIANCE
+from gyro_calibration.logs.cdr import (
+    along_z,
+    NO_COVARIANCE,
+    NOT_REPORTED,
+    NSEC_PER_SEC,
+    UNMEASURED,
+    UNMEASURED_VARIANCE,
+)
 from gyro_calibration.ros.calibration_session import Drive, REST
 from gyro_calibration.ros.compensation_report import calibration_status, CompensationReport
 from gyro_calibration.ros.diagnostics import Diagnostics, OK, Report, status_array
@@ -62,9 +69,6 @@ from std_srvs.srv import Trigger
 
 #: Between two polls of publishers, receivers and clocks, s.
 _WATCH_INTERVAL = 0.2
-_NOT_REPORTED = (NOT_REPORTED, *8 * (0.0,))
-_UNMEASURED = (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE, 0.0, 0.0, 0.0,
-               UNMEASURED_VARIANCE)
 
 
 class NodeClock:
@@ -194,15 +198,14 @@ class CompensationNode(Node):
         covariance = imu.linear_acceleration_covariance.tolist()
         if not math.isfinite(acceleration.x + acceleration.y + acceleration.z + sum(covariance)):
             acceleration.x = acceleration.y = acceleration.z = 0.0
-            imu.linear_acceleration_covariance[:] = _NOT_REPORTED
+            imu.linear_acceleration_covariance[:] = NO_COVARIANCE
         elif covariance[0] != NOT_REPORTED and min(covariance[::4]) < 0.0:
-            imu.linear_acceleration_covariance[:] = _UNMEASURED
+            imu.linear_acceleration_covariance[:] = UNMEASURED
         half = 0.5 * found.heading
         turned = imu.orientation
         turned.x = turned.y = 0.0
         turned.z, turned.w = math.sin(half), math.cos(half)
-        imu.orientation_covariance[:] = (UNMEASURED_VARIANCE, 0.0, 0.0, 0.0, UNMEASURED_VARIANCE,
-                                         0.0, 0.0, 0.0, found.heading_variance)
+        imu.orientation_covariance[:] = along_z(found.heading_variance)
         self._imu.publish(imu)
         if self._wanted[self._heading]:
             pose = self._pose_message

@@ -29,7 +29,7 @@ from gyro_calibration.driver.decimation import Decimation, Mean
 from gyro_calibration.driver.protocols import PROTOCOLS, Settings
 from gyro_calibration.driver.protocols.protocol import ASSUMED_FORCE_NOISE
 from gyro_calibration.driver.timestamps import NodeTime, read_together, steady
-from gyro_calibration.logs.cdr import NOT_REPORTED, NSEC_PER_SEC, UNMEASURED_VARIANCE
+from gyro_calibration.logs.cdr import along_z, NO_COVARIANCE, NSEC_PER_SEC
 from gyro_calibration.ros.diagnostics import Diagnostics
 from gyro_calibration.ros.driver_report import DriverReport
 from gyro_calibration.ros.parameters import Parameter
@@ -206,8 +206,8 @@ class Messages:
     def __init__(self, frame_id: str):
         self.imu, self.temperature, self.variance = Imu(), Temperature(), 0.0
         self.imu.header.frame_id = self.temperature.header.frame_id = frame_id
-        self.imu.orientation_covariance[0] = NOT_REPORTED
-        self.imu.angular_velocity_covariance[[0, 4]] = UNMEASURED_VARIANCE
+        self.imu.orientation_covariance[:] = NO_COVARIANCE
+        self.imu.angular_velocity_covariance[:] = along_z(0.0)
         self._has_force: bool | None = None
 
     def fill(self, mean: Mean) -> None:
@@ -226,9 +226,8 @@ class Messages:
         imu.linear_acceleration.z = force or 0.0
         if (force is not None) is not self._has_force:
             self._has_force = force is not None
-            imu.linear_acceleration_covariance[[0, 4, 8]] = (
-                (UNMEASURED_VARIANCE, UNMEASURED_VARIANCE, ASSUMED_FORCE_NOISE ** 2)
-                if self._has_force else (NOT_REPORTED, 0.0, 0.0))
+            imu.linear_acceleration_covariance[:] = (
+                along_z(ASSUMED_FORCE_NOISE ** 2) if self._has_force else NO_COVARIANCE)
 
 
 def settings(values: SimpleNamespace) -> Settings:
