@@ -24,11 +24,15 @@ minute.
 from collections.abc import Iterator
 from dataclasses import replace
 import math
+from pathlib import Path
+import sys
 
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_faults import damaged, SerialFaults
 from gyro_calibration.logs.log import DEGREE
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
+from serial_faults import damaged  # noqa: E402, I100, I202
 
 SHARES = (0.001, 0.01, 0.1)
 FRAMES = 50_000
@@ -43,13 +47,13 @@ def arrived(name: str, share: float, full_scale: float | None) -> list[float]:
     protocol, generator = find(name), np.random.default_rng(1)
     settings = replace(Settings(sensitivity=DEGREE / 27880.0 if name == 'fizoptika' else None),
                        full_scale=full_scale)
-    encode, decoder, line = (protocol.encoder(settings), protocol.decoder(settings),
-                             SerialFaults(0.0, 0.0, *(3 * [share / 3.0])))
+    encode, decoder = protocol.encoder(settings), protocol.decoder(settings)
     good = protocol.preamble + b''.join(encode(Sample(SENT, 25.0, 1.0, number))
                                         for number in range(4))
     rates = [protocol.decoder(settings).feed(good)[-1].output]
     for number in range(FRAMES):
-        data = damaged(line, encode(Sample(SENT, 25.0, number / protocol.rate, number)), generator)
+        data = damaged(encode(Sample(SENT, 25.0, number / protocol.rate, number)), generator,
+                       *(3 * [share / 3.0]))
         rates += [sample.output for sample in decoder.feed(data)]
     return rates
 

@@ -16,7 +16,6 @@ import argparse
 from collections.abc import Iterator
 from itertools import chain, repeat
 import json
-import secrets
 import signal
 import sys
 from typing import Any
@@ -35,7 +34,6 @@ from gyro_calibration.cli.verb import (
 )
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, Protocol, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.files import plain
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
@@ -65,41 +63,20 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='start when a program has opened the port')
     parser.add_argument('--repeat', action='store_true', help='start again at the end')
     add_topics(parser)
-    _add_line(parser)
     parser.set_defaults(**AS_IT_IS)
     return parser
 
 
-def _add_line(parser: argparse.ArgumentParser) -> None:
-    line = parser.add_argument_group(
-        'faults of the line', 'P is a probability from 0 to 1; --seed selects what is hit')
-    line.add_argument('--lose-samples', type=float, default=0.0, metavar='P',
-                      help='a sample is never sent')
-    line.add_argument('--invalid-samples', type=float, default=0.0, metavar='P',
-                      help='the gyro marks a sample as invalid')
-    line.add_argument('--lose', type=float, default=0.0, metavar='P', help='a byte is lost')
-    line.add_argument('--double', type=float, default=0.0, metavar='P',
-                      help='a byte is sent twice')
-    line.add_argument('--flip', type=float, default=0.0, metavar='P',
-                      help='a bit of a byte is flipped')
-    line.add_argument('--burst', type=float, default=0.0, metavar='MS',
-                      help='interval at which bytes are delivered, ms; USB adapters: 16')
-    line.add_argument('--piece', type=int, default=0, metavar='BYTES',
-                      help='bytes delivered at once, at the speed of the line')
-
-
 def _emulate(given: argparse.Namespace) -> None:
     """Print the path at once, since this verb sends until it ends."""
-    (protocol, settings), faults = _wire(given), _faults(given)
+    protocol, settings = _wire(given)
     log = read(given) if given.log else simulated(given)[0]
     time, output = time_of(given, log), output_of(given, log)
     if np.isfinite(output).sum() < 2:
         raise DataRefused(f'{given.log}: {np.isfinite(output).sum()} of {len(output)} samples '
                           'have an output; give a log with two or more')
     samples = _samples(time, output, log.temperature, given.repeat)
-    generator = np.random.default_rng(secrets.randbits(32) if given.seed is None else given.seed)
-    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait, faults,
-                        generator)
+    emulator = Emulator(protocol, samples, settings, given.speed, given.link, given.wait)
     _handle_signals(lambda *_: emulator.stop())
 
     def answer(path: str) -> None:
@@ -125,14 +102,6 @@ def _wire(given: argparse.Namespace) -> tuple[Protocol, Settings]:
     except ValueError as error:
         raise UsageError(str(error)) from None
     return protocol, settings
-
-
-def _faults(given: argparse.Namespace) -> SerialFaults:
-    try:
-        return SerialFaults(given.lose_samples, given.invalid_samples, given.lose, given.double,
-                            given.flip, 1e-3 * given.burst, given.piece)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
 
 
 def _samples(time: Array, output: Array, temperature: Array | None,

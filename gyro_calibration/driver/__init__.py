@@ -12,6 +12,6 @@
 From bytes on a serial port to stamped samples, whatever happens to the port.
 
 Reading order: `protocols` (wire formats), `serial_port`, `timestamps`, `connection`, `decimation`,
-`recorder`, `serial_faults`, `emulator`.
+`recorder`, `emulator`.
 
 """

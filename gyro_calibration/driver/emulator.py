@@ -30,13 +30,14 @@ import time
 import tty
 
 from gyro_calibration.driver.protocols import Protocol, Sample, Settings
-from gyro_calibration.driver.serial_faults import damaged, delivered, SerialFaults
-import numpy as np
 
 _POLL = 0.05  # s; how soon a reader, or the wish to stop, is noticed
 _SETTLING = 0.2  # s; a reader that opens a port drops what is in it just afterwards
 _LINGERING = 1.0  # s; closing a pseudo-terminal throws away what its reader has not yet taken
 _BATCH = 0.0005  # s; samples due within it are written together, as waiting takes too long
+
+#: When bytes are sent, s, and the bytes.
+_Piece = tuple[float, bytes]
 
 
 class Emulator:
@@ -48,10 +49,9 @@ class Emulator:
 
     Samples are pulled one by one, each after the one before it was sent, so a source may be
     endless and may follow a motion that is commanded meanwhile. The time of the first is the
-    beginning; a source that is itself slower than its times sets the pace. Above 2 kHz, and on a
-    line with bursts, a few samples are pulled before they are sent together.
-
-    Samples without a sequence are numbered from 0 on, before any are lost.
+    beginning; a source that is itself slower than its times sets the pace. Above 2 kHz a few
+    samples are pulled before they are sent together. Samples without a sequence are numbered from
+    0 on.
 
     Parameters
     ----------
@@ -67,15 +67,13 @@ class Emulator:
         removed at the end.
     wait_for_reader : bool
         Whether to send the first sample only after a reader has opened the port.
-    faults : SerialFaults or None
-        What happens to samples and bytes on their way; None for nothing.
-    generator : numpy.random.Generator or None
-        Chooses which of them; a line without faults needs none.
+    line : callable or None
+        Takes the time, s, and the bytes of each sample, and gives those that arrive, as a line
+        with faults changes them.
 
     Raises
     ------
-    ValueError : the speed is not above 0, the settings do not suffice for the protocol, or a
-        generator is missing
+    ValueError : the speed is not above 0, or the settings do not suffice for the protocol
     FileExistsError : the place of the link is taken by a file that is no link
 
     """
@@ -88,8 +86,7 @@ class Emulator:
         speed: float = 1.0,
         link: str | Path | None = None,
         wait_for_reader: bool = False,
-        faults: SerialFaults | None = None,
-        generator: np.random.Generator | None = None,
+        line: Callable[[Iterable[_Piece]], Iterable[_Piece]] | None = None,
     ):
         if not speed > 0.0:
             raise ValueError(f'speed is {speed}, but must be above 0; 1 is real time')
@@ -99,11 +96,7 @@ class Emulator:
         self._samples = samples
         self._speed = speed
         self.link = None if link is None else Path(link)
-        self._wait_for_reader = wait_for_reader
-        self._faults = faults = faults or SerialFaults()
-        if generator is None and faults.is_random:
-            raise ValueError('the line loses or damages bytes at random: give a numpy Generator')
-        self._generator = generator or np.random.default_rng(0)  # never asked
+        self._wait_for_reader, self._line = wait_for_reader, line
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name='emulator')
         self._master, self._reader_poll = -1, select.poll()
@@ -135,9 +128,11 @@ class Emulator:
 
         """
         if self._wait_for_reader:
-            self._wait_until_read()
+            while not self.is_read() and not self._stop.wait(_POLL):
+                pass
+            self._stop.wait(_SETTLING)
         self._send(self._protocol.preamble)
-        self._send_in_time(delivered(self._faults, self._frames(), self._protocol.baud))
+        self._send_in_time(self._line(self._frames()) if self._line else self._frames())
         if self.is_read():
             self._stop.wait(_LINGERING)
 
@@ -186,43 +181,30 @@ class Emulator:
         os.symlink(self.path, temporary)
         os.replace(temporary, self.link)
 
-    def _wait_until_read(self) -> None:
-        while not self.is_read() and not self._stop.wait(_POLL):
-            pass
-        self._stop.wait(_SETTLING)
-
-    def _stopped_before(self, due: float, earliest: float) -> bool:
-        now = time.monotonic()
-        return self._stop.wait(max(due, earliest) - now) if due > now else self._stop.is_set()
-
-    def _frames(self) -> Iterator[tuple[float, bytes]]:
-        """
-        Yield when each sample is due after the first, in the time of the host, and its bytes.
-
-        Lost samples are left out.
-
-        """
-        begin, faults, generator = None, self._faults, self._generator
-        encode = self._protocol.encoder(self._settings)
+    def _frames(self) -> Iterator[_Piece]:
+        """Give when each sample is due after the first, in the time of the host, and its bytes."""
+        begin, encode = None, self._protocol.encoder(self._settings)
         for number, sample in enumerate(self._samples):
-            due = _time(sample) / self._speed
+            if sample.time is None:
+                raise ValueError('a sample has no time at which to send it: set Sample.time in '
+                                 'seconds')
+            due = sample.time / self._speed
             begin = due if begin is None else begin
-            if faults.lost_samples and generator.random() < faults.lost_samples:
-                continue
             if sample.sequence is None:
                 sample = replace(sample, sequence=number)
-            invalid = faults.invalid_samples and generator.random() < faults.invalid_samples
-            yield due - begin, damaged(faults, encode(sample, not invalid), generator)
+            yield due - begin, encode(sample)
 
-    def _send_in_time(self, pieces: Iterable[tuple[float, bytes]]) -> None:
+    def _send_in_time(self, pieces: Iterable[_Piece]) -> None:
         """Send each piece at its time, or with others that are due at once."""
         start, pending, sent = time.monotonic(), b'', -math.inf
-        batch = 0.0 if self._faults.piece else _BATCH
+        batch = 0.0 if self._line else _BATCH
         for due, data in pieces:
             if pending and start + due > time.monotonic():
                 self._send(pending)
                 pending, sent = b'', time.monotonic()
-            if self._stopped_before(start + due, sent + batch):
+            now = time.monotonic()
+            if (self._stop.wait(max(start + due, sent + batch) - now) if start + due > now
+                    else self._stop.is_set()):
                 return
             pending += data
             if time.monotonic() >= sent + batch:
@@ -232,7 +214,10 @@ class Emulator:
 
     def _send(self, data: bytes) -> None:
         while data and not self._stop.is_set():
-            written = self._write(data)
+            written = 0
+            if self.is_read():
+                with contextlib.suppress(BlockingIOError):
+                    written = os.write(self._master, data)
             self.sent_bytes += written
             data = data[written:]
             if data and self._speed <= 1.0:
@@ -240,20 +225,6 @@ class Emulator:
                 return
             if data:
                 self._stop.wait(_POLL / 10)
-
-    def _write(self, data: bytes) -> int:
-        if not self.is_read():
-            return 0
-        try:
-            return os.write(self._master, data)
-        except BlockingIOError:
-            return 0
-
-
-def _time(sample: Sample) -> float:
-    if sample.time is None:
-        raise ValueError('a sample has no time at which to send it: set Sample.time in seconds')
-    return sample.time
 
 
 def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: None) -> None:

@@ -19,10 +19,10 @@ from fake_port import BEGIN, Reading, World
 from gyro_calibration.driver.connection import Connection, resolve
 from gyro_calibration.driver.emulator import Emulator
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_faults import damaged, SerialFaults
 from gyro_calibration.driver.serial_port import PortError
 import numpy as np
 import pytest
+from serial_faults import damaged
 
 ONE_COLUMN = Settings(columns=('gyro_dps',))
 SETTINGS = {name: Settings(sensitivity=1e-6 if name == 'fizoptika' else None)
@@ -328,12 +328,10 @@ def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
 def test_a_bad_line_is_survived_and_counted(name, share):
     """Few long frames survive a tenth of faulty bytes; a good line shows right decoding."""
     protocol, generator = find(name), np.random.default_rng(2)
-    bad = SerialFaults(lost_bytes=share / 3.0, doubled_bytes=share / 3.0,
-                       flipped_bytes=share / 3.0)
     encode = protocol.encoder(SETTINGS[name])
     frames = [encode(Sample(0.5, 25.0, number / 100.0, number)) for number in range(3000)]
     world = World(30.0)
-    world.send((damaged(bad, frame, generator) if number < 2000 else frame
+    world.send((damaged(frame, generator, *(3 * [share / 3.0])) if number < 2000 else frame
                 for number, frame in enumerate(frames)))
     reading = Reading(world, name, settings=SETTINGS[name])
     exact = reading.samples[-1].output

@@ -11,20 +11,18 @@
 """The emulated gyro, read through a real pseudo-terminal."""
 
 from dataclasses import replace
+from functools import partial
 import itertools
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 
 from gyro_calibration.driver.emulator import emulate, Emulator
 from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
-from gyro_calibration.driver.serial_faults import SerialFaults
 from gyro_calibration.driver.serial_port import PortError, SerialPort
-import numpy as np
 import pytest
+from serial_faults import bursts, single_bytes
 
 
 def samples(count=None, rate=100.0):
@@ -168,10 +166,9 @@ def test_a_sample_without_a_time_is_refused():
         emulate(Emulator(find('csv'), [Sample(0.5)]))
 
 
-def received_over(faults, protocol, count, rate):
-    """Return the bursts of samples of a short drive over a bad line, and the bursts of bytes."""
-    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, faults=faults,
-                    generator=np.random.default_rng(1))
+def received_over(line, protocol, count, rate):
+    """Return the bursts of samples of a short drive over a line, and the bursts of bytes."""
+    gyro = Emulator(protocol, samples(count, rate), wait_for_reader=True, line=line)
     with gyro:
         port, decoder, received = SerialPort(gyro.path, 9600, timeout=0.5), protocol.decoder(), []
         port.open()
@@ -183,43 +180,28 @@ def received_over(faults, protocol, count, rate):
     return received, chunks
 
 
-def test_lost_samples_leave_holes():
-    received = sum(received_over(SerialFaults(lost_samples=0.3), find('csv'), 200, 1000.0)[0], [])
-    numbers = [round((sample.time - 5.0) * 1000.0) for sample in received]
-    assert 100 < len(numbers) < 180 and numbers == sorted(set(numbers))
-    assert max(numbers) > 190
-
-
-def test_samples_are_numbered_before_any_is_lost():
+def test_samples_are_numbered():
     sent = []
     protocol = replace(
         find('csv'), writer=lambda settings: lambda reading: sent.append(reading.sequence) or b'')
-    with Emulator(protocol, samples(100, 1e4), faults=SerialFaults(lost_samples=0.5),
-                  generator=np.random.default_rng(1)) as gyro:
+    with Emulator(protocol, samples(100, 1e4)) as gyro:
         gyro.join()
-    assert set(sent) < set(range(100)) and sent == sorted(sent) and 30 < len(sent) < 70
+    assert sent == list(range(100))
 
 
 def test_an_adapter_hands_over_in_bursts():
     """Sixteen samples of 1 ms each come together."""
-    received = [len(samples) for samples in received_over(
-        SerialFaults(burst=0.016), find('csv'), 320, 1000.0)[0]]
+    received = [len(samples) for samples in received_over(bursts, find('csv'), 320, 1000.0)[0]]
     assert sum(received) == 320
     # a busy machine may take several bursts at once
     assert sum(count for count in received if count % 16 == 0) > 160
 
 
 def test_a_slow_line_gives_single_bytes():
-    received, chunks = received_over(SerialFaults(piece=1),
-                                     replace(find('kvh_ecore'), baud=600), 10, 5.0)
+    received, chunks = received_over(partial(single_bytes, baud=600), find('kvh_ecore'), 10, 5.0)
     assert sum(len(samples) for samples in received) == 10
     sizes = [len(chunk) for chunk in chunks if chunk]
     assert sizes.count(1) > 0.5 * len(sizes)
-
-
-def test_a_line_with_faults_needs_a_generator():
-    with pytest.raises(ValueError, match='give a numpy Generator'):
-        Emulator(find('csv'), samples(), faults=SerialFaults(lost_bytes=0.1))
 
 
 def test_eleven_thousand_samples_a_second_are_sent_in_time():
@@ -238,28 +220,3 @@ def test_eleven_thousand_samples_a_second_are_sent_in_time():
     assert count == 11500
     # A busy machine is late, but its work must not last longer than the samples.
     assert elapsed > 0.9 and used < 1.5
-
-
-@pytest.mark.parametrize('words, sentence', [
-    (['--lose', '3'], 'lost_bytes is 3.0, but must be a probability'),
-    (['--burst', '-1'], 'burst is -0.001 s'), (['--piece', 'x'], 'invalid int value')])
-def test_a_line_that_is_not_possible_is_refused_by_the_verb(run, tmp_path, words, sentence):
-    (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
-    code, _, said = run('emulate', '--protocol', 'csv', '--model', tmp_path / 'model.yaml', *words)
-    assert code == 2 and sentence in said
-
-
-def test_the_verb_sends_over_a_bad_line(tmp_path):
-    """Three samples in ten are lost, and the same ones with the same seed."""
-    (tmp_path / 'model.yaml').write_text('effects: {bias: {bias: 0.01}}')
-    command = [sys.executable, '-m', 'gyro_calibration', 'emulate', '--protocol', 'csv',
-               '--model', tmp_path / 'model.yaml', '--wait', '--link', tmp_path / 'gyro',
-               '--speed', '50', '--lose-samples', '0.3', '--seed', '7']
-    times = []
-    for _ in range(2):
-        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-            process.stdout.readline()
-            times.append([sample.time for sample in read_all(tmp_path / 'gyro', 'csv', 100)][:100])
-            process.terminate()
-    assert times[0] == times[1]
-    assert times[0][-1] - times[0][0] == pytest.approx(1.0 / 0.7, rel=0.2)
