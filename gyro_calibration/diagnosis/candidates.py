@@ -25,7 +25,7 @@ from itertools import combinations, product
 import math
 
 from gyro_calibration.diagnosis.replay import Replay
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.effects import ADDED, CATALOGUE
 import numpy as np
 from scipy.interpolate import BSpline
@@ -136,6 +136,20 @@ def constant(replays: Sequence[Replay]) -> frozenset[str]:
     return frozenset(
         name for name, values in known.items()
         if values and max(float(np.ptp(value)) for value in values) < LEAST_CHANGE[name])
+
+
+def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
+    """Return the numbers of experiments like these logs, in deg/s, degC and min."""
+    numbers = {'long': 4.0 * math.ceil(max(each.duration for each in replays) / 60.0)}
+    top = max(float(np.quantile(np.abs(each.channels.rate), 0.999)) for each in replays) / DEGREE
+    if top > 0.0:
+        numbers |= {'top': top, 'faster': 3.0 * top}
+    if all('temperature' in each.has for each in replays):
+        degc = np.concatenate([each.channels.temperature for each in replays])
+        # a range that shows something
+        middle, half = 0.5 * (degc.max() + degc.min()), max(0.5 * float(np.ptp(degc)), 10.0)
+        numbers |= {'low': float(middle - half), 'high': float(middle + half)}
+    return numbers
 
 
 def candidates(replays: Sequence[Replay]) -> list[Candidate]:

@@ -11,8 +11,8 @@
 """
 Every cause that a diagnosis can name: effects of the gyro, faults of reference or record, noise.
 
-What an effect is, and in which units, stands in `effects`. Here stands what it is taken for, and
-what would tell the two apart.
+What an effect is, and in which units, stands in `effects`. Here stands along which variable it
+shows, and which experiment distinguishes it from what looks alike.
 
 """
 
@@ -20,8 +20,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
+from typing import Any
 
-from gyro_calibration.diagnosis.findings import Finding
+from gyro_calibration.diagnosis.findings import Estimate, Finding
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel
 
@@ -40,9 +42,8 @@ class Cause:
     sentence : what it is, for people
     units : parameter -> SI unit, for those that a diagnosis estimates
     needs : columns of a log without which it cannot be shown; 'reference' is one of `REFERENCES`
-    confounders : the causes that may look the same
-    separate_by : the experiment that parts it from them; '' where it has none
     along : the variable along which it shows
+    separate_by : the experiment that distinguishes it from what looks alike; '' where it has none
     of : 'gyro', 'reference', 'record' or 'noise': what is to be mended
 
     """
@@ -51,144 +52,114 @@ class Cause:
     sentence: str
     units: Mapping[str, str]
     needs: frozenset[str]
-    confounders: tuple[str, ...]
-    separate_by: str
     along: str
+    separate_by: str
     of: str
 
-
-@dataclass(frozen=True)
-class _Likeness:
-    """What the diagnosis knows of an effect in addition to the catalogue of effects."""
-
-    along: str
-    confounders: tuple[str, ...] = ()
-    separate_by: str = ''
+    @property
+    def unit(self) -> str:
+        """Return the unit of the parameter that is named like it, SI."""
+        return next(iter(self.units.values()))
 
 
 _ACCELERATIONS = ('swing fast with quick reversals: a delay keeps the size of what it delays, '
                   'a lag does not')
-_TEMPERATURE_CORNERS = 'heat and cool with corners, at two speeds, while the gyro rests'
-_UP_AND_DOWN = 'heat and cool the gyro within one log, and start it both cold and warm'
+_CORNERS = 'heat and cool with corners, at two speeds, while the gyro rests'
+_FULL_SCALE = 'turn at many speeds up to full scale'
+_MARK = 'close whole turns on a mark, or take a second reference'
+_HEADINGS = 'turn at several speeds, and stop at eight headings'
 
-_OF_THE_GYRO: Mapping[str, _Likeness] = {
-    'bias': _Likeness('rate', ('acceleration_sensitivity', 'vibration_rectification'),
-                      'turn the axis over within one power-on, with all motors off'),
-    'scale_factor_error': _Likeness('rate', ('clock_rate', 'reference_scale', 'unit_error'),
-                                    'close whole turns on a mark, or take a second reference'),
-    'scale_factor_asymmetry': _Likeness('rate', ('quadratic_nonlinearity',),
-                                        'turn both ways at many speeds, slow ones too'),
-    'quadratic_nonlinearity': _Likeness('rate', ('scale_factor_asymmetry',),
-                                        'turn both ways at many speeds, slow ones too, '
-                                        'with the sensor on the axis of the table'),
-    'cubic_nonlinearity': _Likeness('rate', ('sine_response', 'saturation'),
-                                    'turn at many speeds up to full scale'),
-    'sine_response': _Likeness('rate', ('cubic_nonlinearity',),
-                               'turn at many speeds up to full scale'),
-    'bias_temperature': _Likeness('temperature', ('rate_ramp', 'warm_up', 'supply_sensitivity'),
-                                  _UP_AND_DOWN),
-    'bias_temperature_quadratic': _Likeness('temperature'),
-    'scale_factor_temperature': _Likeness('temperature'),
-    'bias_temperature_rate': _Likeness('temperature_rate',
-                                       ('thermal_lag', 'thermal_hysteresis', 'bias_step'),
-                                       _TEMPERATURE_CORNERS),
-    'thermal_lag': _Likeness('temperature_rate', ('bias_temperature_rate',), _TEMPERATURE_CORNERS),
-    'thermal_hysteresis': _Likeness('temperature_rate', ('bias_temperature_rate', 'bias_step'),
-                                    'go through the same cycle of temperature twice, '
-                                    'at two speeds'),
-    'warm_up': _Likeness('time', ('rate_ramp', 'bias_temperature'),
-                         'start the gyro both cold and warm, and let it rest'),
-    'rate_ramp': _Likeness('time', ('bias_temperature', 'warm_up', 'rate_random_walk'),
-                           'record it again, from a power-on at another temperature: '
-                           'what is no ramp does not repeat'),
-    'bias_step': _Likeness('time', ('bias_temperature_rate', 'thermal_hysteresis'),
-                           'record it again: a step happens once'),
-    'heading_sensitivity': _Likeness('heading',
-                                     ('reference_once_per_rev', 'acceleration_sensitivity'),
-                                     'turn at several speeds, and stop at eight headings'),
-    'acceleration_sensitivity': _Likeness('specific_force', ('bias', 'heading_sensitivity'),
-                                          'rest in several poses within one power-on'),
-    'vibration_rectification': _Likeness('vibration', ('bias',), 'rest with the motor on and off'),
-    'supply_sensitivity': _Likeness('supply', ('bias_temperature',),
-                                    'step the supply voltage at one temperature'),
-    'interference_tone': _Likeness('frequency'),
-    'bandwidth': _Likeness('rate_change', ('time_offset',), _ACCELERATIONS),
-    'time_offset': _Likeness('rate_change', ('bandwidth', 'unit_error'), _ACCELERATIONS),
-    'clock_rate': _Likeness('time', ('scale_factor_error',),
-                            'record long, with sharp reversals at both ends'),
-    'dead_zone': _Likeness('rate', ('quantization',), 'sweep slowly through zero'),
-    'saturation': _Likeness('rate', ('cubic_nonlinearity',),
-                            'turn faster than the limit: its code is repeated there'),
-    'quantization': _Likeness('output', ('dead_zone', 'stuck_samples'),
-                              'turn slowly: the set of codes shows it'),
+#: Effect of the gyro -> the variable along which it shows, and its experiment.
+_OF_THE_GYRO: Mapping[str, tuple[str, str]] = {
+    'bias': ('rate', 'turn the axis over within one power-on, with all motors off'),
+    'scale_factor_error': ('rate', _MARK),
+    'scale_factor_asymmetry': ('rate', 'turn both ways at many speeds, slow ones too'),
+    'quadratic_nonlinearity': ('rate', 'turn both ways at many speeds, slow ones too, with the '
+                               'sensor on the axis of the table'),
+    'cubic_nonlinearity': ('rate', _FULL_SCALE),
+    'sine_response': ('rate', _FULL_SCALE),
+    'bias_temperature': ('temperature', 'heat and cool the gyro within one log, and start it both '
+                         'cold and warm'),
+    'bias_temperature_quadratic': ('temperature', ''),
+    'scale_factor_temperature': ('temperature', ''),
+    'bias_temperature_rate': ('temperature_rate', _CORNERS),
+    'thermal_lag': ('temperature_rate', _CORNERS),
+    'thermal_hysteresis': ('temperature_rate', 'go through the same cycle of temperature twice, '
+                           'at two speeds'),
+    'warm_up': ('time', 'start the gyro both cold and warm, and let it rest'),
+    'rate_ramp': ('time', 'record it again, from a power-on at another temperature: what is no '
+                  'ramp does not repeat'),
+    'bias_step': ('time', 'record it again: a step happens once'),
+    'heading_sensitivity': ('heading', _HEADINGS),
+    'acceleration_sensitivity': ('specific_force', 'rest in several poses within one power-on'),
+    'vibration_rectification': ('vibration', 'rest with the motor on and off'),
+    'supply_sensitivity': ('supply', 'step the supply voltage at one temperature'),
+    'interference_tone': ('frequency', ''),
+    'bandwidth': ('rate_change', _ACCELERATIONS),
+    'time_offset': ('rate_change', _ACCELERATIONS),
+    'clock_rate': ('time', 'record long, with sharp reversals at both ends'),
+    'dead_zone': ('rate', 'sweep slowly through zero'),
+    'saturation': ('rate', 'turn faster than the limit: its code is repeated there'),
+    'quantization': ('output', 'turn slowly: the set of codes shows it'),
 }
 
+#: Name, sentence, unit, whose it is, what it needs, variable along which it shows, experiment.
+_OTHERS = (
+    ('outliers', 'Single samples are outliers, as from a disturbed line or a corrected checksum.',
+     '1', 'record', 'time', 'time', ''),
+    ('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record', 'time',
+     'time', 'turn without rest: the code of a gyro that works changes then'),
+    ('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time', 'time', ''),
+    ('reference_once_per_rev', 'The reference errs once in a revolution, as an eccentric encoder '
+     'or a wobbling table does.', '1', 'reference', 'time reference', 'heading', _HEADINGS),
+    ('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
+     'time reference', 'rate', _MARK),
+    ('reference_slip', 'The motion slipped: the reference shows a turn that the gyro did not '
+     'make.', 'rad', 'reference', 'time reference', 'rate_change', ''),
+    ('reference_quantization', 'The reference counts in steps, and its rate between samples is as '
+     'coarse.', 'rad', 'reference', 'time reference_heading', 'heading', ''),
+    ('unit_error', 'The output is in another unit, or of the other sign, than its name says.', '1',
+     'record', 'reference', 'rate',
+     'look up what the wire carries: the number itself is the evidence'),
+    ('angle_random_walk', 'The angle random walk differs from the simulated one.', 'rad/√s',
+     'noise', 'time', 'frequency', ''),
+    ('bias_instability', 'The bias instability differs from the simulated one.', 'rad/s', 'noise',
+     'time', 'frequency', 'record at rest for hours'),
+    ('rate_random_walk', 'The rate random walk differs from the simulated one.', 'rad/s/√s',
+     'noise', 'time', 'frequency', 'record at rest for hours, and again: a walk does not repeat'),
+)
 
-def _of_an_effect(name: str, likeness: _Likeness) -> Cause:
+
+def _of_an_effect(name: str, along: str, separate_by: str) -> Cause:
     effect = CATALOGUE[name]
     units = {parameter.name: parameter.unit
              for parameter in effect.parameters if parameter.default is None}
-    needs = effect.looks_at & {'temperature', 'specific_force', 'supply'}
-    turned = likeness.along in {'rate', 'heading', 'rate_change'} and name != 'bias'
-    needs = needs | {'time'} | ({'reference'} if turned or 'rate' in effect.looks_at else set())
-    return Cause(name, effect.cause, units, frozenset(needs), likeness.confounders,
-                 likeness.separate_by, likeness.along, 'gyro')
+    turned = along in {'rate', 'heading', 'rate_change'} and name != 'bias'
+    needs = {'time', *(effect.looks_at & {'temperature', 'specific_force', 'supply'}),
+             *({'reference'} if turned or 'rate' in effect.looks_at else ())}
+    return Cause(name, effect.cause, units, frozenset(needs), along, separate_by, 'gyro')
 
-
-def _other(name: str, sentence: str, unit: str, of: str, along: str,
-           needs: tuple[str, ...] = ('time',), confounders: tuple[str, ...] = (),
-           separate_by: str = '') -> Cause:
-    return Cause(name, sentence, {name: unit}, frozenset(needs), confounders, separate_by, along,
-                 of)
-
-
-_WITH_REFERENCE = ('time', 'reference')
-
-_OTHERS = (
-    _other('outliers',
-           'Single samples are outliers, as from a disturbed line or a corrected checksum.', '1',
-           'record', 'time'),
-    _other('stuck_samples', 'The last value is repeated where a new one was due.', '1', 'record',
-           'time', confounders=('quantization',),
-           separate_by='turn without rest: the code of a gyro that works changes then'),
-    _other('dropped_samples', 'Samples are missing from the record.', '1', 'record', 'time'),
-    _other('reference_once_per_rev',
-           'The reference errs once in a revolution, as an eccentric encoder or a wobbling table '
-           'does.', '1', 'reference', 'heading', _WITH_REFERENCE, ('heading_sensitivity',),
-           'turn at several speeds, and stop at eight headings'),
-    _other('reference_scale', 'The scale of the reference itself is wrong.', '1', 'reference',
-           'rate', _WITH_REFERENCE, ('scale_factor_error',),
-           'close whole turns on a mark, or take a second reference'),
-    _other('reference_slip',
-           'The motion slipped: the reference shows a turn that the gyro did not make.', 'rad',
-           'reference', 'rate_change', _WITH_REFERENCE, (), ''),
-    _other('reference_quantization',
-           'The reference counts in steps, and its rate between samples is as coarse.', 'rad',
-           'reference', 'heading', ('time', 'reference_heading')),
-    _other('unit_error',
-           'The output is in another unit, or of the other sign, than its name says.', '1',
-           'record', 'rate', ('reference',), ('scale_factor_error', 'time_offset'),
-           'look up what the wire carries: the number itself is the evidence'),
-    _other('angle_random_walk', 'The angle random walk differs from the simulated one.',
-           'rad/√s', 'noise', 'frequency'),
-    _other('bias_instability', 'The bias instability differs from the simulated one.', 'rad/s',
-           'noise', 'frequency', confounders=('rate_random_walk',),
-           separate_by='record at rest for hours'),
-    _other('rate_random_walk', 'The rate random walk differs from the simulated one.',
-           'rad/s/√s', 'noise', 'frequency', confounders=('bias_instability', 'rate_ramp'),
-           separate_by='record at rest for hours, and again: a walk does not repeat'),
-)
 
 CAUSES: dict[str, Cause] = {
-    **{name: _of_an_effect(name, likeness) for name, likeness in _OF_THE_GYRO.items()},
-    **{cause.name: cause for cause in _OTHERS}}
+    **{name: _of_an_effect(name, *shown) for name, shown in _OF_THE_GYRO.items()},
+    **{name: Cause(name, sentence, {name: unit}, frozenset(needs.split()), along, separate_by, of)
+       for name, sentence, unit, of, needs, along, separate_by in _OTHERS}}
 
 
 def add_causes(effects: Iterable[Effect]) -> None:
     """Add effects of one's own, which are in the catalogue, to what a diagnosis looks for."""
     for effect in effects:
-        CAUSES[effect.name] = _of_an_effect(
-            effect.name, _Likeness(effect.along, separate_by=effect.shown_by))
+        CAUSES[effect.name] = _of_an_effect(effect.name, effect.along, effect.shown_by)
+
+
+def finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
+            confounders: Sequence[str] = (), **known: Any) -> Finding:
+    """Return a finding of a cause, with what is known of the cause where nothing else is given."""
+    cause = CAUSES[name]
+    usual = {'cause': cause.sentence, 'along': cause.along,
+             'separate_by': cause.separate_by if confounders else ''}
+    return Finding(name, parameters=parameters, p_value=p_value,
+                   ambiguous_with=tuple(confounders), **{**usual, **known})
 
 
 _REMEDIES = {
@@ -205,3 +176,64 @@ def with_remedies(findings: Sequence[Finding], shares: Mapping[str, float],
     return [replace(each, share_of_heading_error=shares.get(each.effect), remedy=each.remedy or (
         '' if CAUSES[each.effect].of == 'gyro' and each.effect not in inside
         else _REMEDIES[CAUSES[each.effect].of])) for each in findings]
+
+
+#: What to record next, in the numbers of the logs -> the pairs of causes that it distinguishes.
+_EXPERIMENTS: Mapping[str, str] = {
+    'heat and cool it twice between {low:.0f} and {high:.0f} °C within one log, at rest, from a '
+    'power-on at {high:.0f} °C': 'bias_temperature rate_ramp, bias_temperature warm_up',
+    'heat and cool it twice between {low:.0f} and {high:.0f} °C at rest, at two speeds, with '
+    'corners and pauses of 2 min':
+        'bias_temperature_rate thermal_lag, bias_temperature_rate thermal_hysteresis, '
+        'thermal_lag thermal_hysteresis, bias_temperature thermal_lag',
+    'let it rest for {long:.0f} min at one temperature, from power-on': 'warm_up rate_ramp',
+    'turn whole turns at three speeds, and stop at eight headings, 45 deg apart':
+        'heading_sensitivity reference_once_per_rev',
+    'turn both ways at eight speeds, slow ones too, up to {top:.3g} deg/s':
+        'scale_factor_asymmetry quadratic_nonlinearity',
+    'turn both ways at up to {faster:.3g} deg/s, or as far beyond {top:.3g} deg/s as the gyro '
+    'allows': 'cubic_nonlinearity sine_response, cubic_nonlinearity saturation, '
+              'sine_response saturation',
+    'rest with the motor on and off, half a minute each, for 5 min':
+        'scale_factor_asymmetry vibration_rectification, '
+        'quadratic_nonlinearity vibration_rectification',
+    'rest for half a minute each with the axis up, level, down and level, turned over slowly '
+    'within one power-on':
+        'quadratic_nonlinearity acceleration_sensitivity, '
+        'scale_factor_asymmetry acceleration_sensitivity, '
+        'heading_sensitivity acceleration_sensitivity, bias acceleration_sensitivity',
+    'swing with quick reversals for 2 min or more at up to {top:.3g} deg/s':
+        'time_offset bandwidth',
+    'record {long:.0f} min with quick reversals at up to {top:.3g} deg/s at both ends':
+        'time_offset clock_rate, clock_rate scale_factor_error',
+    'record the same again, from another power-on: what happens once does not repeat':
+        'bias_step thermal_hysteresis, bias_step bias_temperature_rate, bias_step warm_up',
+    'step the supply by 5 % each minute at one temperature and at rest':
+        'bias_temperature supply_sensitivity',
+}
+_OF_PAIRS = {frozenset(pair.split()): words
+             for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
+
+
+def experiment(name: str, others: Sequence[tuple[str, float]],
+               numbers: Mapping[str, float]) -> str:
+    """
+    Return what to record next to distinguish a cause from others, in words.
+
+    Parameters
+    ----------
+    name : of the cause
+    others : names of those that may be in its place, with what each lacks in logarithm of the
+        likelihood, half the square of the sigmas by which the logs distinguish them already
+    numbers : of the logs, as of `candidates.observed_range`
+
+    """
+    found: dict[str, list[str]] = {}
+    for other, lack in others:
+        words = _OF_PAIRS.get(frozenset((name, other)), '')
+        if not words or any(f'{{{key}:' in words for key in {'top', 'low'} - numbers.keys()):
+            words = CAUSES[name].separate_by or CAUSES[other].separate_by
+        found.setdefault(words.format(**numbers), []).append(
+            f'{other.replace("_", " ")} by {math.sqrt(2.0 * max(lack, 0.0)):.1f}')
+    return '; '.join(f'{words} (the data at hand distinguish {", ".join(names)} sigma)'
+                     for words, names in found.items() if words)

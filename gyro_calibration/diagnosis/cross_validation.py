@@ -21,6 +21,7 @@ from gyro_calibration.diagnosis.replay import Replay
 from gyro_calibration.diagnosis.search import relaid, Search, searched
 from gyro_calibration.logs.log import Array, Mask
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 #: The heading is compared over so long, s.
@@ -67,23 +68,43 @@ def gain(search: Search, causes: Collection[str], given: bool) -> Gain | None:
         for some in ((), [each for each in named if each.candidate.cause == 'time_offset'], named))
     models = {'given': None, 'straight': straight, 'plain': plain, 'extended': extended}
     squares: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
-    counts: list[int] = []
+    counts: list[tuple[int, int]] = []
     for run, (each, out) in enumerate(zip(replays, held)):
         left = {name: _left(each, run, found) for name, found in models.items()}
         number = _numbers(each, length)
         for part in (out & (number == place) for place in np.unique(number[out])):
-            counts.append(int(np.count_nonzero(part)))
+            counts.append((int(np.count_nonzero(part)), 1))
             for name, (of_rate, increments) in left.items():
                 turned = float(np.mean(increments[part]) * np.ptp(each.channels.time[part]))
                 squares[name].append((float(np.sum(of_rate[part] ** 2)), turned ** 2))
-    both = np.array([squares['given' if given else 'straight'], squares['extended']])
-    rate = change_over(both[:, :, 0].T, np.array(counts, float))
-    heading = change_over(both[:, :, 1].T, np.ones(len(counts))) if length >= WINDOW else None
-    words = (f'every third {length:.3g} s of the log' if len(replays) == 1
-             else f'every third {length:.3g} s of each log')
-    return Gain(f'{words}, {len(counts)} parts', rate, heading, WINDOW, {
-        name: float(np.sqrt(np.mean([turned for _, turned in each])))
-        for name, each in squares.items() if name != 'straight' and heading is not None})
+    which = 'the log' if len(replays) == 1 else 'each log'
+    return gain_of(f'every third {length:.3g} s of {which}, {len(counts)} parts', squares, counts,
+                   'given' if given else 'straight', WINDOW if length >= WINDOW else None)
+
+
+def gain_of(held_out: str, squares: Mapping[str, ArrayLike], counts: ArrayLike, before: str,
+            window: float | None) -> Gain:
+    """
+    Return what was won on parts that were held out.
+
+    Parameters
+    ----------
+    held_out : which parts, in words
+    squares : model -> sums of the squares of each part: of the rate error, and of the heading
+        error over windows, shape (parts, 2)
+    counts : how many were summed, shape (parts, 2)
+    before : the model that the extended one is compared with
+    window : s; None where the parts are shorter than it
+
+    """
+    rate, heading = (change_over(np.array([squares[before], squares['extended']])[:, :, k].T,
+                                 np.array(counts, float)[:, k]) for k in (0, 1))
+    if window is None:
+        return Gain(held_out, rate, None, WINDOW)
+    whole = np.sum(counts, axis=0)[1]
+    return Gain(held_out, rate, heading, window, {
+        name: float(np.sqrt(np.sum(each, axis=0)[1] / whole))
+        for name, each in squares.items() if name != 'straight'})
 
 
 def held_out(each: Replay, length: float) -> Mask:

@@ -22,12 +22,12 @@ Steps of codes and units need no chance, but a size that matters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.dwells.samples import output_of, where_lost
-from gyro_calibration.diagnosis.causes import CAUSES
+from gyro_calibration.diagnosis.causes import CAUSES, finding
 from gyro_calibration.diagnosis.expected_output import (
     bridged,
     compare,
@@ -124,8 +124,8 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
         name = unit_of_scale(ratio, deviation)
         if name is not None:
             factor = 1.0 / FACTORS[name]
-            units = [finding(
-                'unit_error', ratio, (ratio - 1.96 * deviation, ratio + 1.96 * deviation),
+            units = [_sized(
+                'unit_error', ratio, 1.96 * deviation,
                 float(2.0 * stats.norm.sf(abs(ratio - 1.0) / max(deviation, 1e-300))),
                 f'the output is {ratio:.5g} +- {deviation:.2g} times what the reference says, and '
                 f'{name} is {FACTORS[name]:.5g}',
@@ -156,19 +156,10 @@ def decided(clean: DataQuality) -> DataQuality:
                    remarks=(*clean.remarks, note))
 
 
-def finding(name: str, value: float, interval: tuple[float, float], p_value: float, evidence: str,
-            confounders: tuple[str, ...] = ()) -> Finding:
-    """Return a finding of a cause with one parameter."""
-    cause = CAUSES[name]
-    unit = next(iter(cause.units.values()))
-    return Finding(name, cause.sentence, {name: Estimate(value, interval, unit)}, p_value,
-                   ambiguous_with=confounders,
-                   separate_by=cause.separate_by if confounders else '',
-                   evidence=evidence, along=cause.along)
-
-
-def _counted(name: str, count: int, p_value: float, evidence: str) -> Finding:
-    return finding(name, float(count), (float(count), float(count)), p_value, evidence)
+def _sized(name: str, value: float, half: float, p_value: float, evidence: str,
+           confounders: Sequence[str] = ()) -> Finding:
+    return finding(name, {name: Estimate.about(float(value), half, CAUSES[name].unit)}, p_value,
+                   confounders, evidence=evidence)
 
 
 def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
@@ -189,8 +180,8 @@ def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     jitter = robust_deviation(steps - np.median(steps)) + 1e-9 * stamps.interval
     late = (lost.max() - 0.5) * stamps.interval / jitter
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
-    return found if chance >= LEVEL else replace(found, findings=(*found.findings, _counted(
-        'dropped_samples', int(lost.sum()), chance, stamps.said_of_lost[0].rstrip('.'))))
+    return found if chance >= LEVEL else replace(found, findings=(*found.findings, _sized(
+        'dropped_samples', int(lost.sum()), 0.0, chance, stamps.said_of_lost[0].rstrip('.'))))
 
 
 def _remarks_of_pace(stamps: Stamps) -> Iterator[str]:
@@ -292,17 +283,15 @@ def _of_codes(codes: Codes, seen: Compared, limit: Limit | None, at_limit: Mask,
     if (codes.step >= STEP * seen.white and codes.step
             and not _knows(model, 'quantization', codes.step)):
         chance = float(np.exp(-min(codes.counts.sum() * codes.aligned ** 2, 700.0)))
-        within = 1.96 * codes.deviation
-        yield finding('quantization', codes.step, (codes.step - within, codes.step + within),
-                      chance, f'the output has {len(codes.values)} codes, '
-                      f'{codes.step / DEGREE:.4g} deg/s apart, where its white noise is '
-                      f'{seen.white / DEGREE:.3g} deg/s')
+        yield _sized('quantization', codes.step, 1.96 * codes.deviation, chance,
+                     f'the output has {len(codes.values)} codes, {codes.step / DEGREE:.4g} deg/s '
+                     f'apart, where its white noise is {seen.white / DEGREE:.3g} deg/s')
     if limit is not None and not _knows(model, 'saturation', limit.size):
         sides = [f'{value / DEGREE:.5g} deg/s' for value in (limit.low, limit.high)
                  if np.isfinite(value)]
-        yield finding('saturation', limit.size, (limit.size, limit.size), limit.p_value,
-                      f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) '
-                      f'have the extreme code {" or ".join(sides)}')
+        yield _sized('saturation', limit.size, 0.0, limit.p_value,
+                     f'{np.count_nonzero(at_limit)} samples ({100.0 * at_limit.mean():.2g} %) '
+                     f'have the extreme code {" or ".join(sides)}')
 
 
 def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | None, log: Log,
@@ -312,30 +301,28 @@ def _of_single_samples(repeated: RepeatedSamples | None, outlying: Outliers | No
     if repeated is not None:
         count = int(np.count_nonzero(repeated.repeats))
         first = log.time[int(np.argmax(repeated.repeats))]
-        yield _counted('stuck_samples', count, repeated.p_value,
-                       f'{count} samples in {repeated.runs} runs repeat the one before, the first '
-                       f'at {first:.3f} s; codes and noise explain {repeated.explained:.2g} '
-                       'repeats in the whole log')
+        yield _sized('stuck_samples', count, 0.0, repeated.p_value,
+                     f'{count} samples in {repeated.runs} runs repeat the one before, the first '
+                     f'at {first:.3f} s; codes and noise explain {repeated.explained:.2g} '
+                     'repeats in the whole log')
     if outlying is not None:
         count = int(np.count_nonzero(outlying.samples))
         first = log.time[int(np.argmax(outlying.samples))]
-        yield _counted('outliers', count, outlying.p_value,
-                       f'{count} single samples are up to {outlying.largest:.0f} standard '
-                       f'deviations off their neighbours, the first at {first:.3f} s')
+        yield _sized('outliers', count, 0.0, outlying.p_value,
+                     f'{count} single samples are up to {outlying.largest:.0f} standard '
+                     f'deviations off their neighbours, the first at {first:.3f} s')
     interval = float(np.median(np.diff(log.time)))
     if step and (not white or step ** 2 / 6.0 / (interval * white) ** 2 > REFERENCE_STEP):
-        yield finding('reference_quantization', step, (step, step), 0.0,
-                      f'the reference heading comes in steps of {step / DEGREE:.4g} deg: its rate '
-                      'over one sample is uncertain by '
-                      f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
-                      f'{white / DEGREE:.3g} deg/s of noise')
+        yield _sized('reference_quantization', step, 0.0, 0.0,
+                     f'the reference heading comes in steps of {step / DEGREE:.4g} deg: its rate '
+                     'over one sample is uncertain by '
+                     f'{step / np.sqrt(6.0) / interval / DEGREE:.3g} deg/s, where the gyro has '
+                     f'{white / DEGREE:.3g} deg/s of noise')
 
 
 # the kind of the reference
 
 KINDS = ('rate_command', 'encoder', 'motion_capture', 'course', 'odometry', 'gyro', 'rest')
-#: Kinds that tell a heading, with errors that are not those of a rate.
-OF_HEADING = ('encoder', 'motion_capture', 'course', 'odometry', 'gyro')
 #: Span over which the errors of gyro and reference are compared, s, and by what factor those of a
 #: course are larger than the noise of the gyro (measured: 22 to 560; exact references up to 66).
 _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
@@ -418,16 +405,14 @@ def rate_noise_share(log: Log) -> float:
     quiet = np.repeat(energy <= np.quantile(energy, _QUIETEST), _BLOCK)
     fast, left = fast[: len(quiet)][quiet], left[: len(quiet)][quiet]
     energy_of_fast = float(fast @ fast)
-    if energy_of_fast > 0.0 and float(fast[1:] @ fast[:-1]) < _WHITE * energy_of_fast:
-        variance = energy_of_fast / len(fast) / 20.0
-        gyro = float(np.mean(left**2)) / 20.0 - variance * line[0] ** 2
-        return math.sqrt(variance / max(gyro, 1e-3 * variance))
-    product = -fast * left / 20.0
-    # third differences of white noise are correlated over three samples
-    deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
-    variance = float(np.mean(product)) / line[0]
-    if not variance > _SEEN * deviation:
-        return 0.0
+    variance = energy_of_fast / len(fast) / 20.0
+    if not (variance > 0.0 and float(fast[1:] @ fast[:-1]) < _WHITE * energy_of_fast):
+        product = -fast * left / 20.0
+        # third differences of white noise are correlated over three samples
+        deviation = 2.0 * float(np.std(product)) / math.sqrt(len(product))
+        variance = float(np.mean(product)) / line[0]
+        if not variance > _SEEN * deviation:
+            return 0.0
     gyro = float(np.mean(left**2)) / 20.0 - variance * line[0] ** 2
     return math.sqrt(variance / max(gyro, 1e-3 * variance))
 

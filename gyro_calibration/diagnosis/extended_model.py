@@ -18,8 +18,8 @@ from dataclasses import replace
 from gyro_calibration.calibration.self_calibration import Limits
 from gyro_calibration.diagnosis.data_quality import DataQuality
 from gyro_calibration.diagnosis.findings import Finding
-from gyro_calibration.diagnosis.noise_parameters import NAMES
 from gyro_calibration.diagnosis.regression import FittedValues, happens_once, Named, seen
+from gyro_calibration.diagnosis.residuals import NAMES
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import (
     BIAS,

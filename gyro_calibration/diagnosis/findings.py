@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 from gyro_calibration.logs.log import Array
@@ -38,9 +39,21 @@ class Estimate:
         """Return a value with an interval of half a length on each side."""
         return cls(value, (value - half, value + half), unit)
 
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of which the interval has 1.96 each way."""
+        return (self.interval[1] - self.interval[0]) / (2.0 * 1.96)
+
     def figures(self) -> dict[str, Any]:
         """Return it as data."""
         return {'estimate': self.estimate, 'ci95': list(self.interval), 'unit': self.unit}
+
+
+def probabilities(lacks: Mapping[str, float]) -> dict[str, float]:
+    """Return how probable causes are by what each lacks in log-likelihood, likeliest first."""
+    weights = {name: math.exp(-min(max(lack, 0.0), 700.0)) for name, lack in lacks.items()}
+    return {name: max(weight / sum(weights.values()), LEAST_PROBABILITY)
+            for name, weight in sorted(weights.items(), key=lambda each: -each[1])}
 
 
 @dataclass(frozen=True)
@@ -159,12 +172,6 @@ class Change:
     def worse(self) -> bool:
         """Tell whether the error grew beyond chance."""
         return self.interval is not None and self.interval[1] < 0.0
-
-    def scaled(self, factor: float) -> Change:
-        """Return the errors in another unit."""
-        interval = (None if self.interval is None
-                    else (factor * self.interval[0], factor * self.interval[1]))
-        return Change(factor * self.before, factor * self.after, interval)
 
     def figures(self) -> dict[str, Any]:
         """Return it as data."""

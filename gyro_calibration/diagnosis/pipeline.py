@@ -17,16 +17,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 import math
 
-from gyro_calibration.diagnosis.candidates import along, constant, fitted_shapes, is_named
-from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES, with_remedies
-from gyro_calibration.diagnosis.cross_validation import gain, shares
-from gyro_calibration.diagnosis.curves import (
-    beside_model,
-    curves,
-    heading_curve,
-    noise_curve,
-    what_is_left,
+from gyro_calibration.diagnosis.candidates import (
+    along,
+    constant,
+    fitted_shapes,
+    is_named,
+    observed_range,
 )
+from gyro_calibration.diagnosis.causes import (
+    CAUSES,
+    experiment,
+    finding,
+    REFERENCES,
+    with_remedies,
+)
+from gyro_calibration.diagnosis.cross_validation import gain, shares
 from gyro_calibration.diagnosis.data_quality import (
     DataQuality,
     decided,
@@ -35,7 +40,6 @@ from gyro_calibration.diagnosis.data_quality import (
     reference_of,
 )
 from gyro_calibration.diagnosis.expected_output import unit_of_offset
-from gyro_calibration.diagnosis.experiments import experiment
 from gyro_calibration.diagnosis.extended_model import (
     calibrated,
     extended,
@@ -50,11 +54,10 @@ from gyro_calibration.diagnosis.findings import (
     Finding,
     Gain,
     Gate,
-    LEAST_PROBABILITY,
+    probabilities,
     Unexplained,
 )
 from gyro_calibration.diagnosis.gates import gates, mismatch, model_gate, refuse, rests
-from gyro_calibration.diagnosis.noise_parameters import NAMES, noise_parameters, NoiseParameters
 from gyro_calibration.diagnosis.noisy_reference import diagnose_by_noisy_reference
 from gyro_calibration.diagnosis.regression import (
     filtered,
@@ -65,6 +68,16 @@ from gyro_calibration.diagnosis.regression import (
     Value,
 )
 from gyro_calibration.diagnosis.replay import Replay, replay
+from gyro_calibration.diagnosis.residuals import (
+    beside_model,
+    curves,
+    heading_curve,
+    NAMES,
+    noise_curve,
+    noise_parameters,
+    NoiseParameters,
+    what_is_left,
+)
 from gyro_calibration.diagnosis.search import (
     alternatives,
     begin,
@@ -203,7 +216,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         cause = known.candidate.cause
         findings.append(named_finding(search, found, place, chance, members, experiment(
             cause, [(each.candidate.cause, lack) for each, lack in members
-                    if each.candidate.cause != cause], found.replays)))
+                    if each.candidate.cause != cause], observed_range(found.replays))))
     best: dict[str, Finding] = {}  # of the records, by the log that shows it best
     for each in (each for clean in quality for each in clean.findings):
         if each.effect not in best or each.p_value < best[each.effect].p_value:
@@ -366,13 +379,10 @@ def _of_model(found: FittedValues, model: GyroModel, noise: Noise, rate: float) 
             ('scale_factor_error', scale.value, float(deviations[1]), ('reference_scale',))):
         chance = float(2.0 * norm.sf(abs(value) / deviation)) if deviation > 0.0 else 1.0
         if chance < _OF_BIAS * rate:
-            cause = CAUSES[name]
-            different.append(Finding(
-                name, cause.sentence, {name: Estimate.about(value, 1.96 * deviation,
-                                                            next(iter(cause.units.values())))},
-                chance, 5.4 * deviation, confounders, cause.separate_by if confounders else '',
-                f'it comes on top of that of the model, {abs(value) / deviation:.3g} standard '
-                'deviations from zero', cause.along))
+            different.append(finding(
+                name, {name: Estimate.about(value, 1.96 * deviation, CAUSES[name].unit)}, chance,
+                confounders, minimum_detectable=5.4 * deviation, evidence='it comes on top of '
+                f'that of the model, {abs(value) / deviation:.3g} standard deviations from zero'))
     return different
 
 
@@ -395,13 +405,11 @@ def _of_noise(figures: NoiseParameters, model: GyroModel, rate: float,
             low, high = model.noise_bounds.get(name, (math.inf, -math.inf))
             if figures.interval[name][0] <= high and low <= figures.interval[name][1]:
                 continue
-            cause, value = CAUSES[name], getattr(figures.noise, name)
-            unit = next(iter(cause.units.values()))
-            evidence = (f'the model says {amount(getattr(expected, name), unit, name)}, the log '
-                        f'{amount(value, unit, name)}')
-            found.append(Finding(name, cause.sentence,
-                                 {name: Estimate(value, figures.interval[name], unit)},
-                                 figures.chance[name], None, evidence=evidence, along=cause.along))
+            unit, value = CAUSES[name].unit, getattr(figures.noise, name)
+            found.append(finding(
+                name, {name: Estimate(value, figures.interval[name], unit)}, figures.chance[name],
+                evidence=f'the model says {amount(getattr(expected, name), unit, name)}, the log '
+                f'{amount(value, unit, name)}'))
     return found
 
 
@@ -472,15 +480,13 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
                   members: Members, separate_by: str) -> Finding:
     """Return what is known of a named cause, and of those that may be in its place."""
     known = found.named[place]
-    candidate, name, cause = known.candidate, known.candidate.cause, CAUSES[known.candidate.cause]
+    candidate, name = known.candidate, known.candidate.cause
     parameters = _parameters(found, place)
-    lacks = {name: 0.0, **{each.candidate.cause: lack for each, lack in reversed(members)}}
-    weights = {other: math.exp(-max(lack, 0.0)) for other, lack in lacks.items()}
-    probability = {other: max(weight / sum(weights.values()), LEAST_PROBABILITY)
-                   for other, weight in sorted(weights.items(), key=lambda each: -each[1])}
+    probability = probabilities({name: 0.0, **{
+        each.candidate.cause: lack for each, lack in reversed(members)}})
     confounders = [each.candidate.cause for each, _ in members if each.candidate.cause != name]
     size = next(iter(parameters.values()))
-    deviation = (size.interval[1] - size.interval[0]) / (2.0 * _DEVIATIONS)
+    deviation = size.deviation
     if name == 'time_offset' and unit_of_offset(size.estimate, deviation,
                                                 found.replays[0].interval):
         confounders.append('unit_error')
@@ -494,12 +500,12 @@ def named_finding(search: Search, found: FittedValues, place: int, p_value: floa
         where = candidate.shapes[0], float(found.replays[candidate.run or 0].channels.time[-1])
     elif name == 'reference_slip':
         where = min(candidate.shapes[1:]), max(candidate.shapes[1:])
-    return Finding(
-        name, cause.sentence, parameters, p_value,
-        smallest * deviation if deviation > 0.0 else None, tuple(dict.fromkeys(confounders)),
-        separate_by or (cause.separate_by if confounders else ''),
-        f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0 else '',
-        cause.along, probability=probability, where=where,
+    return finding(
+        name, parameters, p_value, tuple(dict.fromkeys(confounders)),
+        minimum_detectable=smallest * deviation if deviation > 0.0 else None,
+        separate_by=separate_by or (CAUSES[name].separate_by if confounders else ''),
+        evidence=(f'{log}{abs(size.estimate) / deviation:.3g} sigma from zero' if deviation > 0.0
+                  else ''), probability=probability, where=where,
         remedy=_ONCE if happens_once(known) else '')
 
 

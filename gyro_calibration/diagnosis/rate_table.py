@@ -35,8 +35,8 @@ from gyro_calibration.calibration.scatter import (
     Whitener,
 )
 from gyro_calibration.calibration.selection import supported_effects, swapped_effects
-from gyro_calibration.diagnosis.causes import CAUSES, with_remedies
-from gyro_calibration.diagnosis.cross_validation import change_over, WINDOW
+from gyro_calibration.diagnosis.causes import CAUSES, finding, with_remedies
+from gyro_calibration.diagnosis.cross_validation import gain_of, WINDOW
 from gyro_calibration.diagnosis.data_quality import decided, inspect
 from gyro_calibration.diagnosis.dwell_fit import (
     alternatives,
@@ -178,13 +178,13 @@ def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
     if not known.any():
         return None
     numbered = np.unique(parts[known], return_inverse=True)[1]
-    both = np.column_stack([errors['plain' if model is None else 'given'], errors['extended']])
-    change = change_over(summed(both[known] ** 2, numbered), np.bincount(numbered).astype(float))
     what = 'sweeps' if len(np.unique(dwells.sweep)) >= FEWEST_SWEEPS else 'consecutive dwells'
-    # A heading error is that of so long a turn at the rate of a dwell.
-    return Gain(f'{what} left out, each of {groups.max() + 1} groups in turn', change,
-                change.scaled(WINDOW), WINDOW,
-                {name: WINDOW * float(rms(error[known])) for name, error in errors.items()})
+    # a heading error is that of so long a turn at the rate of a dwell
+    squares = {name: np.outer(np.bincount(numbered, error[known] ** 2), [1.0, WINDOW ** 2])
+               for name, error in errors.items()}
+    return gain_of(f'{what} left out, each of {groups.max() + 1} groups in turn', squares,
+                   np.outer(np.bincount(numbered), [1, 1]),
+                   'plain' if model is None else 'given', WINDOW)
 
 
 def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
@@ -202,10 +202,9 @@ def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Findin
     far = (np.abs(fit.residual) / deviation)[outlying]
     chance = min(1.0, len(dwells) * 2.0 * float(student.sf(far.max(), freedom)))
     if chance < level:
-        cause, count = CAUSES['outliers'], float(len(outlying))
         places = listed([dwells.place[row] for row in outlying])
-        yield Finding('outliers', cause.sentence.replace('samples', 'dwells'),
-                      {'outliers': Estimate(count, (count, count), '1')}, chance,
+        yield finding('outliers', {'outliers': Estimate.about(float(len(outlying)), 0.0, '1')},
+                      chance, cause=CAUSES['outliers'].sentence.replace('samples', 'dwells'),
                       evidence=f'{len(outlying)} of {len(dwells)} dwells are up to '
                       f'{far.max():.0f} standard deviations off what the others say: {places}',
                       along=RATE)
@@ -228,17 +227,17 @@ def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
 
 
 def _finding(named: Named, effect: Effect) -> Finding:
-    cause, others = CAUSES[effect.name], alternatives(named.fit, effect)
-    along = 'temperature_while_turning' if effect is SCALE_FACTOR_TEMPERATURE else cause.along
+    others = alternatives(named.fit, effect)
+    along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     term, deviations = _with_deviations(named.fit, effect)
     own, parameters = _own_values(named, effect), effect.parameters
     # what is added to the model's values; 1.96 deviations hold 95 %
     estimates = {parameters[place].name: Estimate.about(
         term.values[place] - own[place], 1.96 * deviation, parameters[place].unit)
         for place, deviation in zip(term.fitted, deviations)}
-    return Finding(effect.name, cause.sentence, estimates, named.chance_of(effect),
-                   _smallest(named, effect), others.names, others.separate_by,
-                   _evidence(named, effect), along)
+    return finding(effect.name, estimates, named.chance_of(effect), others.names,
+                   minimum_detectable=_smallest(named, effect), separate_by=others.separate_by,
+                   evidence=_evidence(named, effect), **along)
 
 
 def _own_values(named: Named, effect: Effect) -> tuple[float, ...]:

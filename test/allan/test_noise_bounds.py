@@ -10,8 +10,8 @@
 
 """Noise within the bounds that a model states is that of the model, and no finding."""
 
-from gyro_calibration.diagnosis.noise_parameters import NoiseParameters
 from gyro_calibration.diagnosis.pipeline import _of_noise
+from gyro_calibration.diagnosis.residuals import NoiseParameters
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import Noise
 import pytest

@@ -11,10 +11,17 @@
 """Causes: all that the catalogue of effects lists can be named."""
 
 import re
+import zlib
 
-from gyro_calibration.diagnosis.causes import CAUSES, REFERENCES
-from gyro_calibration.logs.log import QUANTITIES
+from diagnosed import diagnosis_of, log_of
+from gyro_calibration.diagnosis.candidates import observed_range
+from gyro_calibration.diagnosis.causes import CAUSES, experiment, REFERENCES
+from gyro_calibration.diagnosis.replay import replay
+from gyro_calibration.logs.log import DEGREE, QUANTITIES
 from gyro_calibration.model.effects import CATALOGUE
+from gyro_calibration_bench.hidden import hide
+from gyro_calibration_bench.hidden.twins import twin, TWINS
+import numpy as np
 import pytest
 
 
@@ -28,12 +35,10 @@ def test_causes_are_the_effects_of_the_gyro_with_their_sentences_and_those_of_th
     assert all(CAUSES[name].sentence == effect.cause for name, effect in CATALOGUE.items())
 
 
-def test_a_cause_has_units_and_an_experiment_that_separates_it_from_its_confounders():
+def test_a_cause_has_units_and_a_variable_along_which_it_shows():
     for name, cause in CAUSES.items():
         assert cause.name == name and cause.units and cause.along
         assert re.match(r'[A-Z].*\.$', cause.sentence), name
-        assert bool(cause.confounders) == bool(cause.separate_by), name
-        assert all(name in CAUSES[other].confounders for other in cause.confounders), name
         assert (cause.needs <= {*QUANTITIES, 'reference'}
                 and cause.of in {'gyro', 'reference', 'record', 'noise'}), name
     assert len({cause.sentence for cause in CAUSES.values()}) == len(CAUSES)
@@ -51,3 +56,54 @@ def test_what_a_log_must_hold_to_show_a_cause(name, needed):
 
 def test_a_reference_is_a_column_of_a_log():
     assert set(REFERENCES) <= set(QUANTITIES)
+
+
+#: What physics wants for each pair of twins, in their order.
+WANTED = dict(zip(TWINS, [
+    'heat and cool', 'heat and cool', 'rest for', 'whole turns', 'at eight speeds', 'motor',
+    'axis up, level, down', 'beyond', 'quick reversals', 'corners', 'corners', 'again', 'again',
+    'step the supply', 'axis up', 'whole turns']))
+
+
+@pytest.fixture(name='laid', scope='module')
+def _laid():
+    log = log_of(hide(['bias'], 1.0, np.random.default_rng(3), sample_rate=20.0,
+                      conditions={'top_rate': 2.0})[0])
+    return replay(log, np.ones(len(log), bool), np.random.default_rng(1))
+
+
+@pytest.mark.parametrize('pair', TWINS, ids='-'.join)
+def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair, laid):
+    for one, other in (pair, pair[::-1]):
+        words = experiment(one, [(other, 2.0)], observed_range([laid]))
+        assert WANTED[pair] in words and f'{other.replace("_", " ")} by 2.0 sigma' in words
+
+
+def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
+    def numbers(one, other):
+        words = experiment(one, [(other, 0.0)], observed_range([laid])).partition(' (')[0]
+        return [float(each) for each in re.findall(r'-?\d+\.?\d*', words)]
+    top = float(np.abs(laid.channels.rate).max()) / DEGREE
+    assert numbers('sine_response', 'saturation') == pytest.approx([3.0 * top, top], rel=0.01)
+    low, high, again = numbers('bias_temperature', 'rate_ramp')
+    degc = laid.channels.temperature
+    assert low <= degc.min() and high == again >= degc.max() and high - low >= 20.0
+    assert numbers('warm_up', 'rate_ramp')[0] * 60.0 >= 4.0 * laid.duration
+
+
+def test_a_set_of_three_names_each_experiment_once(laid):
+    words = experiment('cubic_nonlinearity', [('sine_response', 0.0), ('saturation', 0.5)],
+                       observed_range([laid]))
+    assert words.count('turn both ways') == 1
+    assert 'sine response by 0.0, saturation by 1.0' in words
+    assert not experiment('outliers', [('dropped_samples', 0.0)], {})
+
+
+def test_a_set_that_is_found_has_its_experiment():
+    pair = ('bias_temperature', 'warm_up')
+    generator = np.random.default_rng(zlib.crc32(b'a set'))
+    found = diagnosis_of([twin(pair, pair[0], generator, sample_rate=10.0)], generator)
+    (finding,) = found.findings
+    assert {finding.effect, *finding.ambiguous_with} >= set(pair)
+    assert 'heat and cool it twice' in finding.separate_by and 'sigma' in finding.separate_by
+    assert all(CAUSES[name].separate_by for name in finding.ambiguous_with)

@@ -10,9 +10,9 @@
 
 """The residual along each variable: bands of 95 % hold 95 % of it, whatever the noise."""
 
-from gyro_calibration.diagnosis.curves import curves, what_is_left
 from gyro_calibration.diagnosis.regression import fitted, FittedValues, regression_problem
 from gyro_calibration.diagnosis.replay import replay
+from gyro_calibration.diagnosis.residuals import curves, what_is_left
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
