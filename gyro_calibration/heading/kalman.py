@@ -69,12 +69,6 @@ class Turn:
                     self.sensitivity + other.sensitivity,
                     self.lost + other.lost, self.noise + other.noise)
 
-    def add(self, duration: float, turned: float, sensitivity: Array) -> None:
-        """Take in what the next sample brings."""
-        self.duration += duration
-        self.turned += turned
-        self.sensitivity += sensitivity
-
     def __sub__(self, other: Turn) -> Turn:
         """Return what is left of this one behind another with which it begins."""
         return Turn(self.duration - other.duration, self.turned - other.turned,
@@ -121,13 +115,22 @@ class Drift:
 
     def step(self, turn: Turn) -> Step:
         """Return how the state changes over a turn."""
-        seen, kept, grown = _step(self.noise, round(turn.duration, 6), turn.unseen,
-                                  len(turn.sensitivity))
-        seen, grown = seen.copy(), grown.copy()
+        seen, variance = self._seen(turn)
+        _, kept, grown = self._wandered(turn)
+        grown = grown.copy()
+        grown[HEADING, HEADING] = variance
+        return Step(seen, kept, grown)
+
+    def _wandered(self, turn: Turn) -> tuple[Array, Array, Array]:
+        return _step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
+
+    def _seen(self, turn: Turn) -> tuple[Array, float]:
+        """Return `Step.seen`, and the variance of what comes in new to the integral, rad²."""
+        seen, _, grown = self._wandered(turn)
+        seen = seen.copy()
         seen[len(seen) - len(turn.sensitivity):] = -turn.sensitivity
         white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
-        grown[HEADING, HEADING] += white + turn.lost + turn.noise
-        return Step(seen, kept, grown)
+        return seen, float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise
 
     def moved(self, turn: Turn) -> Drift:
         """Return the state after a turn."""
@@ -144,15 +147,10 @@ class Drift:
 
     def heading_variances(self, turns: list[Turn]) -> Array:
         """Return the same after each of several turns, shape (k,)."""
-        steps = [_step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
-                 for turn in turns]
-        rows = -np.array([seen for seen, _, _ in steps])
+        seen, variances = zip(*map(self._seen, turns))
+        rows = -np.array(seen)
         rows[:, HEADING] += 1.0
-        rows[:, self.calibrated:] = [turn.sensitivity for turn in turns]
-        white = self.noise.angle_random_walk ** 2
-        grown = [float(each[HEADING, HEADING]) + white * turn.duration * (not turn.unseen)
-                 + turn.lost + turn.noise for (_, _, each), turn in zip(steps, turns)]
-        return np.einsum('ki,ij,kj->k', rows, self.covariance, rows) + grown
+        return np.asarray((rows @ self.covariance * rows).sum(axis=1) + variances)
 
     def rested(self, turn: Turn) -> Drift:
         """Return the state after a time in which the true rate was zero."""
@@ -190,13 +188,8 @@ class Drift:
 
     def expected(self, turn: Turn) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
-        values, noise = len(turn.sensitivity), self.noise
-        seen, _, grown = _step(noise, round(turn.duration, 6), turn.unseen, values)
-        seen = seen.copy()
-        seen[len(seen) - values:] = -turn.sensitivity
-        white = 0.0 if turn.unseen else noise.angle_random_walk ** 2 * turn.duration
-        return (float(seen @ self.mean), float(seen @ self.covariance @ seen)
-                + float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise)
+        seen, variance = self._seen(turn)
+        return float(seen @ self.mean), float(seen @ self.covariance @ seen) + variance
 
     @cached_property
     def offset(self) -> tuple[float, float]:
@@ -268,6 +261,15 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
         whole[-1, -1] = max(whole[-1, -1] - noise.floor ** 2, 0.0) + of_each * np.sum(within)
         whole[-1, flicker] = whole[flicker, -1] = -of_each * shared * np.exp(-age / constants)
     return Drift(noise, mean, whole)
+
+
+def surprises(drifts: list[Drift], turns: list[Turn]) -> Array:
+    """Return how far each turn is off that of a rest after its state, in standard deviations."""
+    seen, variances = zip(*(drift._seen(turn) for drift, turn in zip(drifts, turns)))
+    rows, means = np.array(seen), np.array([drift.mean for drift in drifts])
+    along = np.matmul(np.array([drift.covariance for drift in drifts]), rows[:, :, None])[:, :, 0]
+    return np.asarray(([turn.turned for turn in turns] - (rows * means).sum(axis=1))
+                      / np.sqrt((rows * along).sum(axis=1) + variances))
 
 
 @lru_cache(maxsize=4096)

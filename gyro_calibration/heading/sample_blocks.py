@@ -84,18 +84,19 @@ class EvenSamples:
     moving, resting : sensitivities, shape (n, m)
     seen : those that were used, with that of the sample before, shape (n + 1, m)
     begins, ends, whole : of the blocks, and which of them are whole
-    sums : duration, integral, share of a pending correction that stays, half of the first
-        interval, and sums of the rates, their squares, and the squares of their steps, by block
-    weighted, weighted_at_rest : integrals of the sensitivities without the sample before, (k, m)
+    sums : duration, integral, share of a pending correction that stays, and sums of the rates,
+        their squares, and the squares of their steps, by block
+    weighted : integrals of the sensitivities in motion and at rest, shape (k, m) each
     found : what `HeadingTracker.follow` returns
+    rested : whether the last sample was taken at rest
     epochs : begun so far
 
     """
 
     def __init__(self, given: Samples, where: slice, last: tuple[float, float, float, Array],
-                 begun: float, found: Array):
+                 begun: float, rested: bool, found: Array):
         """Begin behind the last sample, with a block that has begun for some time, s."""
-        self._given, self._first, self.found = given, where.start, found
+        self._given, self._first, self.rested, self.found = given, where.start, rested, found
         self.time, self.rate = given.time[where], given.rate[where]
         self.moving, self.resting = given.moving[where], given.resting[where]
         count = len(self.time)
@@ -110,19 +111,20 @@ class EvenSamples:
             self.ends.append(count)
         self.begins = [0, *self.ends[:-1]]
         self.whole = range(bool(begun), whole)
-        weights = self.halves + np.append(self.halves[1:], 0.0)
-        weights[np.array(self.ends) - 1] = self.halves[np.array(self.ends) - 1]
-        self.weighted = self._by_blocks(weights[:, None] * self.moving)
-        self.weighted_at_rest = (self.weighted if self.resting is self.moving
-                                 else self._by_blocks(weights[:, None] * self.resting))
+        moving = self._weighted(self.moving)
+        self.weighted = moving, (moving if given.resting is given.moving
+                                 else self._weighted(self.resting))
         sums = [self._by_blocks(values).tolist() for values in (
             self.intervals, self.turned, self.rate, self.rate * self.rate, steps * steps)]
         self._kept = 1.0 - self.intervals / SETTLING
-        sums[2:2] = [np.multiply.reduceat(self._kept, self.begins).tolist(),
-                     self.halves[self.begins].tolist()]
+        sums.insert(2, np.multiply.reduceat(self._kept, self.begins).tolist())
         self.sums = list(zip(*sums))
         self.epochs = list[Epoch]()
         self._extremes: tuple[int, int, list[float], list[float]] = -1, 0, [], []
+
+    def _weighted(self, rows: Array) -> Array:
+        before = np.concatenate([self.seen[:1], rows[:-1]])
+        return self._by_blocks(self.halves[:, None] * (rows + before))
 
     def _by_blocks(self, values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, self.begins))
@@ -159,6 +161,8 @@ class EvenSamples:
         begin, epoch.end = max(epoch.place, 0), end
         if end <= begin:
             return
+        self.seen[epoch.place + 2:end + 2] = (
+            self.resting if epoch.resting else self.moving)[epoch.place + 1:end + 1]
         rows = self.found[begin:end]
         rows[:, 4] = epoch.resting
         if epoch.resting:

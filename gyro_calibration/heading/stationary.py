@@ -21,6 +21,7 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 
 from gyro_calibration.heading.gaps import CLOSE
@@ -79,16 +80,23 @@ class Block:
         self.differences += (rate - before) ** 2
 
 
+@lru_cache(maxsize=1024)
 def sigmas(lag: float, false_alarms: float) -> float:
     """Return the sigmas of a mean over `lag` s that give `false_alarms` per hour at rest."""
     chances = 3600.0 / lag * _OVERLAPPING
     return -float(ndtri(min(0.5 * false_alarms / (_TESTS * chances), 0.25)))
 
 
+@lru_cache(maxsize=1024)
+def _exceeded(freedom: int, chance: float) -> float:
+    """Return what chi squared exceeds by such a chance."""
+    return float(chdtri(freedom, chance))
+
+
 def most_scatter(lag: float, freedom: int, false_alarms: float) -> float:
     """Return the sum of squares of means over `lag` s that gives `false_alarms` an hour."""
     chances = 3600.0 / lag * _OVERLAPPING
-    return float(chdtri(freedom, min(false_alarms / (_TESTS * chances), 0.5)))
+    return _exceeded(freedom, min(false_alarms / (_TESTS * chances), 0.5))
 
 
 #: Tests that share the false alarms, and how many more chances windows have that overlap.
@@ -134,11 +142,11 @@ class Energy:
         self.factor = 1.0
         self._noise = noise
         self._level = false_alarms / (_TESTS * 3600.0 / WINDOW * _OVERLAPPING)
+        self._alarms = false_alarms / _OVERLAPPING
         self._blocks: deque[Block] = deque()
         self._energies, self._roughnesses = _Quietest(), _Quietest()
         self._since, self._interval = 0.0, BLOCK
         self._sudden: float | None = None
-        self._most: dict[tuple[int, float], float] = {}
 
     def clear(self) -> None:
         """Forget the window, as where rates of another calibration come."""
@@ -169,18 +177,12 @@ class Energy:
         energy = (squares - total * total / count) / (count - 1)
         self._learn(block.duration, count, energy / claimed, 0.5 * differences / count / claimed)
         claimed *= self.factor ** 2
-        if energy >= claimed * self._exceeded(count - 1, self._level) / (count - 1):
+        if energy >= claimed * _exceeded(count - 1, self._level) / (count - 1):
             return False
         # what a robot does is slower than its samples: means over blocks show it far better
         freedom = len(blocks) - 1
         return bool(freedom < 2 or means - total * total / count
-                    < claimed * self._exceeded(freedom, self._level))
-
-    def _exceeded(self, freedom: int, chance: float) -> float:
-        """Return what chi squared exceeds by such a chance."""
-        if (freedom, chance) not in self._most:
-            self._most[freedom, chance] = float(chdtri(freedom, chance))
-        return self._most[freedom, chance]
+                    < claimed * _exceeded(freedom, self._level))
 
     def _learn(self, duration: float, count: int, energy: float, differences: float) -> None:
         """
@@ -196,7 +198,7 @@ class Energy:
         self._since = 0.0
         quietest, rough = self._energies.add(energy), self._roughnesses.add(differences)
         if self._energies.count >= _NEEDED:
-            quietest = min(quietest, rough) * (count - 1) / self._exceeded(count - 1, 0.9)
+            quietest = min(quietest, rough) * (count - 1) / _exceeded(count - 1, 0.9)
             self.factor = math.sqrt(min(max(quietest, 1.0), _TRUSTED ** 2))
 
     def sudden(self) -> float:
@@ -207,7 +209,7 @@ class Energy:
 
         """
         if self._sudden is None:
-            limit = sigmas(self._interval, _TESTS * self._level * 3600.0 / WINDOW)
+            limit = sigmas(round(self._interval, 9), self._alarms)
             self._sudden = limit * self.factor * math.sqrt(
                 self._noise.rate_variance(self._interval))
         return self._sudden

@@ -26,7 +26,7 @@ import math
 
 from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
 from gyro_calibration.heading.integration import Threshold, ThresholdFilter
-from gyro_calibration.heading.kalman import begin, Drift, HEADING, Turn, WALK
+from gyro_calibration.heading.kalman import begin, Drift, HEADING, surprises, Turn, WALK
 from gyro_calibration.heading.sample_blocks import Epoch, EvenSamples, Samples, SETTLING
 from gyro_calibration.heading.stationary import (
     BEGINS,
@@ -161,11 +161,11 @@ class HeadingTracker:
                age: float | None) -> None:
         self._claimed, self._calibrated = noise, (covariance, age)
         self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
-        self._nothing, self._part = self._none(), self._none()
-        self._open = self._nothing
+        self._nothing = Turn(0.0, 0.0, np.zeros(len(covariance)))
+        self._part, self._open = self._none(), self._nothing
 
     def _none(self) -> Turn:
-        return Turn(0.0, 0.0, np.zeros(len(self._drift.mean) - self._drift.calibrated))
+        return Turn(0.0, 0.0, self._nothing.sensitivity)
 
     def set(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
@@ -181,7 +181,6 @@ class HeadingTracker:
                                        else settings.threshold)
         self._sigmas = {lag: _ALLOWED * sigmas(lag, settings.false_alarms)
                         for lag in (WINDOW, *LAGS)} if self._seeks else {}
-        self._most_scatter: dict[tuple[float, int], float] = {}
         if rests:
             self._rest()
         else:
@@ -374,7 +373,8 @@ class HeadingTracker:
         count = len(usual) - bool(lost)
         if count:
             piece = EvenSamples(given, slice(begin, begin + count), self._last,
-                                self._block.duration, found[begin:begin + count])
+                                self._block.duration, self.resting,
+                                found[begin:begin + count])
             self._gaps.add_many(piece.intervals, piece.rate, self._last[1])
             if not self._block.duration:
                 piece.epochs.append(self._epoch(-1))
@@ -388,6 +388,7 @@ class HeadingTracker:
                     continue
                 piece.close(piece.begins[number])
                 for place in range(piece.begins[number], until):
+                    piece.rested = self.resting
                     sample = given.sample(begin + place, self.resting)
                     piece.seen[place + 1] = sample[2]
                     self._add(*sample, lost=0)
@@ -419,13 +420,15 @@ class HeadingTracker:
         elif self._hesitates > 0.0:
             return False
         part, block, sums = self._part, self._block, piece.sums[number]
-        rows, weighted = (piece.resting, piece.weighted_at_rest) if self.resting else (
-            piece.moving, piece.weighted)
-        piece.seen[begin + 1:end + 1] = rows[begin:end]
-        part.duration, part.turned, decayed = sums[:3]
-        part.sensitivity = weighted[number] + sums[3] * piece.seen[begin]
-        block.duration, block.count, block.total, block.squares, block.differences = (
-            part.duration, end - begin, *sums[4:])
+        rows = piece.resting if self.resting else piece.moving
+        part.duration, part.turned, decayed, block.total, block.squares, block.differences = sums
+        part.sensitivity = piece.weighted[self.resting][number]
+        if self.resting != piece.rested:
+            assert self._last is not None
+            part.sensitivity = (part.sensitivity
+                                + piece.halves[begin] * (self._last[3] - rows[begin - 1]))
+            piece.rested = self.resting
+        block.duration, block.count = part.duration, end - begin
         turned = self._corrected(part)
         if self.resting:
             self.deleted += turned
@@ -457,14 +460,16 @@ class HeadingTracker:
         kept, last_kept = half * (filtered == rate), half * (last_filtered == last_rate)
         duration, turned = kept + last_kept, half * (filtered + last_filtered)
         if sensitivity is last_sensitivity:
-            self._part.add(duration, turned, duration * sensitivity)
-            turned -= duration * self._off(sensitivity)
+            seen, corrected = duration * sensitivity, turned - duration * self._off(sensitivity)
         else:
             seen = kept * sensitivity + last_kept * last_sensitivity
-            self._part.add(duration, turned, seen)
-            turned += float(seen @ self._values) - duration * self._offset
+            corrected = turned - duration * self._offset + float(seen @ self._values)
+        part = self._part
+        part.duration += duration
+        part.turned += turned
+        part.sensitivity = part.sensitivity + seen
         if self.resting:
-            self.deleted += turned
+            self.deleted += corrected
             return
         self.deleted += half * (rate - filtered + last_rate - last_filtered)
         if self._hesitates > 0.0:
@@ -473,7 +478,7 @@ class HeadingTracker:
         else:
             settled = self._pending * duration / SETTLING
             self._pending -= settled
-        self.heading += turned + settled
+        self.heading += corrected + settled
 
     def _look(self, duration: float, before: float, wheels: bool | None) -> None:
         """Look for sudden motion at each sample, and for any at the end of each block."""
@@ -572,12 +577,12 @@ class HeadingTracker:
 
     def _compare(self, wheels: bool | None) -> None:
         """Compare the means over the longer times with the bias that was known before them."""
-        for lag in LAGS:
-            before = self._before(lag)
-            if before is None:
-                return
-            turn = self._rested - before.turn
-            surprise = self._surprise(before.drift, turn)
+        known = [before for before in map(self._before, LAGS) if before is not None]
+        if not known:
+            return
+        turns = [self._rested - before.turn for before in known]
+        found = surprises([before.drift for before in known], turns).tolist()
+        for lag, before, turn, surprise in zip(LAGS, known, turns, found):
             if abs(surprise) > self._sigmas[lag]:
                 if wheels is False:
                     expected, _ = before.drift.expected(turn)
@@ -588,7 +593,7 @@ class HeadingTracker:
                 else:
                     self._notice(lag)
                 return
-        if wheels is not False:
+        if wheels is not False and len(known) == len(LAGS):
             self._compare_scatter()
 
     def _compare_scatter(self) -> None:
@@ -598,16 +603,11 @@ class HeadingTracker:
             before = self._before(lag)
             if before is None:
                 return
-            if last.squares - before.squares > self._scatter_limit(lag, last.means - before.means):
+            if last.squares - before.squares > _ALLOWED ** 2 * most_scatter(
+                    lag, last.means - before.means, self._settings.false_alarms):
                 self._notice(lag, max(self._snapshots, key=lambda each: (
                     last.squares - each.squares - BEGINS * (last.means - each.means))))
                 return
-
-    def _scatter_limit(self, lag: float, means: int) -> float:
-        if (lag, means) not in self._most_scatter:
-            self._most_scatter[lag, means] = _ALLOWED ** 2 * most_scatter(
-                lag, means, self._settings.false_alarms)
-        return self._most_scatter[lag, means]
 
     def _before(self, lag: float) -> Snapshot | None:
         """Return the state `lag` s before the last step of this rest; None if before its begin."""
