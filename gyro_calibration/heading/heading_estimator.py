@@ -376,7 +376,12 @@ class HeadingEstimator:
         self._look_at(time, output, float(result.rate), around, distance)
         message = tracker.add(time, rate, self._sensitivity, wheels, self._still)
         self.corrected, self.rate = rate, tracker.rate
-        self._gather(time, bool(message))
+        if message or not tracker.resting:
+            self._end_rest()
+        elif self.temperature is None or self.temperature_is_lost:
+            self._stretch = None
+        else:
+            self._gather(time, time, 1, float(result.modelled), self.temperature, [self._still])
         self._learn_at_rest(now)
         return message
 
@@ -529,9 +534,15 @@ class HeadingEstimator:
         self.corrected, self.rate = float(rate[-1]), float(found[-1, 2])
         self._sensitivity = tracker.sensitivity
         interval = np.diff(time, prepend=last)
-        self._gather_all(time, np.asarray(result.modelled), temperature, still,
-                         (found[:, 4] > 0.5) & (interval >= 0.0)
-                         & (interval <= self._settings.maximum_gap))
+        moving = np.flatnonzero((found[:, 4] < 0.5) | (interval < 0.0)
+                                | (interval > self._settings.maximum_gap))
+        first = int(moving[-1]) + 1 if len(moving) else 0
+        if first:
+            self._end_rest()
+        if first < len(time) and temperature is not None:
+            self._gather(float(time[first]), self._time, len(time) - first,
+                         float(np.sum(result.modelled[first:])),
+                         float(temperature[first:].sum()), (still[first], still[-1]))
 
     def _stills(self, time: Array, output: Array, result: Compensated, distance: Array) -> Array:
         """Return the sensitivities at rest, which are computed every `_STILL` s, shape (n, m)."""
@@ -576,46 +587,28 @@ class HeadingEstimator:
             temperature[places] if isinstance(temperature, np.ndarray) else temperature),
             distance[places]).T
 
-    def _gather_all(self, time: Array, modelled: Array, temperature: Array | None, still: Array,
-                    resting: Mask) -> None:
-        """Gather samples at rest to a stretch, as `_gather` does one by one."""
-        moving = np.flatnonzero(~resting)
-        first = int(moving[-1]) + 1 if len(moving) else 0
-        if first:
-            self._end_rest()
-        if first or temperature is None:
-            self._stretch = None
-        if first == len(time) or temperature is None:
-            return
-        if self._stretch is None:
-            self._stretch = _Stretch(float(time[first]), still[first])
-        stretch = self._stretch
-        stretch.count += len(time) - first
-        stretch.modelled += float(modelled[first:].sum())
-        stretch.temperature += float(temperature[first:].sum())
-        if time[-1] - stretch.begin >= STRETCH - CLOSE:
-            stretch.seen = 0.5 * (stretch.seen + still[-1])
-            self._pending.append(stretch)
-            self._stretch = None
-
     # What rests teach the next run
 
-    def _gather(self, time: float, restarted: bool) -> None:
-        """Gather samples at rest to stretches."""
-        if restarted or not self.tracker.resting:
-            self._end_rest()
-        if (restarted or not self.tracker.resting or self.temperature is None
-                or self.temperature_is_lost):
-            self._stretch = None
-            return
+    def _gather(self, begin: float, end: float, count: int, modelled: float, temperature: float,
+                seen: Sequence[Array]) -> None:
+        """
+        Add samples at rest to a stretch.
+
+        Parameters
+        ----------
+        begin, end : stamps of the first and the last, s
+        count, modelled, temperature : their number, and sums as in `_Stretch`
+        seen : sensitivities at rest, of which the first and the last count
+
+        """
         if self._stretch is None:
-            self._stretch = _Stretch(time, self._still)
+            self._stretch = _Stretch(begin, seen[0])
         stretch = self._stretch
-        stretch.count += 1
-        stretch.modelled += float(self.last.modelled)
-        stretch.temperature += self.temperature
-        if time - stretch.begin >= STRETCH - CLOSE:
-            stretch.seen = 0.5 * (stretch.seen + self._still)
+        stretch.count += count
+        stretch.modelled += modelled
+        stretch.temperature += temperature
+        if end - stretch.begin >= STRETCH - CLOSE:
+            stretch.seen = 0.5 * (stretch.seen + seen[-1])
             self._pending.append(stretch)
             self._stretch = None
 
@@ -637,6 +630,7 @@ class HeadingEstimator:
         return message
 
     def _end_rest(self) -> None:
+        self._stretch = None
         for each in self._pending:
             each.over = True
 
