@@ -223,24 +223,6 @@ def test_absurd_samples_are_lost_samples_and_the_deviation_of_the_heading_holds(
     assert abs(live.tracker.heading - turned) < 4.5 * math.sqrt(live.tracker.variance)
 
 
-@tries(12)
-@hypothesis.given(st.lists(st.tuples(st.one_of(st.just(INTERVAL), FINITE), FINITE), max_size=40),
-                  st.sampled_from([0.0, 0.1]))
-def test_no_stream_leaves_a_tracker_with_something_that_is_no_number(samples, false_alarms):
-    tracker, time = (HeadingTracker(NOISE, np.diag([1e-4, 1e-8]),
-                                    Settings(false_alarms, Threshold(0.3 * DEGREE))), 0.0)
-    for step, rate in samples:
-        time = time + step if math.isfinite(time + step) else step
-        tracker.add(time, rate, np.array([0.0 if abs(rate) > 1e9 else -rate, -1.0]))
-        assert is_sound(tracker)
-    end = rest_for_a_minute(lambda at, rate: tracker.add(at, rate, np.array([0.0, -1.0])), 0.0)
-    assert is_sound(tracker)
-    tracker.reset()
-    assert tracker.heading == 0.0 and tracker.variance < 1e-3
-    rest_for_a_minute(lambda at, rate: tracker.add(at, rate, np.array([0.0, -1.0])), end)
-    assert abs(tracker.heading) <= 4.5 * math.sqrt(tracker.variance)
-
-
 @pytest.mark.parametrize('place', ['sensitivity', 'mean', 'covariance'])
 def test_a_state_that_is_not_finite_is_reported_and_built_anew_with_the_last_heading(place):
     tracker = HeadingTracker(NOISE, np.diag([1e-4, 1e-8]), Settings())

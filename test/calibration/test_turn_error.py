@@ -336,12 +336,6 @@ def test_a_model_that_looks_around_sees_the_surroundings_of_the_log(run, tmp_pat
             and answer['modelled']['largest_rad_per_turn'] < 1e-9)
 
 
-def test_a_table_of_counts_alone_is_wrong_use_that_names_the_sensitivity(run, tmp_path):
-    (tmp_path / 'table.csv').write_text('gyro_counts,reference_rate_dps\n1,0\n102,10\n')
-    code, text, error = run(tmp_path / 'table.csv')
-    assert code == 2 and not text and '--sensitivity' in error
-
-
 def test_a_log_without_a_reference_is_refused(run, tmp_path):
     (tmp_path / 'log.csv').write_text('gyro_dps\n1.0\n2.0\n3.0\n')
     code, text, error = run(tmp_path / 'log.csv')

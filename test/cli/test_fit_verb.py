@@ -79,13 +79,6 @@ def test_the_matrix_is_given_with_a_polynomial_only(run, table):
     assert code == 2 and '--matrix needs --polynomial' in error and not text
 
 
-def test_counts_without_a_sensitivity_are_wrong_use(run, tmp_path):
-    (tmp_path / 'player.csv'
-     ).write_text('reference_rate_dps,gyro_counts\n0,2.5654\n200,-2854.5\n270,-3857.9\n')
-    code, out, error = run('fit', tmp_path / 'player.csv')
-    assert (code, out) == (2, '') and '--sensitivity' in error
-
-
 def test_three_speeds_in_counts_give_scale_and_bias(run, tmp_path):
     # the record player of the blog, an L3G4200D at 70 mdps a count, turned clockwise
     (tmp_path / 'player.csv'

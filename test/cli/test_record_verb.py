@@ -18,7 +18,6 @@ import os
 from pathlib import Path
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -327,34 +326,6 @@ def test_where_nothing_can_be_written_no_file_is_left(record, tmp_path, name):
     with gyro(tmp_path / 'gyro'):
         code, _, error = record(*words_for(tmp_path / 'gyro', tmp_path / name), limit=1000).end()
     assert code == 1 and 'nothing was written' in error and not (tmp_path / name).exists()
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """Return what gives a folder on a disk of its own; skip where none may be mounted."""
-    folder = tmp_path / 'small'
-    folder.mkdir()
-
-    def mount(kilobytes):
-        command = ['mount', '-t', 'tmpfs', '-o', f'size={kilobytes}k', 'tmpfs', folder]
-        if subprocess.run(command, capture_output=True).returncode:
-            pytest.skip('this needs the right to mount a small disk')
-        return folder
-
-    yield mount
-    subprocess.run(['umount', '-l', folder], capture_output=True)
-
-
-@pytest.mark.parametrize('name, kilobytes', [('a.csv', 64), ('a.mcap', 600)])
-def test_on_a_full_disk_what_was_recorded_stays(record, small_disk, tmp_path, name, kilobytes):
-    small_disk = small_disk(kilobytes)
-    with gyro(tmp_path / 'gyro', 1000.0):
-        code, out, error = record(*words_for(tmp_path / 'gyro', small_disk / name)).end()
-    log = read(small_disk / name)
-    assert (code, out) == (1, '') and 'No space left on device' in error and 'make room' in error
-    assert len(log) > 500 and is_unbroken(log)
-    if name == 'a.mcap':
-        assert len(_messages(small_disk / name, '/imu/data_raw')) == len(log)
 
 
 # From topics

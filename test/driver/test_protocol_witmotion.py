@@ -40,12 +40,6 @@ def test_the_axis_chooses_rate_and_acceleration():
                 and sample.temperature == pytest.approx(25.34))
 
 
-@pytest.mark.parametrize('count', [0x7FFF, -0x8000, -1, 0])
-def test_counts_have_a_sign(count):
-    sample, = decoded(frame(0x52, 0, 0, count, 0))
-    assert sample.output == pytest.approx(math.radians(2000.0 * count / 32768))
-
-
 @pytest.mark.parametrize('temperature', [-40.0, -0.01, 0.0, 61.7])
 def test_the_temperature_has_a_sign(temperature):
     assert (decoded(frame(0x52, 0, 0, 0, round(100 * temperature)))[0].temperature

@@ -154,12 +154,6 @@ def test_over_a_gap_the_gyro_says_by_how_many_turns_the_heading_went_on():
     np.testing.assert_allclose(found[known] - found[0], heading[known] - heading[0], atol=1e-9)
 
 
-def test_a_table_of_arrays_is_a_log():
-    table = {'t': [0.0, 1.0, 2.0], 'w': np.array([1.0, 2.0, 3.0])}
-    log = log_from_table(table, {'time': 't:ms', 'gyro': 'w:deg/s'})
-    assert isinstance(log, Log) and log.time[1] == 1e-3 and log.output[2] == 3.0 * DEGREE
-
-
 def test_a_data_frame_is_a_log():
     pandas = pytest.importorskip('pandas')
     log = log_from_table(pandas.DataFrame({'time_s': [0.0, 1.0], 'gyro_rad_s': [1.0, 2.0]}))

@@ -25,7 +25,6 @@ from gyro_calibration.model.effects import (
     rate_temperature_polynomial,
 )
 from gyro_calibration.model.gyro_model import GyroModel, Term
-from gyro_calibration.model.model_file import read_model, write_model
 from gyro_calibration.model.motion import CALIBRATION
 from gyro_calibration.model.noise import Noise
 from gyro_calibration.model.simulation import respond
@@ -256,11 +255,3 @@ def test_every_product_of_powers_has_a_column_of_its_own():
 def test_what_is_no_matrix_of_eq_11_is_refused(matrix):
     with pytest.raises(ValueError, match='rows of finite numbers'):
         polynomial_from_matrix(matrix)
-
-
-def test_a_polynomial_survives_its_file(tmp_path):
-    model = gyro('all')
-    write_model(tmp_path / 'model.yaml', model)
-    again = read_model(tmp_path / 'model.yaml')
-    assert again.terms[-1].values == POLYNOMIAL_VALUES
-    assert again.rate(1.0, 33.0) == model.rate(1.0, 33.0)

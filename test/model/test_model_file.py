@@ -236,11 +236,6 @@ def test_a_file_with_any_value_of_another_kind_is_a_model_or_refused(tmp_path):
     assert 0 < read_ones < 200
 
 
-def test_rates_beyond_what_a_sine_can_answer_stay_finite():
-    model = GyroModel((Term(CATALOGUE['sine_response'], (0.5, 1.0)),))
-    assert np.isfinite(model.rate(np.linspace(-1e6, 1e6, 1001), 25.0)).all()
-
-
 def test_self_calibration_is_eq_3_of_hong_and_park():
     """Their example: s = -10 %, b = 0.1 rad/s give s_bar = 1.111 and b_bar = -0.111."""
     calibration = SelfCalibration(-0.1, 0.1)

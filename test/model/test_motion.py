@@ -138,10 +138,5 @@ def test_what_is_no_profile_is_refused(tmp_path, text, message):
     assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
 
 
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(MotionError, match='cannot be read'):
-        read_motion(tmp_path / 'profile.csv')
-
-
 def test_a_still_motion_is_one():
     assert math.fsum(np.abs(NAMED['rest'].heading_at(np.arange(60.0)))) == 0.0

@@ -93,16 +93,6 @@ def test_a_run_of_known_length_may_be_longer_than_one_that_waits_for_a_call(kind
     assert run.over == ''
 
 
-def test_finishing_acts_once_and_returns_how_long_to_wait():
-    run = Run(TURNS, math.inf, 2.5, 0.0)
-    for time in (0.0, 10.0):
-        run.add(time, 0.0, 0.0, None)
-    assert run.finish() == 'leave the robot at rest for 2.5 s more'
-    run.add(11.0, 0.0, 0.0, None)
-    assert run.finish() == 'leave the robot at rest for 1.5 s more'
-    assert run.duration == 10.0 and run.over is None
-
-
 def test_odometry_without_a_yaw_is_taken_by_its_rates():
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
     run.odometry = [(time, 0.0, rate) for time, _, rate in run.odometry]
@@ -140,15 +130,6 @@ def test_who_drives_on_after_a_run_by_odometry_is_not_checked():
     run.odometry = [each for each in run.odometry if each[0] <= BEGIN + 20.0]
     assert 'at rest after it' not in calibrated(
         run, Rules(Limits(time_offset=0.5), Reference(0.01), 2, True), Noise(), '')[1]
-
-
-def test_a_rest_gives_the_bias_alone():
-    run = Run(REST, 10.0, 0.0, 0.0)
-    for number, noise in enumerate(1e-4 * np.random.default_rng(1).standard_normal(520)):
-        run.add(number * INTERVAL, B + noise, B + noise, None)
-    calibration, said = calibrated(run, rules(), Noise(), '')
-    assert (run.over == '' and calibration.bias == pytest.approx(B, abs=1e-5)
-            and calibration.method == 'rest' and not said)
 
 
 def test_a_dead_gyro_at_rest_is_seen_behind_a_model_that_follows_the_temperature():
