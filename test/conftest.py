@@ -253,14 +253,12 @@ def impatient():
 class NodeProcess:
     """A node in a process of its own, as a robot starts it."""
 
-    def __init__(self, module, parameters, remappings, parameter_files):
+    def __init__(self, module, parameters, remappings):
         arguments = [f'{name}:={value}' for name, value in parameters.items()]
         self._command = [sys.executable, '-m', f'gyro_calibration.ros.{module}', '--ros-args']
         self._command += [word for argument in arguments for word in ('-p', argument)]
         self._command += [
             word for old, new in remappings.items() for word in ('-r', f'{old}:={new}')]
-        self._command += [word for file in parameter_files
-                          for word in ('--params-file', str(file))]
         self.waited = False
         handle, self._output = tempfile.mkstemp(dir=_FOLDER)
         with os.fdopen(handle, 'wb') as output:
@@ -310,16 +308,16 @@ def start_node(ros_domain, request):
     """
     Return a function that starts ``python -m gyro_calibration.<module>``, ended after the test.
 
-    ``start_node('driver_node', parameters={'port': '/dev/x'}, remappings={'imu/data_raw': 'raw'},
-    parameter_files=[path])`` gives a `NodeProcess` with ``output``, ``wait()``, ``stop()`` and
-    ``process``. A node that a test did not itself wait for must still run at the end, end on
-    SIGINT with code 0, and never print a traceback.
+    ``start_node('driver_node', {'port': '/dev/x'}, {'imu/data_raw': 'raw'})``, with parameters and
+    remappings, gives a `NodeProcess` with ``output``, ``wait()``, ``stop()`` and ``process``. A
+    node that a test did not itself wait for must still run at the end, end on SIGINT with code 0,
+    and never print a traceback.
 
     """
     nodes = []
 
-    def start(module, parameters=None, remappings=None, parameter_files=()):
-        nodes.append(NodeProcess(module, parameters or {}, remappings or {}, parameter_files))
+    def start(module, parameters=None, remappings=None):
+        nodes.append(NodeProcess(module, parameters or {}, remappings or {}))
         return nodes[-1]
 
     failures = request.session.testsfailed

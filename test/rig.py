@@ -254,7 +254,7 @@ class Rig:
         assert not self.begin()
         assert self.go(10.0, lambda: abs(self.robot.rate) > rate)
 
-    def stopped_after(self, since, others=()):
+    def stopped_after(self, since):
         """Return how long after a time the last command to turn was followed by a zero, s."""
         sent = [(when, rate) for when, rate in self.commands if when >= since]
         last = max([when for when, rate in sent if rate], default=since)

@@ -25,7 +25,7 @@ import threading
 import time
 
 try:
-    from geometry_msgs.msg import Twist, TwistStamped
+    from geometry_msgs.msg import Twist
     from nav_msgs.msg import Odometry
     from rclpy.qos import QoSProfile
     from rosgraph_msgs.msg import Clock
@@ -124,11 +124,10 @@ class Robot:
 
 @dataclass(frozen=True)
 class Moment:
-    """The truth at one time of the steady clock, s: heading, rad, and rate, rad/s."""
+    """The true heading, rad, at one time of the steady clock, s."""
 
     time: float
     heading: float
-    rate: float
 
 
 class RosRobot:
@@ -142,8 +141,6 @@ class RosRobot:
     node : rclpy.node.Node
         Its executor is spun by the caller.
     robot : Robot
-    stamped : bool
-        Whether cmd_vel is a TwistStamped.
     speed : float or None
         Simulated: seconds of /clock in one second, which stamps follow. None: no /clock, and
         stamps are those of the node's clock.
@@ -163,26 +160,24 @@ class RosRobot:
 
     """
 
-    def __init__(self, node, robot, *, stamped=False, speed=None):
+    def __init__(self, node, robot, *, speed=None):
         self.robot, self.node, self.also = robot, node, None
         self.clock_absent = self.clock_stands = False
         self.commands, self.headings, self.moments = [], {}, []
-        self._stamped, self._speed, self._lock, self._last = stamped, speed, threading.Lock(), None
+        self._speed, self._lock, self._last = speed, threading.Lock(), None
         quality = QoSProfile(depth=100)
-        kind = TwistStamped if stamped else Twist
         self._imu = node.create_publisher(Imu, 'imu/data_raw', quality)
         self._odometry = node.create_publisher(Odometry, 'odom', quality)
         self._clock = node.create_publisher(Clock, '/clock', 10) if speed else None
-        self._heard = node.create_subscription(kind, 'cmd_vel', self._on_command, quality)
+        self._heard = node.create_subscription(Twist, 'cmd_vel', self._on_command, quality)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _on_command(self, message):
-        twist = message.twist if self._stamped else message
         with self._lock:
-            self.commands.append((now(), twist.angular.z))
-            self.robot.command(twist.angular.z)
+            self.commands.append((now(), message.angular.z))
+            self.robot.command(message.angular.z)
 
     def _run(self):
         interval = INTERVAL / (self._speed or 1.0)
@@ -193,7 +188,7 @@ class RosRobot:
                 self._publish(self.robot.step())
 
     def _publish(self, reading):
-        self.moments.append(Moment(now(), reading.heading, reading.rate))
+        self.moments.append(Moment(now(), reading.heading))
         stamp = self._stamp(reading)
         self.headings[stamp] = reading.heading
         header = {'sec': stamp // 10 ** 9, 'nanosec': stamp % 10 ** 9}
@@ -255,9 +250,8 @@ class SecondCommander:
 
     """
 
-    def __init__(self, node, stamped=False):
-        self.rate, self._node, self._stamped = None, node, stamped
-        self._publisher = node.create_publisher(TwistStamped if stamped else Twist, 'cmd_vel', 10)
+    def __init__(self, node):
+        self.rate, self._publisher = None, node.create_publisher(Twist, 'cmd_vel', 10)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -265,8 +259,8 @@ class SecondCommander:
     def _run(self):
         while not self._stop.wait(0.05):
             if self.rate is not None:
-                message = TwistStamped() if self._stamped else Twist()
-                (message.twist if self._stamped else message).angular.z = self.rate
+                message = Twist()
+                message.angular.z = self.rate
                 self._publisher.publish(message)
 
     def close(self):
