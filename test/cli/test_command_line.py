@@ -162,11 +162,6 @@ def test_a_new_model_names_its_log_and_a_given_one_keeps_its_origin(
         assert read_model(tmp_path / 'new.yaml').origin == {}
 
 
-def test_self_calibrate_takes_the_reference_of_the_log_itself(run, log):
-    code, text, _ = run('self-calibrate', log)
-    assert code == 0 and 'scale factor error -10.000' in text.lower()
-
-
 @pytest.mark.parametrize('words', [(), ('--turns', 'nearest')], ids=['profile', 'turns'])
 def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate(
         run, tmp_path, words):
@@ -181,15 +176,6 @@ def test_self_calibrate_by_a_model_that_looks_around_leaves_nothing_to_calibrate
                             '--model', tmp_path / 'model.yaml', '--json', *words)
     assert code == 0, error
     assert abs(json.loads(text)['bias']) < 1e-5
-
-
-def test_what_the_data_do_not_allow_ends_with_1_and_one_sentence(run, tmp_path):
-    (tmp_path / 'dead.csv').write_text('time_s,gyro_dps\n'
-                                       + ''.join(f'{i / 100},0\n' for i in range(2000)))
-    (tmp_path / 'profile.csv').write_text('time_s,rate_dps\n0,0\n5,30\n10,-30\n20,0\n')
-    code, text, error = run('self-calibrate', tmp_path / 'dead.csv',
-                            '--profile', tmp_path / 'profile.csv')
-    assert code == 1 and not text and 'same value' in error and error.count('\n') == 1
 
 
 @pytest.mark.parametrize('words, said', [
@@ -296,18 +282,6 @@ def test_a_calibration_of_the_demonstration_that_is_refused_is_run_again_and_not
             with pytest.raises(Refused, match='slipped'):
                 calibrate(SimpleNamespace(call=call), bar)
     assert capsys.readouterr().err.count('slipped; once more') == min(refusals, ATTEMPTS - 1)
-
-
-def test_rows_without_output_are_reported_and_do_not_change_the_heading(run, model, tmp_path):
-    # the bias, 0.002 rad/s
-    rows = ['nan' if 20 <= i < 25 else '0.11459155902616464' for i in range(101)]
-    (tmp_path / 'log.csv').write_text(
-        'time_s,gyro_dps\n' + ''.join(f'{i / 100},{row}\n' for i, row in enumerate(rows)))
-    code, text, _ = run('compensate', tmp_path / 'log.csv', '--model', model,
-                        '--out', tmp_path / 'out.csv', '--json')
-    answer = json.loads(text)
-    assert code == 0 and answer['rows_without_output'] == 5 and abs(answer['heading_rad']) < 1e-12
-    assert read_log(tmp_path / 'out.csv').others['rate_rad_s'][22] == 'nan'
 
 
 def test_a_method_that_gives_no_standard_deviation_claims_none(run, log, tmp_path):

@@ -393,8 +393,8 @@ def reliable(**how):
     return QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, **how)
 
 
-def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
-        ros, record, run, wait_until, tmp_path):
+def test_a_log_and_a_recording_of_the_same_topics_hold_the_same(
+        ros, record, wait_until, tmp_path):
     robot = Robot(ros)
     robot.offer('imu/data_raw', 'imu/temperature', 'odom')
     both = [record('record', '--reference-topic', 'odom', '--out', tmp_path / name, '--json')
@@ -413,19 +413,6 @@ def test_a_log_and_a_recording_of_the_same_topics_give_the_same_answers(
     for name in ('output', 'time', 'temperature', 'reference_rate'):
         np.testing.assert_array_equal(getattr(log, name), getattr(recording, name), name)
     np.testing.assert_allclose(log.reference_heading, recording.reference_heading, atol=1e-9)
-    (tmp_path / 'm.yaml').write_text(
-        'effects: {bias: {bias: 0.001}}\nnoise: {angle_random_walk: 0.0001}\n')
-    model = ['--model', tmp_path / 'm.yaml']
-    for words in (['fit'], ['diagnose', *model],
-                  ['compensate', *model, '--out', tmp_path / 'o.csv'], ['allan']):
-        results = [run(*words, tmp_path / 'a.csv'),
-                   run(*words, tmp_path / 'a.mcap', '--reference-topic', 'odom')]
-        assert results[0][0] == results[1][0], results
-        if results[0][0]:  # a refusal is the same sentence
-            assert (results[0][2].splitlines()[-1].replace('a.csv', 'a.mcap')
-                    == results[1][2].splitlines()[-1])
-        else:
-            assert results[0][1].replace('a.csv', 'a.mcap') == results[1][1]
 
 
 def test_publishers_that_come_late_or_with_another_quality_are_received(
