@@ -29,7 +29,7 @@ from gyro_calibration.heading.assumptions import assumed, Assumptions, sensitive
 from gyro_calibration.heading.bias_table import BiasTable, carry
 from gyro_calibration.heading.gaps import CLOSE
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
-from gyro_calibration.logs.log import Array, DEGREE, Mask
+from gyro_calibration.logs.log import Array, DEGREE
 from gyro_calibration.model.compensation import (
     compensate,
     Compensated,
