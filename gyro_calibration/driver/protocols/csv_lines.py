@@ -25,7 +25,6 @@ from functools import partial
 import math
 import re
 
-from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
 from gyro_calibration.driver.protocols.protocol import (
     check_rates,
     GYRO_COLUMNS,
@@ -36,6 +35,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
 
 _NUMBER = re.compile(NUMBER)
 _NOT_FINITE = re.compile(rb'[+-]?(?:nan|inf(?:inity)?)', re.IGNORECASE)
@@ -54,55 +54,35 @@ def _check(settings: Settings) -> None:
 
 
 def _parse(line: bytes, settings: Settings) -> Reading | None:
-    fields = [field.strip() for field in line.split(b',')]
-    try:
-        return _reading(dict(zip(settings.columns, fields, strict=True)))
-    except ValueError:
+    texts = [text.strip() for text in line.split(b',')]
+    if len(texts) != len(settings.columns):
         return None
-
-
-def _reading(fields: dict[str, bytes]) -> Reading:
+    fields = dict(zip(settings.columns, texts))
     name = next(name for name in GYRO_COLUMNS if name in fields)
-    known = (_known(fields.get(column, b'')) for column in KNOWN_COLUMNS)
+    output = fields[name]  # which may be one that the decoder refuses
+    if not (_NUMBER.fullmatch(output) or _NOT_FINITE.fullmatch(output)):
+        return None
+    known: list[float | None] = []
+    for column in KNOWN_COLUMNS:
+        text = fields.get(column, b'')
+        if text.lower() in _UNKNOWN:
+            known.append(None)
+        elif _NUMBER.fullmatch(text) and math.isfinite(value := float(text)):
+            known.append(value)
+        else:
+            return None
     temperature, time, force, supply = known
-    health = {} if supply is None else {'supply_v': supply}
-    value = _output(fields[name]) * GYRO_COLUMNS[name]
-    return Reading(value, True, temperature, time, None, force, health)
-
-
-def _output(text: bytes) -> float:
-    """Return an output, which may be one that the decoder refuses."""
-    if _NUMBER.fullmatch(text) or _NOT_FINITE.fullmatch(text):
-        return float(text)
-    raise ValueError('not a number')
-
-
-def _known(text: bytes) -> float | None:
-    return None if text.lower() in _UNKNOWN else _number(text)
-
-
-def _number(text: bytes) -> float:
-    value = float(text) if _NUMBER.fullmatch(text) else math.nan
-    if not math.isfinite(value):
-        raise ValueError('not a finite number')
-    return value
+    return Reading(float(output) * GYRO_COLUMNS[name], True, temperature, time, None, force,
+                   {} if supply is None else {'supply_v': supply})
 
 
 def _write(reading: Written, settings: Settings) -> bytes:
-    return b','.join(_field(name, reading) for name in settings.columns) + b'\r\n'
-
-
-def _field(name: str, reading: Written) -> bytes:
-    if name in KNOWN_COLUMNS:
-        values = (reading.temperature, reading.time, reading.specific_force,
-                  reading.health.get('supply_v'))
-        value = values[KNOWN_COLUMNS.index(name)]
-        return b'nan' if value is None else b'%.6f' % value
-    if name == 'gyro_counts':
-        return b'%d' % round(reading.value)
-    if name in GYRO_COLUMNS:
-        return b'%.9g' % (reading.value / GYRO_COLUMNS[name])
-    return b'0'
+    known = dict(zip(KNOWN_COLUMNS, (reading.temperature, reading.time, reading.specific_force,
+                                     reading.health.get('supply_v'))))
+    fields = {name: b'nan' if value is None else b'%.6f' % value for name, value in known.items()}
+    fields |= {name: b'%.9g' % (reading.value / unit) for name, unit in GYRO_COLUMNS.items()}
+    fields['gyro_counts'] = b'%d' % round(reading.value)
+    return b','.join(fields.get(name, b'0') for name in settings.columns) + b'\r\n'
 
 
 CSV = Protocol(

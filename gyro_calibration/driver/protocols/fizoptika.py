@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
     check_counts,
     Protocol,
@@ -35,6 +34,7 @@ from gyro_calibration.driver.protocols.protocol import (
     Settings,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _HEADER = 0xDD
 # number of the high byte: name, unit of one count, offset, default of an emulated unit
@@ -58,26 +58,19 @@ class _Parser:
     """Joins the halves of the values that are spread over two frames."""
 
     def __init__(self, settings: Settings):
-        self._number: int | None = None
-        self._high = 0
+        self._number, self._high = -1, 0
 
     def __call__(self, frame: bytes) -> Reading:
         _, low, high, middle, number, byte, *_ = frame
-        joined = self._joined(number, byte)
-        self._number, self._high = number, byte
+        (before, first), (self._number, self._high) = (self._number, self._high), (number, byte)
         count = int.from_bytes((high, middle, low), 'big', signed=True)
-        if joined is None:
+        if before not in _VALUES or number != before + 1:
             return Reading(count)
-        name, value = joined
+        name, unit, offset, _ = _VALUES[before]
+        value = int.from_bytes((first, byte), 'big', signed=True) * unit + offset
         if name == 'temperature':
             return Reading(count, temperature=value)
         return Reading(count, health={name: value})
-
-    def _joined(self, number: int, byte: int) -> tuple[str, float] | None:
-        if self._number not in _VALUES or number != self._number + 1:
-            return None
-        name, unit, offset, _ = _VALUES[self._number]
-        return name, int.from_bytes((self._high, byte), 'big', signed=True) * unit + offset
 
 
 class _Writer:
@@ -90,18 +83,14 @@ class _Writer:
         number = reading.sequence % 8
         even = number & ~1
         if number == even or even not in self._latched:
-            self._latched = {even: _half_bytes(even, reading)}
+            name, unit, offset, usual = _VALUES[even]
+            value = reading.temperature if name == 'temperature' else reading.health.get(name)
+            half = round(((usual if value is None else value) - offset) / unit)
+            self._latched = {even: min(max(half, -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)}
         count = min(max(round(reading.value), -0x800000), 0x7FFFFF)
         high, middle, low = count.to_bytes(3, 'big', signed=True)
         frame = bytes([_HEADER, low, high, middle, number, self._latched[even][number - even]])
         return frame + _checksum(frame)
-
-
-def _half_bytes(number: int, reading: Written) -> bytes:
-    name, unit, offset, usual = _VALUES[number]
-    value = reading.temperature if name == 'temperature' else reading.health.get(name)
-    count = round(((usual if value is None else value) - offset) / unit)
-    return min(max(count, -0x8000), 0x7FFF).to_bytes(2, 'big', signed=True)
 
 
 FIZOPTIKA = Protocol(

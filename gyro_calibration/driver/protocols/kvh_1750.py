@@ -35,7 +35,6 @@ import math
 import struct
 import zlib
 
-from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -44,6 +43,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _HEADER = b'\xfe\x81\xff\x55'
 _FRAME = struct.Struct('>4s3f3fBBh')

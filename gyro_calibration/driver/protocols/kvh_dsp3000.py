@@ -28,7 +28,6 @@ from functools import partial
 import math
 import re
 
-from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -36,6 +35,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import LineSplitter
 
 _LINE = re.compile(rb' *(-?[0-9]{1,3}\.[0-9]{6}) +([01]) *')
 

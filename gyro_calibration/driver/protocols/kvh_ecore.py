@@ -24,7 +24,6 @@ from __future__ import annotations
 from functools import partial
 import math
 
-from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -32,6 +31,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _COUNT = math.radians(0.00183)
 

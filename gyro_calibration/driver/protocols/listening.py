@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import re
 
 from gyro_calibration.driver.protocols import Protocol, PROTOCOLS, Settings
-from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
+from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
 
 BAUDS = (*dict.fromkeys(protocol.baud for protocol in PROTOCOLS.values()), 460800, 230400, 19200)
 """Bits per second to try in this order: first those of new gyros, then others that some can do."""
@@ -93,11 +93,28 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
     runner_up = second if second.explained else None
     ambiguous = runner_up is not None and second.explained >= _NEARLY * best.explained
     enough = _ENOUGH if best.distinct >= _FRAMES else _ALL
+    protocol, explained = None, best.explained
     if best.frames >= _FRAMES and best.explained >= enough and not ambiguous:
-        protocol, (explained, words) = best.protocol, _found(best, runner_up, data)
+        protocol = best.protocol
+        words = (f'{protocol.name} explains {explained:.0%} of {len(data)} bytes, in '
+                 f'{best.frames} frames')
+        if runner_up:
+            words += f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}'
+    elif ambiguous:
+        words = (f'the bytes may be {best.protocol.name} or {second.protocol.name}: set protocol')
     else:
-        other = second if ambiguous else None
-        protocol, (explained, words) = None, _not_found(best, other, data, settings)
+        count, share = _numbers_of_a_line(data)
+        if count not in (0, named := len(settings.columns)):
+            explained, words = share, (f'lines of {count} numbers came, but columns names '
+                                       f'{named}: name all columns in their order')
+        elif not data:
+            words = 'nothing came: check the power and the wires of the gyro'
+        elif best.frames:
+            words = (f'{len(data)} bytes came, of which too few are frames of '
+                     f'{best.protocol.name}: listen longer, or set protocol')
+        else:
+            words = (f'{len(data)} bytes came, but in no known format: try another baud, or set '
+                     'protocol')
     return Recognition(protocol, explained, best.frames,
                        None if runner_up is None else runner_up.protocol, words)
 
@@ -113,36 +130,6 @@ def _score(protocol: Protocol, settings: Settings, data: bytes) -> _Score:
     begun = min(frames[0].garbage, max(len(frame.data) for frame in good))
     distinct = len({frame.data for frame in good})
     return _Score(protocol, known / (known + unknown - begun), len(good), distinct)
-
-
-def _found(best: _Score, runner_up: _Score | None, data: bytes) -> tuple[float, str]:
-    words = (f'{best.protocol.name} explains {best.explained:.0%} of {len(data)} bytes, in '
-             f'{best.frames} frames')
-    if runner_up:
-        words += f'; next is {runner_up.protocol.name} with {runner_up.explained:.0%}'
-    return best.explained, words
-
-
-def _not_found(best: _Score, other: _Score | None, data: bytes,
-               settings: Settings) -> tuple[float, str]:
-    count, share = _numbers_of_a_line(data)
-    if not other and count not in (0, len(settings.columns)):
-        named = len(settings.columns)
-        return share, (f'lines of {count} numbers came, but columns names {named}: name all '
-                       'columns in their order')
-    return best.explained, _why_not(best, other, data)
-
-
-def _why_not(best: _Score, other: _Score | None, data: bytes) -> str:
-    if not data:
-        return 'nothing came: check the power and the wires of the gyro'
-    if other:
-        return (f'the bytes may be {best.protocol.name} or {other.protocol.name}: set protocol')
-    came = f'{len(data)} bytes came'
-    if best.frames:
-        return (f'{came}, of which too few are frames of {best.protocol.name}: listen longer, or '
-                'set protocol')
-    return f'{came}, but in no known format: try another baud, or set protocol'
 
 
 def _numbers_of_a_line(data: bytes) -> tuple[int, float]:

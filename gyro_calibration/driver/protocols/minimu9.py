@@ -23,7 +23,6 @@ from functools import partial
 import math
 import re
 
-from gyro_calibration.driver.protocols.lines import LineSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -31,6 +30,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import LineSplitter
 
 _COUNT = math.radians(0.07)
 _LINE = re.compile(rb'!ANG:[-+.0-9]+,[-+.0-9]+,[-+.0-9]+,AN:(-?[0-9]{1,5}(?:,-?[0-9]{1,5}){8}) *')

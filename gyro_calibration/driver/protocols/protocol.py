@@ -11,7 +11,7 @@
 """
 What every wire format shares: the records, and the decoder that turns bytes into samples.
 
-A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`lines`, `frames`), a
+A format is a `Protocol`: a splitter that finds frames in a stream of bytes (`splitters`), a
 parser that makes a `Reading` of a frame, and a function back. A reading is in the unit of the
 device; sign, sensitivity and full scale are applied here, for all formats alike, and so are the
 counts of what was discarded, refused and lost.
@@ -44,6 +44,7 @@ ASSUMED_FORCE_NOISE = 0.1
 
 _TEMPERATURES = -100.0, 300.0  # degC; beyond them no sensor of a gyro reports
 _MOST_DEVIATION = 0.05  # of the sample rate; the clocks of gyros are 2 to 3 % off
+_LEARNING = 0.05  # of the average length of a frame, a frame
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,15 @@ class Settings:
                                  'rotation set invert')
         if self.axis not in ('x', 'y', 'z'):
             raise ValueError(f'axis is {self.axis!r}, but must be x, y or z')
-        object.__setattr__(self, 'columns', tuple(self.columns))
-        _check_columns(self.columns)
-
-
-def _check_columns(columns: tuple[str, ...]) -> None:
-    if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
-        raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be '
-                         f'{", ".join(GYRO_COLUMNS)}')
-    for name in KNOWN_COLUMNS:
-        if columns.count(name) > 1:
-            raise ValueError(f'columns are {", ".join(columns)}, but {name} may occur only once')
+        columns = tuple(self.columns)
+        object.__setattr__(self, 'columns', columns)
+        if sum(columns.count(name) for name in GYRO_COLUMNS) != 1:
+            raise ValueError(f'columns are {", ".join(columns)}, but exactly one must be '
+                             f'{", ".join(GYRO_COLUMNS)}')
+        for name in KNOWN_COLUMNS:
+            if columns.count(name) > 1:
+                raise ValueError(f'columns are {", ".join(columns)}, but {name} may occur only '
+                                 'once')
 
 
 @dataclass(frozen=True)
@@ -331,7 +330,9 @@ class Protocol:
 
         def encode(sample: Sample, valid: bool = True) -> bytes:
             value = min(max(sample.output, -limit), limit) / factor
-            temperature, force = _finite(sample.temperature), _finite(sample.specific_force)
+            # a log has nan where a sensor failed
+            temperature, force = (each if each is not None and math.isfinite(each) else None
+                                  for each in (sample.temperature, sample.specific_force))
             return write(Written(value, valid, temperature, sample.time, sample.sequence or 0,
                                  force, sample.health))
 
@@ -386,11 +387,6 @@ class Protocol:
         if self.noise_density is None:
             return ASSUMED_NOISE ** 2
         return self.noise_density ** 2 * self.nominal_rate(settings)
-
-
-def _finite(value: float | None) -> float | None:
-    """Return a value, or None in place of nan: a log has it where its sensor failed."""
-    return value if value is not None and math.isfinite(value) else None
 
 
 class Decoder:
@@ -451,31 +447,19 @@ class Decoder:
         if reading.value is None:
             return None
         output = reading.value * self._factor
-        if not self._is_good(reading, output):
+        if not (reading.valid and math.isfinite(output) and abs(output) <= self._limit):
+            self.faults += not reading.valid
+            self.refused_samples += reading.valid
             self._skipped += 1
             return None
-        missing, temperature = self._missing(len(frame.data)), reading.temperature
+        # frames that were discarded or skipped before this one; 0 for the first
+        length = len(frame.data)
+        self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
+        missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
+        self._garbage, self._skipped, self._begun = 0, 0, True
+        temperature = reading.temperature
         if temperature is not None and not _TEMPERATURES[0] <= temperature <= _TEMPERATURES[1]:
             self.refused_temperatures += 1
             temperature = None
         return Sample(output, temperature, reading.time, reading.sequence, missing,
                       reading.specific_force, reading.health)
-
-    def _is_good(self, reading: Reading, output: float) -> bool:
-        if not reading.valid:
-            self.faults += 1
-            return False
-        if not (math.isfinite(output) and abs(output) <= self._limit):
-            self.refused_samples += 1
-            return False
-        return True
-
-    def _missing(self, length: int) -> int:
-        """Return how many frames were discarded or skipped before a sample; 0 for the first."""
-        self._length += (_LEARNING if self._length else 1.0) * (length - self._length)
-        missing = self._skipped + round(self._garbage / self._length) if self._begun else 0
-        self._garbage, self._skipped, self._begun = 0, 0, True
-        return missing
-
-
-_LEARNING = 0.05  # of the average length of a frame, a frame

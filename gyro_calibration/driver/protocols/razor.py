@@ -29,7 +29,6 @@ from functools import partial
 import math
 import re
 
-from gyro_calibration.driver.protocols.lines import LineSplitter, NUMBER
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -38,6 +37,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import LineSplitter, NUMBER
 
 _LINE = re.compile(rb'#YPRAG=(' + NUMBER + rb'(?:,' + NUMBER + rb'){8}) *')
 # what the firmware sends when it is not asked for more

@@ -28,7 +28,6 @@ from functools import partial
 import math
 import struct
 
-from gyro_calibration.driver.protocols.frames import FrameSplitter
 from gyro_calibration.driver.protocols.protocol import (
     Protocol,
     Reading,
@@ -37,6 +36,7 @@ from gyro_calibration.driver.protocols.protocol import (
     stateless,
     Written,
 )
+from gyro_calibration.driver.protocols.splitters import FrameSplitter
 
 _COUNT = math.radians(2000.0) / 0x8000
 _FORCE = 16.0 * STANDARD_GRAVITY / 0x8000  # m/s² of one count

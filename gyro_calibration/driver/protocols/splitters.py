@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Find binary frames of a fixed length in a stream of bytes."""
+"""Find lines of text, and binary frames of a fixed length, in a stream of bytes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,66 @@ from collections.abc import Callable
 import re
 
 from gyro_calibration.driver.protocols.protocol import Frame
+
+NUMBER = rb'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?'
+"""A finite number in text: `float` also takes nan, inf and 1_0."""
+
+_LINE_END = re.compile(rb'[\r\n]')
+
+
+class LineSplitter:
+    """
+    Gives whole lines without their ends, and no empty ones.
+
+    A port is opened in the middle of a line, and the rest of ``-120.5`` is ``20.5``: so the first
+    line is discarded, unless it begins as only whole lines do.
+
+    Parameters
+    ----------
+    longest : int
+        Bytes; a longer line is discarded, so that an endless one does not fill the memory.
+    beginnings : tuple of bytes
+        With what only a whole line begins.
+
+    """
+
+    def __init__(self, longest: int, beginnings: tuple[bytes, ...] = ()):
+        self._longest = longest
+        self._beginnings = beginnings
+        self._tail = b''
+        self._begun = False
+        self._too_long = False
+        self._garbage = 0
+        self.discarded_bytes = 0
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Return the lines that these bytes complete."""
+        first, *rest = _LINE_END.split(data)  # the tail was searched for line ends when it came
+        *lines, tail = self._tail + first, *rest
+        whole = []
+        for line in lines:
+            good = not self._too_long and len(line) <= self._longest
+            good = good and (self._begun or line.startswith(self._beginnings))
+            self._begun, self._too_long = True, False
+            if not good:
+                self._discard(len(line))
+            elif line:
+                whole.append(Frame(line, self._garbage))
+                self._garbage = 0
+        self._tail = tail
+        if self._too_long or len(tail) > self._longest:
+            self._discard(len(tail))
+            self._tail, self._too_long = b'', True
+        return whole
+
+    def reset(self) -> None:
+        """Drop the line that has begun."""
+        self._discard(len(self._tail))
+        self._tail, self._garbage, self._begun, self._too_long = b'', 0, False, False
+
+    def _discard(self, count: int) -> None:
+        self.discarded_bytes += count
+        self._garbage += count
 
 
 class FrameSplitter:
