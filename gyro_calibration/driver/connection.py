@@ -51,10 +51,8 @@ class Chunk:
     Attributes
     ----------
     samples : list of Sample
-    stamps : list of float
-        When they were sent, in seconds; they increase strictly over all chunks.
-    arrival : float
-        When they came, in seconds.
+    stamps : when they were sent, in seconds; they increase strictly over all chunks
+    arrival : when they came, in seconds
 
     """
 
@@ -70,12 +68,10 @@ class State:
 
     Attributes
     ----------
-    name : str
-        ``'opening'``, ``'listening'``, ``'reading'`` (samples come) or ``'failed'`` (none come).
-    problem : str
-        One sentence while it has failed, else empty.
-    waiting : float
-        Seconds until the port is opened anew, while it has failed; an open one is read until then.
+    name : ``'opening'``, ``'listening'``, ``'reading'`` (samples come) or ``'failed'`` (none come)
+    problem : one sentence while it has failed, else empty
+    waiting : seconds until the port is opened anew, while it has failed; an open one is read until
+        then
 
     """
 
@@ -92,14 +88,10 @@ class Counts:
     Attributes
     ----------
     samples, lost_samples : int
-    refused_samples : int
-        Not finite, or beyond full scale.
-    refused_temperatures : int
-        Not finite, or beyond what a sensor can report.
-    device_faults : int
-        Samples that the gyro itself calls invalid.
-    discarded_bytes : int
-        In no frame.
+    refused_samples : not finite, or beyond full scale
+    refused_temperatures : not finite, or beyond what a sensor can report
+    device_faults : samples that the gyro itself calls invalid
+    discarded_bytes : in no frame
 
     """
 
@@ -150,17 +142,13 @@ class _Silence:
 
     Parameters
     ----------
-    period : float
-        From one sample to the next, s.
-    now : float
-        When the port was opened, s.
+    period : from one sample to the next, s
+    now : when the port was opened, s
 
     Attributes
     ----------
-    timeout : float
-        Seconds.
-    end : float
-        When the port is to be opened anew, s.
+    timeout : seconds
+    end : when the port is to be opened anew, s
 
     """
 
@@ -208,39 +196,25 @@ class Connection:
 
     Parameters
     ----------
-    port : str
-        Path, or a pattern that finds it under any name.
-    protocol : str
-        Name of a protocol, or ``'auto'``.
-    baud : int
-        Bits per second; 0 for that of the protocol.
+    port : path, or a pattern that finds it under any name
+    protocol : name of a protocol, or ``'auto'``
+    baud : bits per second; 0 for that of the protocol
     settings : Settings or None
-    on_change : callable
-        Gets each new `State`, in the thread that takes the samples.
-    clock : callable
-        Returns seconds of a steady clock.
-    make_port : callable
-        Returns what reads a port, given its path and baud.
+    on_change : gets each new `State`, in the thread that takes the samples
+    clock : returns seconds of a steady clock
+    make_port : returns what reads a port, given its path and baud
 
     Attributes
     ----------
     state : State
-    protocol : Protocol or None
-        None until it is known.
-    baud : int
-        0 until it is known.
-    path : str
-        The device behind the port when it was last opened, links followed.
-    detected : str
-        What was recognized by listening, in a sentence.
-    clock : SampleClock or None
-        None until the protocol is known.
-    openings : int
-        How often the port was opened.
-    waited : float
-        Seconds that were waited for the port altogether.
-    longest_gap : float
-        Longest time between two samples, s; 0 where it was never more than 1.5 periods.
+    protocol : None until it is known
+    baud : 0 until it is known
+    path : the device behind the port when it was last opened, links followed
+    detected : what was recognized by listening, in a sentence
+    clock : None until the protocol is known
+    openings : how often the port was opened
+    waited : seconds that were waited for the port altogether
+    longest_gap : longest time between two samples, s; 0 where it was never more than 1.5 periods
     last_error : str
 
     Raises

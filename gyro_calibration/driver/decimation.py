@@ -32,8 +32,7 @@ class Decimation:
 
     Parameters
     ----------
-    size : int
-        Samples of a group; 1 leaves them as they are.
+    size : samples of a group; 1 leaves them as they are
 
     """
 

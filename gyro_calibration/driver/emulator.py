@@ -56,20 +56,15 @@ class Emulator:
     Parameters
     ----------
     protocol : Protocol
-    samples : iterable of Sample
-        Each with its time, in seconds.
+    samples : each with its time, in seconds
     settings : Settings or None
-    speed : float
-        Times real time; inf is as fast as the reader reads. At 1 or slower, bytes that are not
+    speed : times real time; inf is as fast as the reader reads. At 1 or slower, bytes that are not
         read are lost, as on a real line; faster is a replay, which waits for the reader.
-    link : path or None
-        A symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
+    link : a symbolic link to the pseudo-terminal, whose own name differs from run to run. It is
         removed at the end.
-    wait_for_reader : bool
-        Whether to send the first sample only after a reader has opened the port.
-    line : callable or None
-        Takes the time, s, and the bytes of each sample, and gives those that arrive, as a line
-        with faults changes them.
+    wait_for_reader : whether to send the first sample only after a reader has opened the port
+    line : takes the time, s, and the bytes of each sample, and gives those that arrive, as a line
+        with faults changes them
 
     Raises
     ------
@@ -234,8 +229,7 @@ def emulate(emulator: Emulator, announce: Callable[[str], None] = lambda path: N
     Parameters
     ----------
     emulator : Emulator
-    announce : callable
-        Gets the path to open, once it is there.
+    announce : gets the path to open, once it is there
 
     """
     try:

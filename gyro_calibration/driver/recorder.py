@@ -85,10 +85,8 @@ class AtomicAppender:
 
     Attributes
     ----------
-    size : int
-        Bytes in the file.
-    is_full : bool
-        Whether a piece found no room.
+    size : bytes in the file
+    is_full : whether a piece found no room
 
     Raises
     ------
@@ -157,15 +155,12 @@ class McapRecorder:
 
     Parameters
     ----------
-    path : str
-        Of the new file.
-    notes : callable
-        Returns its notes.
+    path : of the new file
+    notes : returns its notes
 
     Attributes
     ----------
-    variance : float
-        Of the rate of one sample of a port, (rad/s)².
+    variance : of the rate of one sample of a port, (rad/s)²
 
     Raises
     ------
@@ -237,18 +232,14 @@ class CsvRecorder:
 
     Parameters
     ----------
-    path : str
-        Of the new file, .csv or .csv.gz.
-    notes : callable
-        Returns its notes.
-    expected : sequence of str
-        Columns that the first piece waits for, and 'reference' for those of a reference, as they
-        come a little later than the samples that they belong to.
+    path : of the new file, .csv or .csv.gz
+    notes : returns its notes
+    expected : columns that the first piece waits for, and 'reference' for those of a reference, as
+        they come a little later than the samples that they belong to
 
     Attributes
     ----------
-    missed : set of str
-        Columns that came too late to get into the file.
+    missed : columns that came too late to get into the file
 
     Raises
     ------
@@ -409,22 +400,16 @@ class MessageLog:
 
     Parameters
     ----------
-    rows : CsvRecorder or None
-        None to only count.
-    topics : mapping of str to str
-        Those of the gyro, the temperature and the reference, by these words.
+    rows : None to only count
+    topics : those of the gyro, the temperature and the reference, by these words
 
     Attributes
     ----------
-    samples : int
-        Of the gyro.
-    damaged : int
-        Messages that could not be read.
-    left_out : int
-        Samples that are not later than one before.
-    of_another_kind : dict of str to str
-        Topics that are not of the kind that their role wants, with what it wants; where messages
-        are only counted.
+    samples : of the gyro
+    damaged : messages that could not be read
+    left_out : samples that are not later than one before
+    of_another_kind : topics that are not of the kind that their role wants, with what it wants;
+        where messages are only counted
 
     """
 

@@ -47,10 +47,8 @@ class SerialPort:
     Parameters
     ----------
     path : str
-    baud : int
-        Bits per second, with 8 data bits, no parity and 1 stop bit.
-    timeout : float
-        How long `read` waits for the first byte, in seconds.
+    baud : bits per second, with 8 data bits, no parity and 1 stop bit
+    timeout : how long `read` waits for the first byte, in seconds
 
     """
 

@@ -78,8 +78,7 @@ class LowerLine:
 
     Parameters
     ----------
-    slope : float
-        Until there are two points.
+    slope : until there are two points
 
     """
 
@@ -169,11 +168,9 @@ class _Numbers:
 
     Attributes
     ----------
-    size : float
-        How far a sample is from the next on average.
-    unit : int
-        By this many samples, or a multiple, the number may be wrong; 0 where the device gives
-        its time.
+    size : how far a sample is from the next on average
+    unit : by this many samples, or a multiple, the number may be wrong; 0 where the device gives
+        its time
 
     """
 
@@ -351,23 +348,17 @@ class SampleClock:
 
     Parameters
     ----------
-    rate : float
-        Nominal samples per second.
-    modulus : int
-        At which `Sample.sequence` begins anew; 0 for a device without one.
-    after : float
-        All stamps are later than this, the last one of another clock.
+    rate : nominal samples per second
+    modulus : at which `Sample.sequence` begins anew; 0 for a device without one
+    after : all stamps are later than this, the last one of another clock
 
     Attributes
     ----------
-    lost : int
-        Samples lost so far while the port was open: missing in the sequence or in the time of the
-        device, or damaged, or shown by the lateness of all samples since.
-    period : float
-        Seconds from one sample to the next, as fitted.
-    jitter_before, jitter_after : float
-        Root mean square over the last ten seconds, s: how late samples arrive, and how far stamps
-        are from the line.
+    lost : samples lost so far while the port was open: missing in the sequence or in the time of
+        the device, or damaged, or shown by the lateness of all samples since
+    period : seconds from one sample to the next, as fitted
+    jitter_before, jitter_after : root mean square over the last ten seconds, s: how late samples
+        arrive, and how far stamps are from the line
 
     """
 
@@ -413,8 +404,7 @@ class SampleClock:
         Parameters
         ----------
         samples : sequence of Sample, shape (n,)
-        arrival : float
-            When they came, in seconds of a clock that never goes back.
+        arrival : when they came, in seconds of a clock that never goes back
 
         """
         if not samples:
@@ -564,17 +554,13 @@ class ClockSteps:
 
     Parameters
     ----------
-    ahead, behind : float
-        By more than this, s, a clock that runs does not change against the steady one.
-    back : float
-        By more than this, s, it does not go back.
+    ahead, behind : by more than this, s, a clock that runs does not change against the steady one
+    back : by more than this, s, it does not go back
 
     Attributes
     ----------
-    count : int
-        How often the clock was set.
-    last : float
-        By how much it was set the last time, s.
+    count : how often the clock was set
+    last : by how much it was set the last time, s
 
     """
 
@@ -678,12 +664,10 @@ class HostClock:
 
         Parameters
         ----------
-        stamp : float
-            Seconds.
-        before : float
-            Time of the sample before it, s; -inf for the first, which shows no step of the clock.
-        usual : float
-            Interval, s; inf while it is not known.
+        stamp : seconds
+        before : time of the sample before it, s; -inf for the first, which shows no step of the
+            clock
+        usual : interval, s; inf while it is not known
 
         """
         if before == -math.inf:
@@ -718,8 +702,7 @@ class MessageClock:
 
     Attributes
     ----------
-    count : int
-        How often the clock was set.
+    count : how often the clock was set
 
     """
 

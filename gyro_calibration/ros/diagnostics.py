@@ -52,13 +52,10 @@ class Diagnostics:
         Parameters
         ----------
         node : Node
-        name : str
-            What is reported on, for example ``'gyro'``.
-        report : callable
-            Returns the level, one sentence, and values by name. It is never called twice at the
-            same time, and must not call `now`.
-        hardware_id : str
-            The device; ``'none'`` where it has no name.
+        name : what is reported on, for example ``'gyro'``
+        report : returns the level, one sentence, and values by name. It is never called twice at
+            the same time, and must not call `now`.
+        hardware_id : the device; ``'none'`` where it has no name
 
         """
         self.level: bytes | None = None

@@ -198,8 +198,7 @@ class Messages:
     ----------
     imu : Imu
     temperature : Temperature
-    variance : float
-        Of one sample, (rad/s)².
+    variance : of one sample, (rad/s)²
 
     """
 

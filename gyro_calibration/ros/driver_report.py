@@ -30,16 +30,13 @@ class DriverReport:
     Parameters
     ----------
     connection : Connection
-    port : str
-        As it was given.
+    port : as it was given
     settings : Settings
-    clock : callable
-        Returns seconds of the steady clock.
+    clock : returns seconds of the steady clock
 
     Attributes
     ----------
-    event : str
-        What happened last, in a sentence.
+    event : what happened last, in a sentence
 
     """
 

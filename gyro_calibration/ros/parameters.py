@@ -30,19 +30,13 @@ class Parameter:
 
     Attributes
     ----------
-    name : str
-        Groups are separated by a dot, as in ``calibration.maximum_bias``.
+    name : groups are separated by a dot, as in ``calibration.maximum_bias``
     default : bool, int, float, str or sequence of str
-    description : str
-        One sentence, without the unit.
-    unit : str
-        Empty where there is none.
-    range : tuple of two numbers, or None
-        Lowest and highest value, both allowed.
-    dynamic : bool
-        Whether it may be set while the node runs.
-    choices : tuple of str
-        The values that a text may have; empty for any.
+    description : one sentence, without the unit
+    unit : empty where there is none
+    range : lowest and highest value, both allowed
+    dynamic : whether it may be set while the node runs
+    choices : the values that a text may have; empty for any
 
     """
 

@@ -54,19 +54,14 @@ class RecorderNode(Node):
     Parameters
     ----------
     topics : sequence of str
-    everything : bool
-        Whether all other topics are wanted as well.
-    take : callable
-        Gets each message, and the definition.
+    everything : whether all other topics are wanted as well
+    take : gets each message, and the definition
 
     Attributes
     ----------
-    topics : tuple of str
-        Those that were asked for, with their full names.
-    unknown : dict of str to str
-        Topics whose type is not installed here, and why they cannot be recorded.
-    taken : int
-        Number of messages that were handed over.
+    topics : those that were asked for, with their full names
+    unknown : topics whose type is not installed here, and why they cannot be recorded
+    taken : number of messages that were handed over
 
     Raises
     ------

@@ -103,8 +103,7 @@ def declare(node: Node, table: Sequence[Parameter],
     ----------
     node : Node
     table : sequence of Parameter
-    changed : callable
-        Takes the record of all values after some were set.
+    changed : takes the record of all values after some were set
 
     Raises
     ------

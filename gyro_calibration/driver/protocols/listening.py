@@ -43,18 +43,13 @@ class Recognition:
 
     Attributes
     ----------
-    protocol : Protocol or None
-        None if there are too few bytes, or none explains them, or two do.
-    explained : float
-        The share of the bytes that are frames of the best format, 0 to 1; the rest of a frame at
-        the beginning does not count. Where the columns do not fit, the share of the lines that
-        have as many numbers as most.
-    frames : int
-        How many frames that are.
-    runner_up : Protocol or None
-        The next best format, if it explains any byte.
-    words : str
-        This in a sentence.
+    protocol : None if there are too few bytes, or none explains them, or two do
+    explained : the share of the bytes that are frames of the best format, 0 to 1; the rest of a
+        frame at the beginning does not count. Where the columns do not fit, the share of the lines
+        that have as many numbers as most.
+    frames : how many frames that are
+    runner_up : the next best format, if it explains any byte
+    words : this in a sentence
 
     """
 
@@ -81,10 +76,8 @@ def recognize(data: bytes, settings: Settings | None = None) -> Recognition:
 
     Parameters
     ----------
-    data : bytes
-        All that came from the port, from anywhere on.
-    settings : Settings or None
-        The format ``csv`` is recognized by the number of its columns.
+    data : all that came from the port, from anywhere on
+    settings : the format ``csv`` is recognized by the number of its columns
 
     """
     settings, data = settings or Settings(), data[-_LONGEST:]

@@ -54,22 +54,15 @@ class Sample:
 
     Attributes
     ----------
-    output : float
-        rad/s, counter-clockwise positive.
-    temperature : float or None
-        degC; None where the device sends none with this sample.
-    time : float or None
-        Seconds, by the clock of the device.
-    sequence : int or None
-        Count of the device, modulo `Protocol.modulus`.
-    missing : int
-        Samples that seem to be lost directly before this one: damaged, called invalid by the
+    output : rad/s, counter-clockwise positive
+    temperature : degC; None where the device sends none with this sample
+    time : seconds, by the clock of the device
+    sequence : count of the device, modulo `Protocol.modulus`
+    missing : samples that seem to be lost directly before this one: damaged, called invalid by the
         device, or refused. A sequence, or the time that passed, knows better.
-    specific_force : float or None
-        m/s², along the input axis.
-    health : mapping of str to float
-        What else the device reports of itself with this sample, by names with their units:
-        ``supply_v``, ``source_current_a``.
+    specific_force : m/s², along the input axis
+    health : what else the device reports of itself with this sample, by names with their units:
+        ``supply_v``, ``source_current_a``
 
     """
 
@@ -89,22 +82,16 @@ class Settings:
 
     Attributes
     ----------
-    sensitivity : float or None
-        rad/s per count, or per unit of the device.
-    invert : bool or None
-        Whether the device counts clockwise turns positive.
-    axis : str
-        ``'x'``, ``'y'`` or ``'z'``: the one to read of a gyro with three.
-    columns : tuple of str
-        Of the protocol ``csv``, in the words of the log format; columns with other names are
-        skipped.
-    full_scale : float or None
-        rad/s; samples beyond it are refused, since the device cannot mean them.
-    increments : bool or None
-        Whether the device is set to send the angle since its last sample in place of the rate.
-    sample_rate : float or None
-        Hz, that the device is set to; an increment divided by the interval of this rate is the
-        rate of turn.
+    sensitivity : rad/s per count, or per unit of the device
+    invert : whether the device counts clockwise turns positive
+    axis : ``'x'``, ``'y'`` or ``'z'``: the one to read of a gyro with three
+    columns : of the protocol ``csv``, in the words of the log format; columns with other names are
+        skipped
+    full_scale : rad/s; samples beyond it are refused, since the device cannot mean them
+    increments : whether the device is set to send the angle since its last sample in place of the
+        rate
+    sample_rate : Hz, that the device is set to; an increment divided by the interval of this rate
+        is the rate of turn
 
     Raises
     ------
@@ -245,41 +232,25 @@ class Protocol:
     Attributes
     ----------
     name, description : str
-    baud : int
-        Bits per second of the line, which has 8 data bits, no parity and 1 stop bit.
-    rate : float
-        Nominal samples per second; see `nominal_rate`.
-    sensitivity : float
-        rad/s per unit of the device, or rad where it sends increments.
-    splitter : callable
-        Returns a new `Splitter`.
-    parser : callable
-        ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and
-        `stateless`.
-    writer : callable
-        ``writer(settings)`` returns what writes the frames of one device, see `Write` and
-        `stateless`.
-    invert : bool
-        Whether the device counts clockwise turns positive.
-    full_scale : float
-        rad/s.
-    largest_count : int or None
-        Of a device that counts; its full scale is then this many times the sensitivity.
-    noise_density : float or None
-        White noise of the rate, rad/s/√Hz, where the data sheet of the gyro is known.
-    increments : bool
-        Whether the device sends angles since its last sample, if nothing else is set.
-    startup : bytes
-        What makes the device send.
-    preamble : bytes
-        What the emulated device sends first, so that its first sample is not taken for the rest
-        of a line.
-    modulus : int
-        At which the sequence of the device begins anew; 0 where it has none.
-    good : mapping of str to (float, float)
-        Between which the values of `Sample.health` should be.
-    check : callable
-        ``check(settings)`` raises ValueError when the format needs more.
+    baud : bits per second of the line, which has 8 data bits, no parity and 1 stop bit
+    rate : nominal samples per second; see `nominal_rate`
+    sensitivity : rad/s per unit of the device, or rad where it sends increments
+    splitter : returns a new `Splitter`
+    parser : ``parser(settings)`` returns what parses the frames of one connection, see `Parse` and
+        `stateless`
+    writer : ``writer(settings)`` returns what writes the frames of one device, see `Write` and
+        `stateless`
+    invert : whether the device counts clockwise turns positive
+    full_scale : rad/s
+    largest_count : of a device that counts; its full scale is then this many times the sensitivity
+    noise_density : white noise of the rate, rad/s/√Hz, where the data sheet of the gyro is known
+    increments : whether the device sends angles since its last sample, if nothing else is set
+    startup : what makes the device send
+    preamble : what the emulated device sends first, so that its first sample is not taken for the
+        rest of a line
+    modulus : at which the sequence of the device begins anew; 0 where it has none
+    good : between which the values of `Sample.health` should be
+    check : ``check(settings)`` raises ValueError when the format needs more
 
     """
 
@@ -398,12 +369,9 @@ class Decoder:
 
     Attributes
     ----------
-    faults : int
-        Frames whose value the device itself calls invalid.
-    refused_samples : int
-        Frames whose value is not finite, or beyond full scale.
-    refused_temperatures : int
-        Not finite, or beyond -100 to 300 degC.
+    faults : frames whose value the device itself calls invalid
+    refused_samples : frames whose value is not finite, or beyond full scale
+    refused_temperatures : not finite, or beyond -100 to 300 degC
 
     """
 

@@ -32,10 +32,8 @@ class LineSplitter:
 
     Parameters
     ----------
-    longest : int
-        Bytes; a longer line is discarded, so that an endless one does not fill the memory.
-    beginnings : tuple of bytes
-        With what only a whole line begins.
+    longest : bytes; a longer line is discarded, so that an endless one does not fill the memory
+    beginnings : with what only a whole line begins
 
     """
 
@@ -84,12 +82,9 @@ class FrameSplitter:
 
     Parameters
     ----------
-    pattern : bytes
-        Regular expression that a frame matches; ``.`` is any byte.
-    length : int
-        Bytes of a frame.
-    is_intact : callable
-        Whether the checksum of a frame is right.
+    pattern : regular expression that a frame matches; ``.`` is any byte
+    length : bytes of a frame
+    is_intact : whether the checksum of a frame is right
 
     """
 
