@@ -43,7 +43,12 @@ from gyro_calibration.driver.protocols.protocol import Splitter
 from gyro_calibration.driver.protocols.splitters import LineSplitter
 from gyro_calibration.driver.timestamps import SampleClock
 from gyro_calibration.files import LARGEST
-from gyro_calibration.heading.bias_table import BiasTable, carry, read_bias_table, write_bias_table
+from gyro_calibration.heading.bias_table import (
+    BiasTable,
+    propagated,
+    read_bias_table,
+    write_bias_table,
+)
 from gyro_calibration.logs.cdr import IMU, LAYOUTS, serialize, TEMPERATURE
 from gyro_calibration.logs.log import (
     Log,
@@ -366,9 +371,9 @@ def check_bias_table(data: bytes) -> bool:
     with np.errstate(all='ignore'):
         bias, variance = table.predict(25.0, 1.7e9)
         change, spread = table.difference(10.0, 30.0, 1.7e9)
-        carried = carry(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0),
-                        table, 3600.0, 1.7e9, 25.0)
-    assert (all(map(math.isfinite, (bias, change, spread, carried.change))) and variance > 0.0
+        now = propagated(SelfCalibration(0.0, 0.001, ((1e-6, 0.0), (0.0, 1e-8)), temperature=20.0),
+                         table, 3600.0, 1.7e9, 25.0)
+    assert (all(map(math.isfinite, (bias, change, spread, now.change))) and variance > 0.0
             and spread >= 0.0)
     table.add(24.0, bias, 1e-8, 1.7e9)
     write_bias_table(path, table, 1.7e9)

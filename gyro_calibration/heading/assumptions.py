@@ -103,7 +103,7 @@ def _place(model: GyroModel, values: int) -> int:
     return values if model.self_calibration is None else values - 2
 
 
-class Way:
+class TemperatureCorrection:
     """
     Change of the bias from one temperature to others, by a table as it was when this began.
 

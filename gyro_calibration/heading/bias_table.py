@@ -133,7 +133,7 @@ _Dated = TypeVar('_Dated', Entry, Jump)
 
 
 @dataclass(frozen=True)
-class Carried:
+class Propagated:
     """
     A stored calibration as it is worth now.
 
@@ -309,7 +309,7 @@ class BiasTable:
 
     def joined(self, calibration: SelfCalibration, age: float, time: float,
                temperature: float | None, this_run: bool) -> tuple[float, float, float]:
-        """Return bias and variance now (see `carry`), and the weight of the calibration in it."""
+        """Return bias and variance now, and the weight of the calibration in the bias."""
         here = (self._model.reference_temperature if calibration.temperature is None
                 else calibration.temperature)
         now = here if temperature is None else temperature
@@ -491,16 +491,15 @@ def _differs(kept: Entry | None, entry: Entry) -> bool:
             or entry.variance < 0.8 * kept.variance)
 
 
-def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
-          temperature: float | None = None, this_run: bool = False) -> Carried:
+def propagated(calibration: SelfCalibration, table: BiasTable, age: float, time: float,
+               temperature: float | None = None, this_run: bool = False) -> Propagated:
     """
     Return a stored calibration as it holds now, moved and weighted by the table.
 
     It is joined to the table as one more estimate of the bias, at its own temperature and time. It
-    is for the start of a run, or of a tracker that begins anew. Within a run an `assumptions.Way`
-    goes on from there, of the table as it was; carried into a tracker that goes on, it would hold
-    what that knows already. Its age is counted: whatever it is given to must take it for a
-    calibration of now.
+    is for the start of a run, or of a tracker that begins anew; within a run an
+    `assumptions.TemperatureCorrection` goes on from there. Its age is counted: whatever it is
+    given to must take it for a calibration of now.
 
     Parameters
     ----------
@@ -517,17 +516,17 @@ def carry(calibration: SelfCalibration, table: BiasTable, age: float, time: floa
     (a, c), (_, own) = calibration.covariance
     bias, variance, weight = table.joined(calibration, age, time, temperature, this_run)
     moved = replace(calibration, bias=bias, covariance=((a, weight * c), (weight * c, variance)))
-    return Carried(moved, bias - calibration.bias, variance - own,
-                   _sentence(calibration, table, age, temperature, variance))
+    return Propagated(moved, bias - calibration.bias, variance - own,
+                      _sentence(calibration, table, age, temperature, variance))
 
 
 def _moved(calibration: SelfCalibration, table: BiasTable, time: float,
-           temperature: float | None) -> Carried:
+           temperature: float | None) -> Propagated:
     """Return a calibration without a covariance, at another temperature."""
     here = calibration.temperature
     change = (0.0 if here is None or temperature is None
               else table.difference(here, temperature, time)[0])
-    return Carried(replace(calibration, bias=calibration.bias + change), change, math.nan, '')
+    return Propagated(replace(calibration, bias=calibration.bias + change), change, math.nan, '')
 
 
 def _sentence(calibration: SelfCalibration, table: BiasTable, age: float,

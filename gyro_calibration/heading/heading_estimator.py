@@ -25,8 +25,14 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import math
 
-from gyro_calibration.heading.assumptions import assumed, Assumptions, sensitive, uncertain, Way
-from gyro_calibration.heading.bias_table import BiasTable, carry
+from gyro_calibration.heading.assumptions import (
+    assumed,
+    Assumptions,
+    sensitive,
+    TemperatureCorrection,
+    uncertain,
+)
+from gyro_calibration.heading.bias_table import BiasTable, propagated
 from gyro_calibration.heading.gaps import CLOSE
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import Array, DEGREE
@@ -126,7 +132,7 @@ class HeadingEstimator:
         settings : of the tracker
         temperature_timeout : an older temperature is held, and counts as less and less known, s
         now : s since 1970
-        keep : the way of the tracker, for `log_heading.in_hindsight`
+        keep : the steps of the tracker, for `log_heading.in_hindsight`
 
         """
         self._assumptions, self._settings, self._timeout, self._keep = (
@@ -224,8 +230,8 @@ class HeadingEstimator:
         """Let the bias follow the temperature from that of now on, if it is known."""
         here, coefficient = self._known_temperature, self._assumptions.bias_temperature_coefficient
         self._anchored = here is not None
-        self._way = (Way(self.table, here, now, coefficient)
-                     if here is not None and coefficient else None)
+        self._correction = (TemperatureCorrection(self.table, here, now, coefficient)
+                            if here is not None and coefficient else None)
 
     def _resume_temperature(self, now: float, around: Channels | None) -> None:
         """
@@ -250,14 +256,14 @@ class HeadingEstimator:
             return self._from_table(model, now)
         if self.model.self_calibration is None and not self.table.entries:
             return model, None
-        carried = carry(calibration, self.table, self.age(now), now, self._known_temperature,
-                        self._this_run)
-        self._sentence = carried.sentence
+        worth = propagated(calibration, self.table, self.age(now), now, self._known_temperature,
+                           self._this_run)
+        self._sentence = worth.sentence
         if (self._dated(now) or 0.0) < -_OLDER:
             self._sentence = (f'the calibration is dated {calibration.time}, which is later than '
                               'the clock of this computer: its age is not known and taken for a '
                               'year; set the clock, or calibrate again')
-        return with_self_calibration(model, carried.calibration), 0.0
+        return with_self_calibration(model, worth.calibration), 0.0
 
     def _from_table(self, model: GyroModel, now: float) -> tuple[GyroModel, float | None]:
         """Return a calibrated model with the bias of earlier runs on top."""
@@ -417,9 +423,9 @@ class HeadingEstimator:
         """Return the change of the bias with temperature, rad/s, and the distance, K."""
         if self.temperature is None:
             return 0.0, 0.0
-        if self._way is None:
+        if self._correction is None:
             return self._shift, _drifted_unseen(time - self._unknown_since)
-        change, distance = self._way.at(self.temperature)
+        change, distance = self._correction.at(self.temperature)
         late = abs(time - self._temperature_time) - self._timeout
         return (self._shift + change,
                 self._astray + distance + math.copysign(_drifted_unseen(late), distance))
@@ -489,7 +495,7 @@ class HeadingEstimator:
         return found
 
     def _even(self, time: Array, output: Array, temperature: Array | None, place: int) -> int:
-        """Return up to which sample model, table and way of the bias stay as they are."""
+        """Return up to which sample model, table and temperature correction stay as they are."""
         if (self.used.looks_around or self._time == -math.inf or self._other_age
                 or self._anchored == (temperature is None)
                 or temperature is None and self.temperature is not None):
@@ -516,9 +522,9 @@ class HeadingEstimator:
             self.temperature, self._temperature_time = float(temperature[-1]), self._time
             change += self._shift
             distance += self._astray
-            if self._way is not None:
-                on_way, far = self._way.along(temperature)
-                change, distance = change + on_way, distance + far
+            if self._correction is not None:
+                changed, far = self._correction.along(temperature)
+                change, distance = change + changed, distance + far
             else:
                 change[:], distance[:] = self._bias_change(self._time)
         calibration = used.self_calibration
@@ -647,8 +653,8 @@ class HeadingEstimator:
         if abs(bias - expected) > _FAR * math.sqrt(deviation ** 2 + variance):
             return ''
         message = self.table.add(temperature, bias, variance, now)
-        if (self._way is not None and self.tracker.resting and not stretch.over
-                and abs(temperature - self._way.begin) > _AWAY):
+        if (self._correction is not None and self.tracker.resting and not stretch.over
+                and abs(temperature - self._correction.begin) > _AWAY):
             self._begin(now)
         return message
 
@@ -661,7 +667,9 @@ class HeadingEstimator:
 
         """
         calibration = self.used.self_calibration or SelfCalibration()
-        change = self._shift + (0.0 if self._way is None else self._way.at(temperature)[0])
+        change = self._shift
+        if self._correction is not None:
+            change += self._correction.at(temperature)[0]
         off, deviation = self.tracker.bias_by(seen)
         return calibration.bias + change + off / calibration.scale, deviation / calibration.scale
 

@@ -38,7 +38,7 @@ HEADING, WALK, _FLICKER = 0, 1, 2
 
 
 @dataclass(slots=True)
-class Turn:
+class RateIntegral:
     """
     What the rates of some time came to.
 
@@ -63,17 +63,17 @@ class Turn:
     wander: float = 0.0
     unseen: bool = False
 
-    def __add__(self, other: Turn) -> Turn:
+    def __add__(self, other: RateIntegral) -> RateIntegral:
         """Return both after each other."""
-        return Turn(self.duration + other.duration, self.turned + other.turned,
-                    self.sensitivity + other.sensitivity,
-                    self.lost + other.lost, self.noise + other.noise)
+        return RateIntegral(self.duration + other.duration, self.turned + other.turned,
+                            self.sensitivity + other.sensitivity,
+                            self.lost + other.lost, self.noise + other.noise)
 
-    def __sub__(self, other: Turn) -> Turn:
+    def __sub__(self, other: RateIntegral) -> RateIntegral:
         """Return what is left of this one behind another with which it begins."""
-        return Turn(self.duration - other.duration, self.turned - other.turned,
-                    self.sensitivity - other.sensitivity,
-                    self.lost - other.lost, self.noise - other.noise)
+        return RateIntegral(self.duration - other.duration, self.turned - other.turned,
+                            self.sensitivity - other.sensitivity,
+                            self.lost - other.lost, self.noise - other.noise)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Drift:
         """Return the place of the first value of the calibration in the state."""
         return _FLICKER + len(self.noise.flicker()[0])
 
-    def step(self, turn: Turn) -> Step:
+    def step(self, turn: RateIntegral) -> Step:
         """Return how the state changes over a turn."""
         seen, variance = self._seen(turn)
         _, kept, grown = self._wandered(turn)
@@ -121,10 +121,10 @@ class Drift:
         grown[HEADING, HEADING] = variance
         return Step(seen, kept, grown)
 
-    def _wandered(self, turn: Turn) -> tuple[Array, Array, Array]:
+    def _wandered(self, turn: RateIntegral) -> tuple[Array, Array, Array]:
         return _step(self.noise, round(turn.duration, 6), turn.unseen, len(turn.sensitivity))
 
-    def _seen(self, turn: Turn) -> tuple[Array, float]:
+    def _seen(self, turn: RateIntegral) -> tuple[Array, float]:
         """Return `Step.seen`, and the variance of what comes in new to the integral, rad²."""
         seen, _, grown = self._wandered(turn)
         seen = seen.copy()
@@ -132,7 +132,7 @@ class Drift:
         white = 0.0 if turn.unseen else self.noise.angle_random_walk ** 2 * turn.duration
         return seen, float(grown[HEADING, HEADING]) + white + turn.lost + turn.noise
 
-    def moved(self, turn: Turn) -> Drift:
+    def moved(self, turn: RateIntegral) -> Drift:
         """Return the state after a turn."""
         step = self.step(turn)
         transition = np.diag(step.kept)
@@ -141,23 +141,23 @@ class Drift:
         mean[HEADING] += turn.turned - step.seen @ self.mean
         return Drift(self.noise, mean, transition @ self.covariance @ transition.T + step.grown)
 
-    def heading_variance(self, turn: Turn) -> float:
+    def heading_variance(self, turn: RateIntegral) -> float:
         """Return the variance of the heading after a turn, rad²."""
         return float(self.heading_variances([turn])[0])
 
-    def heading_variances(self, turns: list[Turn]) -> Array:
+    def heading_variances(self, turns: list[RateIntegral]) -> Array:
         """Return the same after each of several turns, shape (k,)."""
         seen, variances = zip(*map(self._seen, turns))
         rows = -np.array(seen)
         rows[:, HEADING] += 1.0
         return np.asarray((rows @ self.covariance * rows).sum(axis=1) + variances)
 
-    def rested(self, turn: Turn) -> Drift:
+    def rested(self, turn: RateIntegral) -> Drift:
         """Return the state after a time in which the true rate was zero."""
         step = self.step(turn)
         return self.measured(turn, step).carried(turn, step)
 
-    def measured(self, turn: Turn, step: Step | None = None) -> Drift:
+    def measured(self, turn: RateIntegral, step: Step | None = None) -> Drift:
         """
         Return the state at the begin of a time of rest, with what it shows.
 
@@ -177,7 +177,7 @@ class Drift:
         return Drift(self.noise, self.mean + along * (off / variance),
                      covariance - along[:, None] * along / variance)
 
-    def carried(self, turn: Turn, step: Step | None = None) -> Drift:
+    def carried(self, turn: RateIntegral, step: Step | None = None) -> Drift:
         """Return the state after a time in which the heading stood and nothing was measured."""
         step = step or self.step(turn)
         grown = step.grown.copy()
@@ -186,7 +186,7 @@ class Drift:
         return Drift(self.noise, step.kept * self.mean,
                      step.kept[:, None] * self.covariance * step.kept + grown)
 
-    def expected(self, turn: Turn) -> tuple[float, float]:
+    def expected(self, turn: RateIntegral) -> tuple[float, float]:
         """Return the integral of the compensated rate at rest, rad, and its variance, rad²."""
         seen, variance = self._seen(turn)
         return float(seen @ self.mean), float(seen @ self.covariance @ seen) + variance
@@ -263,7 +263,7 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
     return Drift(noise, mean, whole)
 
 
-def surprises(drifts: list[Drift], turns: list[Turn]) -> Array:
+def surprises(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
     """Return how far each turn is off that of a rest after its state, in standard deviations."""
     seen, variances = zip(*(drift._seen(turn) for drift, turn in zip(drifts, turns)))
     rows, means = np.array(seen), np.array([drift.mean for drift in drifts])
@@ -312,7 +312,7 @@ def _unseen(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
     return seen, kept, grown
 
 
-def smoothed(states: list[Drift], turns: list[Turn], resting: list[bool]) -> list[Drift]:
+def smoothed(states: list[Drift], turns: list[RateIntegral], resting: list[bool]) -> list[Drift]:
     """
     Return the states with all that came later (Rauch, Tung and Striebel).
 
@@ -328,7 +328,7 @@ def smoothed(states: list[Drift], turns: list[Turn], resting: list[bool]) -> lis
     return later[::-1]
 
 
-def _with_hindsight(state: Drift, turn: Turn, rest: bool, later: Drift) -> Drift:
+def _with_hindsight(state: Drift, turn: RateIntegral, rest: bool, later: Drift) -> Drift:
     """Return a state with what the one after it has come to."""
     step, start = state.step(turn), state
     if rest:

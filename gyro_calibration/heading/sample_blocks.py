@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gyro_calibration.heading.gaps import block_ends
-from gyro_calibration.heading.kalman import Drift, HEADING, Turn
+from gyro_calibration.heading.kalman import Drift, HEADING, RateIntegral
 from gyro_calibration.heading.stationary import BLOCK, WINDOW
 from gyro_calibration.logs.log import Array, SHORTEST
 import numpy as np
@@ -69,7 +69,7 @@ class Epoch:
     resting: bool
     heading: float
     pending: float
-    opens: list[tuple[int, Turn]]
+    opens: list[tuple[int, RateIntegral]]
     end: int = -1
 
 

@@ -12,7 +12,7 @@
 Whether a gyro rests: the energy of its rate against the known noise, and how unlikely a mean is.
 
 Each test has its share of the false alarms per hour at rest. What passes for a rest may be a
-straight way; how likely that is follows from the scatter of its means.
+straight drive; how likely that is follows from the scatter of its means.
 
 """
 
@@ -25,7 +25,7 @@ from functools import lru_cache
 import math
 
 from gyro_calibration.heading.gaps import CLOSE
-from gyro_calibration.heading.kalman import Drift, Turn
+from gyro_calibration.heading.kalman import Drift, RateIntegral
 from gyro_calibration.model.noise import Noise
 from scipy.special import chdtri, ndtri
 
@@ -40,11 +40,11 @@ _SAMPLES = 8
 #: Windows whose noise is remembered, those needed to use it, and the largest factor over the noise
 #: of the model.
 _REMEMBERED, _NEEDED, _TRUSTED = 120, 20, 3.0
-#: What is assumed of a robot at first: so many rests and straight ways that pass for rests, so
-#: much scatter of means over 1 s on such ways beyond the noise, over its variance, as if seen for
+#: What is assumed of a robot at first: so many rests and straight drives that pass for rests, so
+#: much scatter of means over 1 s on them beyond the noise, over its variance, as if seen for
 #: so long, s.
 _RESTS, _STRAIGHT, _SCATTER, _SCATTER_SEEN = 3.0, 1.0, 3.0, 5.0
-#: Rests and ways are remembered, and the scatter for so long, s; a mean counts up to so many
+#: Rests and drives are remembered, and the scatter for so long, s; a mean counts up to so many
 #: squared standard deviations.
 _STRETCHES, _SCATTER_MEMORY, SCATTER_MOST = 20.0, 200.0, 40.0
 #: Where the scatter began: the likelihood of a scatter of three times the noise is largest.
@@ -226,12 +226,12 @@ class Snapshot:
     turn : what the rates came to since it began
     squares, means : sum of the squared surprises of the steps since it began, and their number
     excess, weight : weighted sum of what their scatter had beyond the noise, over its variance
-    odds : logarithm of how much likelier they are on a straight way than at a rest
+    odds : logarithm of how much likelier they are on a straight drive than at a rest
 
     """
 
     drift: Drift
-    turn: Turn
+    turn: RateIntegral
     deleted: float
     steps: int
     squares: float = 0.0
@@ -242,39 +242,39 @@ class Snapshot:
 
 
 @dataclass
-class StraightWays:
+class StraightDrives:
     """
-    How often a straight way passed for a rest, and how much the rates scatter there.
+    How often a straight drive passed for a rest, and how much the rates scatter there.
 
     Attributes
     ----------
-    rests, ways : how many there were
+    rests, drives : how many there were
     excess, weight : weighted sum of the scatter of means over 1 s, over the variance of the noise
 
     """
 
     rests: float = _RESTS
-    ways: float = _STRAIGHT
+    drives: float = _STRAIGHT
     excess: float = _SCATTER * _SCATTER_SEEN
     weight: float = _SCATTER_SEEN
 
     @property
     def scatter(self) -> float:
-        """Return the scatter on a way, over the variance of the noise."""
+        """Return the scatter on a straight drive, over the variance of the noise."""
         return max(self.excess / self.weight, 0.0)
 
     def chance(self, odds: float) -> float:
-        """Return the probability that what passes for a rest is a way."""
-        return 1.0 / (1.0 + self.rests / self.ways * math.exp(min(-odds, 700.0)))
+        """Return the probability that what passes for a rest is a straight drive."""
+        return 1.0 / (1.0 + self.rests / self.drives * math.exp(min(-odds, 700.0)))
 
     def learn(self, last: Snapshot) -> None:
         """Take in all of what passed for a rest."""
-        way = self.chance(last.odds)
-        kept = _STRETCHES / max(_STRETCHES, self.rests + self.ways)
-        self.rests, self.ways = kept * self.rests + 1.0 - way, kept * self.ways + way
+        drive = self.chance(last.odds)
+        kept = _STRETCHES / max(_STRETCHES, self.rests + self.drives)
+        self.rests, self.drives = kept * self.rests + 1.0 - drive, kept * self.drives + drive
         kept = _SCATTER_MEMORY / max(_SCATTER_MEMORY, self.weight)
-        self.excess, self.weight = (kept * self.excess + way * last.excess,
-                                    kept * self.weight + way * last.weight)
+        self.excess, self.weight = (kept * self.excess + drive * last.excess,
+                                    kept * self.weight + drive * last.weight)
 
 
 @dataclass
@@ -292,4 +292,4 @@ class SlowTurn:
 
     before: Snapshot
     rate: float
-    turn: Turn
+    turn: RateIntegral

@@ -26,7 +26,7 @@ import math
 
 from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
 from gyro_calibration.heading.integration import Threshold, ThresholdFilter
-from gyro_calibration.heading.kalman import begin, Drift, HEADING, surprises, Turn, WALK
+from gyro_calibration.heading.kalman import begin, Drift, HEADING, RateIntegral, surprises, WALK
 from gyro_calibration.heading.sample_blocks import Epoch, EvenSamples, Samples, SETTLING
 from gyro_calibration.heading.stationary import (
     BEGINS,
@@ -40,7 +40,7 @@ from gyro_calibration.heading.stationary import (
     sigmas,
     SlowTurn,
     Snapshot,
-    StraightWays,
+    StraightDrives,
     WINDOW,
 )
 from gyro_calibration.logs.log import Array, DEGREE, SHORTEST
@@ -96,10 +96,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Step:
-    """A part of the way: state before, integral of the rates, robot at rest or not, end in s."""
+    """A part of the drive: state before, integral of the rates, robot at rest or not, end in s."""
 
     before: Drift
-    turn: Turn
+    turn: RateIntegral
     resting: bool
     end: float
 
@@ -118,7 +118,7 @@ class HeadingTracker:
     refused : samples that were not used, as no robot turns so fast; they count as lost
     outliers : samples that were not used, as no robot starts and stops so fast; they count as lost
     rebuilt : how often the state was not finite and was built anew
-    steps : the way so far, where it is kept
+    steps : the drive so far, where it is kept
     renewed : numbers of steps behind which another calibration was used, and the state before it
 
     """
@@ -139,12 +139,12 @@ class HeadingTracker:
         self.heading = self.rate = self.deleted = 0.0
         self.resting, self.steps, self._keep, self._interval = False, list[Step](), keep, math.inf
         self.renewed = list[tuple[int, Drift]]()
-        self._wanted, self._held, self._pending = WINDOW, Turn(0.0, 0.0, np.zeros(0)), 0.0
+        self._wanted, self._held, self._pending = WINDOW, RateIntegral(0.0, 0.0, np.zeros(0)), 0.0
         self._known: float | None = None
         self._slow: SlowTurn | None = None
         self._last: tuple[float, float, float, Array] | None = None
         self._reached = self._hesitates = 0.0
-        self._ways, self.outliers, self._taken = StraightWays(), 0, 0
+        self._drives, self.outliers, self._taken = StraightDrives(), 0, 0
         self._spike: tuple[float, float, Array, bool | None, Array | None] | None = None
         self.refused, self.rebuilt, self._mended, self._good = 0, 0, '', (0.0, 0.0)
         self._seen: Array | None = None
@@ -161,11 +161,11 @@ class HeadingTracker:
                age: float | None) -> None:
         self._claimed, self._calibrated = noise, (covariance, age)
         self._drift = begin(noise, covariance, heading, variance, age if len(covariance) else None)
-        self._nothing = Turn(0.0, 0.0, np.zeros(len(covariance)))
+        self._nothing = RateIntegral(0.0, 0.0, np.zeros(len(covariance)))
         self._part, self._open = self._none(), self._nothing
 
-    def _none(self) -> Turn:
-        return Turn(0.0, 0.0, self._nothing.sensitivity)
+    def _none(self) -> RateIntegral:
+        return RateIntegral(0.0, 0.0, self._nothing.sensitivity)
 
     def set(self, settings: Settings) -> None:  # noqa: A003
         """Go on with other settings."""
@@ -520,7 +520,7 @@ class HeadingTracker:
             self._advance(self._settled())
             self._rest()
 
-    def _hold(self, part: Turn) -> None:
+    def _hold(self, part: RateIntegral) -> None:
         """Hold the last blocks back that may turn out to be the begin of a rest."""
         self._recent.append(part)
         self._held += part
@@ -528,7 +528,7 @@ class HeadingTracker:
                and self._held.duration - self._recent[0].duration >= self._wanted - CLOSE):
             self._held -= self._recent.popleft()
 
-    def _settled(self) -> Turn:
+    def _settled(self) -> RateIntegral:
         """Return what is held back without its first block, in which the robot may move."""
         return self._held - self._recent[0]
 
@@ -570,7 +570,7 @@ class HeadingTracker:
         self._take()
         return True
 
-    def _surprise(self, drift: Drift, turn: Turn, unseen: float = 0.0) -> float:
+    def _surprise(self, drift: Drift, turn: RateIntegral, unseen: float = 0.0) -> float:
         """Return how far the rates came to something else than at rest, in standard deviations."""
         expected, variance = drift.expected(turn)
         return (turn.turned - expected) / math.sqrt(variance + (unseen * turn.duration) ** 2)
@@ -631,7 +631,7 @@ class HeadingTracker:
     def _move(self, wanted: float) -> None:
         """Take the robot for moving, until it is quiet for `wanted` s."""
         self.resting, self._wanted, self._recent, self._held = (
-            False, wanted, deque[Turn](), self._nothing)
+            False, wanted, deque[RateIntegral](), self._nothing)
 
     def _recognize(self) -> None:
         """Look for a rest anew; if there was one, it may go on."""
@@ -648,13 +648,13 @@ class HeadingTracker:
         turn = self._rested - before.turn
         self._slow = (self._slow_turn(before, turn) if lag >= LAGS[0] and not scattered else None)
         if self._snapshots[-1].means:
-            self._ways.learn(self._snapshots[-1])
+            self._drives.learn(self._snapshots[-1])
         self._drift, self.deleted, self._open = before.drift, before.deleted, turn
         del self.steps[before.steps:]
         self._move(max(lag, WINDOW))
         self._advance()
 
-    def _slow_turn(self, before: Snapshot, turn: Turn) -> SlowTurn | None:
+    def _slow_turn(self, before: Snapshot, turn: RateIntegral) -> SlowTurn | None:
         """Return what was noticed, where it is so slow that the bias may have moved."""
         longest = replace(self._nothing, duration=LAGS[-1])
         least = self._sigmas[LAGS[-1]] * math.sqrt(before.drift.expected(longest)[1]) / LAGS[-1]
@@ -695,7 +695,7 @@ class HeadingTracker:
             self._move(self._wanted)
         self._advance()
 
-    def _advance(self, left: Turn | None = None) -> None:
+    def _advance(self, left: RateIntegral | None = None) -> None:
         """Take the state on over what is open, but for what is left open."""
         left = left or self._nothing
         turn, self._open = self._open - left, left
@@ -706,15 +706,15 @@ class HeadingTracker:
                 self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._take()
 
-    def _advance_at_rest(self, turn: Turn, left: Turn) -> None:
+    def _advance_at_rest(self, turn: RateIntegral, left: RateIntegral) -> None:
         """Take the state on over a part of a rest, and see how much its rates scatter."""
         before, (expected, variance) = self._snapshots[-1], self._drift.expected(turn)
         white = self._drift.noise.angle_random_walk ** 2 * turn.duration
         squared, weight = (turn.turned - expected) ** 2 / variance, (white / variance) ** 2
-        scatter = self._ways.scatter * white
+        scatter = self._drives.scatter * white
         ratio = 1.0 + scatter / variance
         odds = before.odds + 0.5 * (squared * (1.0 - 1.0 / ratio) - math.log(ratio))
-        turn.wander = self._ways.chance(odds) * scatter
+        turn.wander = self._drives.chance(odds) * scatter
         squares, squared = before.squares + squared, min(squared, SCATTER_MOST)
         self._go_on(turn, self._reached - self._part.duration - left.duration)
         self._rested += turn
@@ -725,13 +725,13 @@ class HeadingTracker:
             odds))
         del self._snapshots[:-_SNAPSHOTS]
 
-    def _go_on(self, turn: Turn, end: float) -> None:
+    def _go_on(self, turn: RateIntegral, end: float) -> None:
         """Take the state on over a turn that ends at a time, s."""
         if self._keep:
             self.steps.append(Step(self._drift, turn, self.resting, end))
         self._drift = self._drift.rested(turn) if self.resting else self._drift.moved(turn)
 
-    def _at_rest(self, turn: Turn) -> Turn:
+    def _at_rest(self, turn: RateIntegral) -> RateIntegral:
         """Return what the rates of a rest came to, without their noise in the sensitivity."""
         return (turn + self._nothing if self._still is None
                 else replace(turn, sensitivity=turn.duration * self._still))
@@ -776,7 +776,7 @@ class HeadingTracker:
                         'the heading may be off by a full turn')
         self._take()
 
-    def _corrected(self, part: Turn) -> float:
+    def _corrected(self, part: RateIntegral) -> float:
         """Return what the rates of a part came to, less what rests have taught, rad."""
         return part.turned - part.duration * self._offset + float(part.sensitivity @ self._values)
 

@@ -31,13 +31,13 @@ from bias_history import (
 from gyro_calibration.heading.bias_table import (
     BiasTable,
     BIN,
-    carry,
     ENTRIES,
     Entry,
     INTERVAL,
     Jump,
     model_digest,
     Prior,
+    propagated,
     read_bias_table,
     write_bias_table,
 )
@@ -256,10 +256,10 @@ def test_a_table_makes_a_carried_calibration_better(carried):
 
 
 def test_a_fresh_calibration_is_used_as_it_is():
-    carried = carry(CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, this_run=True)
-    assert (carried.change == 0.0 and not carried.sentence
-            and carried.variance == pytest.approx(NOISE.wander(10.0, 10.0), rel=1e-6))
-    assert carried.calibration.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
+    now = propagated(CALIBRATION, BiasTable(MODEL), 0.0, DAY, 20.0, this_run=True)
+    assert (now.change == 0.0 and not now.sentence
+            and now.variance == pytest.approx(NOISE.wander(10.0, 10.0), rel=1e-6))
+    assert now.calibration.covariance[0] == pytest.approx(CALIBRATION.covariance[0])
 
 
 @pytest.mark.parametrize('age,temperature,words', [
@@ -267,8 +267,8 @@ def test_a_fresh_calibration_is_used_as_it_is():
     (60.0, 45.0, '1 minutes ago at 20.0 degC, and now it is 45.0'),
     (7 * 3600.0, None, '7 hours ago at a temperature that is not known')])
 def test_age_and_distance_are_reported_where_they_matter(age, temperature, words):
-    carried = carry(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
-    assert words in carried.sentence and carried.variance > OWN ** 2 and carried.change == 0.0
+    now = propagated(CALIBRATION, BiasTable(MODEL), age, 500 * DAY, temperature)
+    assert words in now.sentence and now.variance > OWN ** 2 and now.change == 0.0
 
 
 def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_covariance_one():
@@ -276,18 +276,18 @@ def test_a_table_moves_a_calibration_to_the_temperature_of_now_and_keeps_its_cov
                        lambda temperature: 0.05 * DEGREE * (temperature - 20.0), outliers=0.0)
     table = learned(history, 6)
     high = max(each.temperature for each in table.entries)
-    carried = carry(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0, 6 * DAY, high,
-                    this_run=True)
+    now = propagated(CALIBRATION, BiasTable(MODEL, entries=table.entries), 3600.0, 6 * DAY, high,
+                     this_run=True)
     expected = 0.05 * DEGREE * (high - 20.0)
-    assert (carried.change == pytest.approx(expected, rel=0.1)
-            and carried.calibration.bias == CALIBRATION.bias + carried.change)
-    assert np.linalg.eigvalsh(carried.calibration.covariance).min() > 0.0
+    assert (now.change == pytest.approx(expected, rel=0.1)
+            and now.calibration.bias == CALIBRATION.bias + now.change)
+    assert np.linalg.eigvalsh(now.calibration.covariance).min() > 0.0
 
 
 def test_a_calibration_of_which_nobody_knows_how_good_it_is_keeps_no_variance():
-    carried = carry(replace(CALIBRATION, covariance=None), BiasTable(MODEL), DAY, 2 * DAY, 30.0)
-    assert (carried.calibration.covariance is None and math.isnan(carried.variance)
-            and not carried.sentence)
+    now = propagated(replace(CALIBRATION, covariance=None), BiasTable(MODEL), DAY, 2 * DAY, 30.0)
+    assert (now.calibration.covariance is None and math.isnan(now.variance)
+            and not now.sentence)
 
 
 def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
@@ -295,9 +295,9 @@ def test_a_calibration_and_the_rests_of_its_run_are_no_two_runs():
     table.add(20.0, 0.0, WHITE, 1000.0)
     table.begin_run()
     stored = replace(CALIBRATION, bias=0.0)
-    near, far = (carry(stored, table, DAY - made, DAY, 20.0).variance
+    near, far = (propagated(stored, table, DAY - made, DAY, 20.0).variance
                  for made in (1060.0, 20000.0))
-    alone = carry(stored, BiasTable(MODEL), DAY - 1060.0, DAY, 20.0).variance
+    alone = propagated(stored, BiasTable(MODEL), DAY - 1060.0, DAY, 20.0).variance
     assert far < 0.7 * alone < 0.75 * near
 
 
@@ -307,7 +307,7 @@ def test_a_jump_after_a_calibration_makes_it_worth_less_and_one_before_does_not(
     stored = replace(CALIBRATION, bias=history.bias[3, 20], temperature=temperature)
     unjumped = BiasTable(MODEL, jumps=table.jumps)
     after, before, in_this_run = (
-        carry(stored, unjumped, age, time, temperature, this_run).variance
+        propagated(stored, unjumped, age, time, temperature, this_run).variance
         for age, this_run in ((60.0, False), (3 * DAY, False), (3000.0, True)))
     assert min(before, in_this_run) > after + 0.9 * table.jumps[0].variance
 

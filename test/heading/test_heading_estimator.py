@@ -19,7 +19,13 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import math
 
-from gyro_calibration.heading.assumptions import assumed, Assumptions, sensitive, uncertain, Way
+from gyro_calibration.heading.assumptions import (
+    assumed,
+    Assumptions,
+    sensitive,
+    TemperatureCorrection,
+    uncertain,
+)
 from gyro_calibration.heading.bias_table import BiasTable, Entry, Prior
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.tracker import Settings
@@ -138,20 +144,21 @@ def test_sensitivities_have_the_order_of_the_covariance_and_foretell_what_the_ra
     assert np.delete(np.delete(inside, 1, 0), 1, 1) == pytest.approx(covariance(model))
 
 
-def test_a_way_is_that_of_the_table_at_its_steps_and_in_between_and_does_not_learn():
+def test_a_temperature_correction_is_the_table_at_its_steps_and_between_and_does_not_learn():
     table = BiasTable(MODEL, entries=[Entry(t, 0.001 * t, 1e-10, NOW - 1e5, 0)
                                       for t in (20.0, 25.0, 30.0, 35.0)])
-    way = Way(table, 25.0, NOW, 0.03 * DEGREE)
+    correction = TemperatureCorrection(table, 25.0, NOW, 0.03 * DEGREE)
     for temperature in (25.0, 25.13, 31.7, 19.9):
-        change, variance = table.difference(25.0, temperature, NOW)
-        gone, distance = way.at(temperature)
-        assert gone == pytest.approx(change, abs=2e-6)
+        expected, variance = table.difference(25.0, temperature, NOW)
+        change, distance = correction.at(temperature)
+        assert change == pytest.approx(expected, abs=2e-6)
         assert distance == pytest.approx(
             math.copysign(math.sqrt(variance) / (0.03 * DEGREE), temperature - 25.0), abs=0.1)
-    before = way.at(40.0)
+    before = correction.at(40.0)
     for number in range(5):
         table.add(40.0, 0.05, 1e-10, NOW + number)
-    assert way.at(40.0) == before and Way(table, 25.0, NOW, 0.03 * DEGREE).at(40.0) != before
+    anew = TemperatureCorrection(table, 25.0, NOW, 0.03 * DEGREE)
+    assert correction.at(40.0) == before != anew.at(40.0)
 
 
 def test_an_uncalibrated_gyro_learns_its_bias_at_rest_but_not_its_scale():

@@ -14,7 +14,7 @@ import math
 
 from chance import RARE
 from gyro_calibration.heading.integration import integrate, Threshold
-from gyro_calibration.heading.kalman import begin, HEADING, smoothed, Turn
+from gyro_calibration.heading.kalman import begin, HEADING, RateIntegral, smoothed
 from gyro_calibration.heading.log_heading import track
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE
@@ -54,34 +54,34 @@ def follow(time, rate, settings=None, wheels=None, noise=XV3500, hindsight=False
 
 # the filter
 
-def random_way(generator, noise, count=14):
+def random_parts(generator, noise, count=14):
     """Return random turns and an unseen one, which of them are rests, and the state before."""
     durations = generator.uniform(0.3, 3.0, count)
-    ways = [Turn(duration, 0.02 * generator.standard_normal() * duration,
-                 np.array([-0.3 * generator.standard_normal(), -duration]))
-            for duration in durations]
+    parts = [RateIntegral(duration, 0.02 * generator.standard_normal() * duration,
+                          np.array([-0.3 * generator.standard_normal(), -duration]))
+             for duration in durations]
     resting = list(generator.random(count) < 0.5)
-    ways.append(Turn(5.0, 0.0, np.zeros(2), lost=1e-4, unseen=True))
+    parts.append(RateIntegral(5.0, 0.0, np.zeros(2), lost=1e-4, unseen=True))
     half = count // 2
-    return (ways[half:] + ways[:half], resting[half:] + [False] + resting[:half],
+    return (parts[half:] + parts[:half], resting[half:] + [False] + resting[:half],
             begin(noise, np.diag([1e-4, 1e-5]), age=0.0))
 
 
-def by_least_squares(start, ways, resting):
+def by_least_squares(start, parts, resting):
     """Return mean and covariance of all headings from the joint distribution, not recursively."""
-    size, count = len(start.mean), len(ways)
+    size, count = len(start.mean), len(parts)
     transitions, grown, pushed, measured = [], [], [], []
-    for way, rest in zip(ways, resting):
-        step = start.step(way)
+    for part, rest in zip(parts, resting):
+        step = start.step(part)
         transition, new = np.diag(step.kept), step.grown.copy()
         push = np.zeros(size)
         if rest:
-            measured.append((step.seen, way.turned, step.grown[HEADING, HEADING]))
+            measured.append((step.seen, part.turned, step.grown[HEADING, HEADING]))
             new[HEADING] = new[:, HEADING] = 0.0
         else:
             measured.append(None)
             transition[HEADING] -= step.seen
-            push[HEADING] = way.turned
+            push[HEADING] = part.turned
         transitions.append(transition)
         grown.append(new)
         pushed.append(push)
@@ -107,12 +107,12 @@ def by_least_squares(start, ways, resting):
 @pytest.mark.parametrize('noise', [XV3500, Noise(1e-4, 0.0, 1e-5), Noise(1e-3)],
                          ids=['flicker', 'walk', 'white'])
 def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(noise):
-    ways, resting, start = random_way(np.random.default_rng(1), noise)
+    parts, resting, start = random_parts(np.random.default_rng(1), noise)
     states = [start]
-    for way, rest in zip(ways, resting):
-        states.append(states[-1].rested(way) if rest else states[-1].moved(way))
-    mean, variance = by_least_squares(start, ways, resting)
-    later = smoothed(states, ways, resting)
+    for part, rest in zip(parts, resting):
+        states.append(states[-1].rested(part) if rest else states[-1].moved(part))
+    mean, variance = by_least_squares(start, parts, resting)
+    later = smoothed(states, parts, resting)
     assert states[-1].mean[HEADING] == pytest.approx(mean[-1], abs=1e-9)
     assert states[-1].covariance[HEADING, HEADING] == pytest.approx(variance[-1], rel=1e-6)
     assert [state.mean[HEADING] for state in later] == pytest.approx(mean, abs=1e-8)
@@ -122,8 +122,8 @@ def test_filter_and_smoother_agree_with_least_squares_over_everything_at_once(no
 
 def test_one_long_turn_is_as_many_short_ones():
     start, part = (begin(XV3500, np.diag([1e-6, 1e-8]), age=100.0),
-                   Turn(0.7, 0.1, np.array([-0.1, -0.7])))
-    by_parts, whole = start, Turn(0.0, 0.0, np.zeros(2))
+                   RateIntegral(0.7, 0.1, np.array([-0.1, -0.7])))
+    by_parts, whole = start, RateIntegral(0.0, 0.0, np.zeros(2))
     for _ in range(30):
         by_parts, whole = by_parts.moved(part), whole + part
     assert by_parts.mean == pytest.approx(start.moved(whole).mean, abs=1e-12)
@@ -134,7 +134,7 @@ def test_the_variance_after_a_calibration_is_that_of_the_noise():
     """What a log's integration is told by a formula and the filter by its steps is one thing."""
     state = begin(XV3500, np.diag([0.0, 0.0]), age=0.0)
     for duration in (1.0, 10.0, 100.0, 1000.0):
-        after = state.moved(Turn(duration, 0.0, np.array([0.0, -duration])))
+        after = state.moved(RateIntegral(duration, 0.0, np.array([0.0, -duration])))
         assert after.covariance[HEADING, HEADING] == pytest.approx(
             XV3500.heading_variance(duration), rel=1e-6)
 
@@ -402,12 +402,12 @@ def random_drive(generator, duration):
     """Return a drive of rests, some too short to notice, fast and slow turns."""
     stretches, time = [(5.0, 0.0)], 5.0
     while time < duration:
-        kind, way = generator.random(), generator.choice([-1.0, 1.0])
+        kind, part = generator.random(), generator.choice([-1.0, 1.0])
         length, rate = (
             (generator.uniform(3, 20), 0.0) if kind < 0.4
             else (generator.uniform(0.8, 2), 0.0) if kind < 0.5
-            else (generator.uniform(10, 40), way * generator.uniform(0.5, 3)) if kind < 0.6
-            else (generator.uniform(2, 8), way * generator.uniform(5, 60)))
+            else (generator.uniform(10, 40), part * generator.uniform(0.5, 3)) if kind < 0.6
+            else (generator.uniform(2, 8), part * generator.uniform(5, 60)))
         stretches.append((length, rate))
         time += length
     return turns(stretches)
