@@ -12,18 +12,20 @@
 Chance in tests: seeds that stay the same, and bounds of counts.
 
 A test draws from the same seed in each run, by its name, and from another one as evidence. Where
-it counts what happens at a stated rate, its bound is one that chance alone breaks at most once in
-a million runs.
+it counts what happens at a stated rate, or measures a mean or a scatter, its bound is one that
+chance alone breaks at most once in a million runs.
 
 """
 
+import math
 import secrets
 import zlib
 
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binom, chi2
+from scipy.stats import t as student
 
-#: Probability that a count is beyond a bound although the rate is as stated.
+#: Probability that a count, a mean or a scatter is beyond a bound although all is as stated.
 RARE = 1e-6
 
 
@@ -35,6 +37,23 @@ def most(trials, rate):
 def fewest(trials, rate):
     """Return how often something of a stated rate happens at least, in so many trials."""
     return int(binom.ppf(RARE, trials, rate))
+
+
+def rms_bounds(freedom):
+    """
+    Return the least and the largest root mean square of normal values of deviation 1.
+
+    Of a scatter about the own mean, `freedom` is one less than there are values.
+
+    """
+    return tuple(math.sqrt(chi2.ppf(rare, freedom) / freedom) for rare in (RARE, 1.0 - RARE))
+
+
+def mean_bound(values):
+    """Return what the mean of normal values about zero is off at most, by their own scatter."""
+    count = len(values)
+    return (student.isf(0.5 * RARE, count - 1)
+            * np.std(values, axis=0, ddof=1) / math.sqrt(count))
 
 
 def seeded(name, fresh=False):

@@ -38,14 +38,6 @@ def values(*frames):
     return [(sample.temperature, dict(sample.health)) for sample in decoded(*frames)]
 
 
-@pytest.mark.parametrize('count',
-                         [0, 1, -1, 0x7FFFFF, -0x7FFFFF, -0x800000, 0x8000, -0x8000, 0x010203])
-def test_counts_have_a_sign(count):
-    sample, = decoded(frame(count))
-    assert sample.output == count
-    assert decoded(PROTOCOL.encode(Sample(float(count)), ONE_COUNT))[0].output == count
-
-
 @pytest.mark.parametrize('raw, degrees',
                          [(0, -50.0), (9830, 25.0), (1311, -40.0), (-1, -50.0), (0x7FFF, 200.0)])
 def test_the_temperature_comes_in_two_frames(raw, degrees):
