@@ -125,13 +125,6 @@ def resolve(port: str) -> str:
     return matches[0]
 
 
-def _known(protocol: str) -> Protocol:
-    try:
-        return find(protocol)
-    except ValueError as error:
-        raise ValueError(f'{error}, or {AUTO} to find it by listening') from None
-
-
 class _Silence:
     """
     The time without a sample, since the port was opened or since the last one came.
@@ -233,7 +226,8 @@ class Connection:
         clock: Callable[[], float] = steady,
         make_port: Callable[[str, int], SerialPort] = SerialPort,
     ):
-        self._pattern, self._given_baud, self._settings = port, baud, settings or Settings()
+        self._pattern, self._settings = port, settings or Settings()
+        self._bauds = (baud,) if baud else BAUDS
         self._on_change, self._now, self._make_port = on_change, clock, make_port
         self.state = State('opening')
         self.protocol: Protocol | None = None
@@ -246,7 +240,10 @@ class Connection:
         self.openings, self.waited, self.longest_gap = 0, 0.0, 0.0
         self._is_auto = protocol == AUTO
         if not self._is_auto:
-            known = _known(protocol)
+            try:
+                known = find(protocol)
+            except ValueError as error:
+                raise ValueError(f'{error}, or {AUTO} to find it by listening') from None
             self._use(known, baud or known.baud)
 
     def counts(self) -> Counts:
@@ -276,7 +273,11 @@ class Connection:
                     yield from self._read(self._open(stop), stop)
                 except PortError as error:
                     self._close()
-                    self._wait(str(error), stop)
+                    self._fail(str(error), self._delay)
+                    begin = self._now()
+                    stop.wait(self._delay)
+                    self.waited += self._now() - begin
+                    self._delay = min(2.0 * self._delay, _REOPEN[1])
         finally:
             self._close()
 
@@ -290,24 +291,17 @@ class Connection:
         """Open the port, listen if the protocol is not known, and make the gyro send."""
         path = resolve(self._pattern)
         self.path = os.path.realpath(path)
-        self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds()[0])
+        self._port = port = self._make_port(path, self.baud if self.protocol else self._bauds[0])
         port.open()
         self.openings += 1
         if self.protocol is None:
             self._listen(port, stop)
         if self.protocol is not None:
             assert self._decoder is not None and self.clock is not None
-            self._ask(port)
+            port.write(self.protocol.startup)
             self._decoder.reset()
             self.clock.interrupt()
         return port
-
-    def _ask(self, port: SerialPort) -> None:
-        assert self.protocol is not None
-        port.write(self.protocol.startup)
-
-    def _bauds(self) -> tuple[int, ...]:
-        return (self._given_baud,) if self._given_baud else BAUDS
 
     def _listen(self, port: SerialPort, stop: threading.Event) -> None:
         """
@@ -319,27 +313,26 @@ class Connection:
         """
         self._change(State('listening'))
         end = self._now() + _SILENCE + _RESTART
-        while self.protocol is None and not stop.is_set():
-            problem = self._listen_at_each_baud(port, end, stop)
-            if problem:
-                self._report_or_raise(problem, end)
-
-    def _listen_at_each_baud(self, port: SerialPort, end: float, stop: threading.Event) -> str:
-        """Return why no protocol was found, if so."""
-        best: Recognition | None = None
-        for baud in self._bauds():
-            port.set_baud(baud)
-            recognition = self._recognize(port, end, stop)
-            if stop.is_set():
-                return ''
-            if recognition.protocol is not None:
-                self._found(recognition.protocol, recognition.words, baud)
-                return ''
-            best = max(best or recognition, recognition, key=lambda each: each.explained)
-        assert best is not None
-        tried = ', '.join(map(str, self._bauds()))
-        return (f'bytes come on {self._pattern}, but no protocol was recognized at {tried} bit/s; '
-                f'nearest: {best.words}')
+        while True:
+            tried: list[Recognition] = []
+            for baud in self._bauds:
+                port.set_baud(baud)
+                tried.append(self._recognize(port, end, stop))
+                if stop.is_set():
+                    return
+                found = tried[-1].protocol
+                if found is not None:
+                    self.detected = tried[-1].words
+                    try:
+                        self._use(found, baud)
+                    except ValueError as error:
+                        raise PortError(f'{found.name} comes on {self._pattern}, but '
+                                        f'{error}') from error
+                    return
+            best = max(tried, key=lambda each: each.explained)
+            self._report_or_raise(
+                f'bytes come on {self._pattern}, but no protocol was recognized at '
+                f'{", ".join(map(str, self._bauds))} bit/s; nearest: {best.words}', end)
 
     def _recognize(self, port: SerialPort, restarted: float, stop: threading.Event) -> Recognition:
         """Return what is recognized within a second from the first byte on."""
@@ -364,13 +357,6 @@ class Connection:
         if problem != self.state.problem:
             self._fail(problem, end - now)
 
-    def _found(self, protocol: Protocol, words: str, baud: int) -> None:
-        self.detected = words
-        try:
-            self._use(protocol, baud)
-        except ValueError as error:
-            raise PortError(f'{protocol.name} comes on {self._pattern}, but {error}') from error
-
     def _read(self, port: SerialPort, stop: threading.Event) -> Iterator[Chunk]:
         decoder, clock = self._decoder, self.clock
         if decoder is None or clock is None:  # stopped while it still listened
@@ -386,7 +372,8 @@ class Connection:
                 silence.restart(clock.period, arrival, len(samples))
                 continue
             if silence.is_to_ask(arrival):
-                self._ask(port)
+                assert self.protocol is not None
+                port.write(self.protocol.startup)
             if silence.poll(arrival):
                 before, counts = counts, self._unusable(decoder)
                 if silence.is_problem:
@@ -434,13 +421,6 @@ class Connection:
             self._delay = _REOPEN[0]
             self._change(State('reading'))
         return Chunk(samples, stamps, arrival)
-
-    def _wait(self, problem: str, stop: threading.Event) -> None:
-        self._fail(problem, self._delay)
-        begin = self._now()
-        stop.wait(self._delay)
-        self.waited += self._now() - begin
-        self._delay = min(2.0 * self._delay, _REOPEN[1])
 
     def _fail(self, problem: str, waiting: float) -> None:
         self.last_error = problem

@@ -69,7 +69,8 @@ PIECE = 0.5
 _PATIENCE = 3.0
 #: ns; delay behind the gyro of a reference, and of a temperature that belongs to a sample.
 _LATE, _BEHIND = NSEC_PER_SEC // 2, NSEC_PER_SEC // 20
-_LARGEST_CHUNK = 1 << 22
+_LARGEST_CHUNK = 1 << 22  # bytes
+_REFERENCE_COLUMNS = 'reference_heading_rad', 'reference_rate_rad_s'
 
 
 class DiskFull(OSError):
@@ -207,19 +208,15 @@ class McapRecorder:
     def close(self) -> None:
         """Write what is left and the closing part; after a full disk, without the index."""
         try:
-            if self._file.is_full:
-                self._close_without_index()
-            else:
+            if not self._file.is_full:
                 self.flush()
                 if self.size:
                     self._file.append(self._writer.end())
+            elif self.size:
+                with suppress(DiskFull):  # no room for these bytes either: a reader finds it torn
+                    self._file.append(MCAP_END)
         finally:
             self._file.close()
-
-    def _close_without_index(self) -> None:
-        with suppress(DiskFull):  # no room for these bytes either: a reader finds it torn
-            if self.size:
-                self._file.append(MCAP_END)
 
 
 class CsvRecorder:
@@ -294,13 +291,24 @@ class CsvRecorder:
 
     def flush(self, everything: bool = False) -> None:
         """Write the piece that is due: the rows whose reference is known, or too late."""
-        if not self._rows or not (self._columns or everything or self._may_begin()):
+        if not self._rows:
             return
+        newest, has_reference = self._rows[-1][0], bool(self._reference.names)
+        if not (self._columns or everything):
+            waited = (newest - self._rows[0][0]) / NSEC_PER_SEC
+            known = {*self._names, *(['reference'] if has_reference else [])}
+            if not (waited > _PATIENCE or waited > 2.0 * PIECE and self._expected <= known):
+                return
         text = io.StringIO()
         writer = csv.writer(text, lineterminator='\n')
         if not self._columns:
             self._open(text, writer)
-        rows = self._due(everything)
+        rows = list(self._rows)
+        if self._expected and not everything:
+            due = newest - _BEHIND
+            if has_reference:
+                due = min(due, max(self._reference.last, newest - _LATE))
+            rows = [row for row in rows if row[0] <= due]
         references = self._reference.at([time for time, _ in rows])
         for (time, output), referred in zip(rows, references, strict=True):
             while self._changes and self._changes[0][0] <= time:
@@ -320,20 +328,6 @@ class CsvRecorder:
                 self.flush(everything=True)
         finally:
             self._file.close()
-
-    def _may_begin(self) -> bool:
-        waited = (self._rows[-1][0] - self._rows[0][0]) / NSEC_PER_SEC
-        known = {*self._names, *(['reference'] if self._reference.names else [])}
-        return waited > _PATIENCE or waited > 2.0 * PIECE and self._expected <= known
-
-    def _due(self, everything: bool) -> list[tuple[int, float]]:
-        newest = self._rows[-1][0]
-        if everything or not self._expected:
-            return list(self._rows)
-        known = newest - _BEHIND
-        if self._reference.names:
-            known = min(known, max(self._reference.last, newest - _LATE))
-        return [row for row in self._rows if row[0] <= known]
 
     def _open(self, text: io.StringIO, writer: Any) -> None:
         """Write notes and header; what came first holds from the beginning."""
@@ -366,17 +360,14 @@ class _Reference:
                       if value is not None or name in self.names]
         if self._known and time <= self.last:
             return
-        self._known.append((time, self._continuous(heading), np.nan if rate is None else rate))
-
-    def _continuous(self, heading: float | None) -> float:
-        """Return a heading that goes on from the last one that is known."""
         if heading is None or not np.isfinite(heading):
-            return np.nan
-        if np.isfinite(self._heading):
-            turned = np.remainder(heading - self._heading + np.pi, 2.0 * np.pi) - np.pi
-            heading = self._heading + float(turned)
-        self._heading = heading
-        return heading
+            heading = np.nan
+        else:  # it goes on from the last one that is known
+            if np.isfinite(self._heading):
+                turned = np.remainder(heading - self._heading + np.pi, 2.0 * np.pi) - np.pi
+                heading = self._heading + float(turned)
+            self._heading = heading
+        self._known.append((time, heading, np.nan if rate is None else rate))
 
     def at(self, times: Sequence[int]) -> list[dict[str, float]]:
         """Return the columns at some times: on the line between two values, nan where lost."""
@@ -389,9 +380,6 @@ class _Reference:
                    for name, values in zip(_REFERENCE_COLUMNS, (headings, rates))
                    if name in self.names}
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
-
-
-_REFERENCE_COLUMNS = 'reference_heading_rad', 'reference_rate_rad_s'
 
 
 class MessageLog:
@@ -455,26 +443,23 @@ class MessageLog:
             return
         stamp = self._clock.time(role, stamp or message.received, message.received)
         if role == 'gyro':
-            self._add_gyro(stamp, numbers)
+            if self._last is not None and stamp <= self._last:
+                self.left_out += 1
+                return
+            if self._last is not None:
+                self._intervals.add((stamp - self._last) / NSEC_PER_SEC)
+            self._last = stamp
+            self.samples += 1
+            if self._rows is None:
+                return
+            force, is_known = numbers[FORCE_Z], numbers[FORCE_COVARIANCE] != NOT_REPORTED
+            if is_known and force and np.isfinite(force):
+                self._rows.hold(stamp, {'acceleration_mps2': force})
+            self._rows.add_row(stamp, numbers[RATE_Z])
         elif self._rows is not None and role == 'temperature' and np.isfinite(numbers[0]):
             self._rows.hold(stamp, {'temperature_degc': numbers[0]})
         elif self._rows is not None and role == 'reference':
             self._rows.add_reference(stamp, *_reference_of(message.kind, numbers))
-
-    def _add_gyro(self, stamp: int, numbers: Sequence[float]) -> None:
-        if self._last is not None and stamp <= self._last:
-            self.left_out += 1
-            return
-        if self._last is not None:
-            self._intervals.add((stamp - self._last) / NSEC_PER_SEC)
-        self._last = stamp
-        self.samples += 1
-        if self._rows is None:
-            return
-        force, is_known = numbers[FORCE_Z], numbers[FORCE_COVARIANCE] != NOT_REPORTED
-        if is_known and force and np.isfinite(force):
-            self._rows.hold(stamp, {'acceleration_mps2': force})
-        self._rows.add_row(stamp, numbers[RATE_Z])
 
 
 def _reference_of(kind: str, numbers: Sequence[float]) -> tuple[float | None, float | None]:

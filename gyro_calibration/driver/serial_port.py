@@ -113,7 +113,12 @@ class SerialPort:
 
         """
         self.baud = baud
-        self._guarded(lambda port: _change_speed(port, baud))
+
+        def change(port: serial.Serial) -> None:
+            port.baudrate = baud
+            port.reset_input_buffer()
+
+        self._guarded(change)
 
     def close(self) -> None:
         """Close the port, if it is open."""
@@ -138,11 +143,6 @@ class SerialPort:
         except (OSError, ValueError, termios.error) as error:
             self.close()
             raise PortError(f'lost {self.path}: {_reason(error)}') from error
-
-
-def _change_speed(port: serial.Serial, baud: int) -> None:
-    port.baudrate = baud
-    port.reset_input_buffer()
 
 
 def _reason(error: BaseException) -> str:

@@ -147,17 +147,14 @@ def _lower_hull(points: Sequence[_Point]) -> list[_Point]:
     """Return the corners of the lower convex hull of points in the order of x."""
     hull: list[_Point] = []
     for x, y in points:
-        while hull and (hull[-1][0] >= x
-                        or len(hull) > 1 and _is_above(hull[-1], hull[-2], (x, y))):
+        while hull:
+            (a, height), (left, low) = hull[-1], hull[-2] if len(hull) > 1 else (0.0, 0.0)
+            is_above = (height - low) * (x - left) >= (y - low) * (a - left)
+            if a < x and not (len(hull) > 1 and is_above):
+                break
             hull.pop()
         hull.append((x, y))
     return hull
-
-
-def _is_above(point: _Point, left: _Point, right: _Point) -> bool:
-    """Tell whether a point is on or above the line from left to right."""
-    height, rise = point[1] - left[1], right[1] - left[1]
-    return height * (right[0] - left[0]) >= rise * (point[0] - left[0])
 
 
 class _Numbers:
@@ -322,7 +319,9 @@ class _Lateness:
         return grows or self._least > self.since - self._in_time + _HOLD
 
     def _is_in_time(self, lateness: float, bound: float, arrival: float) -> None:
-        self._learn()
+        # Learn from one arrival in time, and from the late ones before it without any loss.
+        self._usual *= (1.0 - 1.0 / _MEMORY) ** self._count
+        self._usual += (1.0 - self._usual) / _MEMORY
         self.reset()
         self._in_time = arrival
         if arrival - self._window > _HOLD:
@@ -331,11 +330,6 @@ class _Lateness:
             self._window, self._least_before = arrival, self._least_in_time
             self._least_in_time = math.inf
         self._least_in_time = min(self._least_in_time, lateness)
-
-    def _learn(self) -> None:
-        """Learn from one arrival in time, and from the late ones before it without any loss."""
-        self._usual *= (1.0 - 1.0 / _MEMORY) ** self._count
-        self._usual += (1.0 - self._usual) / _MEMORY
 
 
 class SampleClock:
@@ -454,15 +448,12 @@ class SampleClock:
         late = lateness, 0.75 * bound, number, arrival, self.period
         if unit and self._lateness.is_proven(*late):
             return self._lost_without_trace(unit, number, arrival)
-        if unit > 1 and self._was_restarted(lateness, 0.75 * bound, number, arrival):
+        # Where the sequence began anew, all are off by the same part of it.
+        least = max(3.0 * self.period, _OUTLYING)
+        if unit > 1 and (lateness < -least or lateness < 0.75 * bound and self._outlying.is_proven(
+                lateness, least, number, arrival, self.period)):
             self._begin_anew()
         return 0
-
-    def _was_restarted(self, lateness: float, bound: float, number: float, arrival: float) -> bool:
-        """Tell whether the sequence began anew: since then all are off by the same part of it."""
-        least = max(3.0 * self.period, _OUTLYING)
-        return lateness < -least or lateness < bound and self._outlying.is_proven(
-            lateness, least, number, arrival, self.period)
 
     def _counted_too_often(self, unit: int, lateness: float) -> int:
         excess = unit and unit * round(-lateness / (unit * self.period))
@@ -501,34 +492,28 @@ class SampleClock:
     def _fit(self, number: float, arrival: float) -> None:
         line, is_first = self._line, not self._line.span()
         before = line.at(number) + self._slew
-        line.add(number, max(arrival, self._lowest(number, arrival)))
+        lowest = -math.inf
+        if (self.is_settled and self._uncertain and self._numbers.unit
+                and arrival - self._uncertain_since < _HOLD):  # near the line
+            lowest = line.at(number) - _DRIFT * (arrival - self._before)
+        line.add(number, max(arrival, lowest))
         elapsed, self._number = max(0.0, number - self._number) * line.slope, number
         slew = 0.0 if is_first else before - line.at(number)
         slew *= math.exp(-elapsed / _SLEW[line.span() > _SETTLED])
         self._slew = min(slew, arrival - line.at(number))
 
-    def _lowest(self, number: float, arrival: float) -> float:
-        """Return how low a point may be: near the line, for `_HOLD` after an uncertain count."""
-        is_uncertain = self.is_settled and self._uncertain and self._numbers.unit
-        if is_uncertain and arrival - self._uncertain_since < _HOLD:
-            return self._line.at(number) - _DRIFT * (arrival - self._before)
-        return -math.inf
-
     def _increasing(self, stamps: list[float], arrival: float) -> list[float]:
-        self._measure(stamps, arrival)
-        if stamps[0] < self._last + _LEAST_STEP:
-            step = max((stamps[-1] - self._last) / len(stamps), _LEAST_STEP)
-            stamps = [self._last + step * (index + 1) for index in range(len(stamps))]
-        self._last = stamps[-1]
-        return stamps
-
-    def _measure(self, stamps: list[float], arrival: float) -> None:
         first, last = (arrival - stamp + self._slew for stamp in (stamps[0], stamps[-1]))
         weight = min(1.0, len(stamps) * self.period / _JITTER_TIME)
         # the mean square of lateness that is spread evenly
         now = (first * first + first * last + last * last) / 3.0, self._slew * self._slew
         self._squares = tuple(old + weight * (new - old)
                               for old, new in zip(self._squares, now, strict=True))
+        if stamps[0] < self._last + _LEAST_STEP:
+            step = max((stamps[-1] - self._last) / len(stamps), _LEAST_STEP)
+            stamps = [self._last + step * (index + 1) for index in range(len(stamps))]
+        self._last = stamps[-1]
+        return stamps
 
 
 def steady() -> float:
