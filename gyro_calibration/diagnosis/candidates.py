@@ -80,7 +80,7 @@ def columns_of(candidate: Candidate, replays: Sequence[Replay]) -> Array:
 def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
     """Return the candidate of an effect of the gyro, or of the reference."""
     if name in _OF_THE_REFERENCE:
-        columns = _OF_THE_REFERENCE[name]
+        columns = _OF_THE_REFERENCE[name][0]
         return Candidate(name, shapes, lambda each: columns(each, *shapes), run)
     known = CATALOGUE[name]
     if (distortion := known.distortion) is not None:
@@ -93,30 +93,24 @@ def effect(name: str, *shapes: float, run: int | None = None) -> Candidate:
                      amplitude)
 
 
-def _once_per_revolution(each: Replay) -> Sequence[Array]:
-    rate, heading = each.channels.rate, each.channels.heading
-    return -rate * np.sin(heading), -rate * np.cos(heading)
-
-
 def pulse(time: Array, middle: float, width: float) -> Array:
     """Return the rate of a reference that jumps by 1 rad in its heading, within about a width."""
     return np.exp(-0.5 * ((time - middle) / width) ** 2) / (width * math.sqrt(2.0 * math.pi))
 
 
-def _slip(each: Replay, width: float, *moments: float) -> Sequence[Array]:
-    return tuple(-pulse(each.channels.time, moment, width) for moment in moments)
-
-
-_OF_THE_REFERENCE: Mapping[str, Callable[..., Sequence[Array]]] = {
-    'reference_once_per_rev': _once_per_revolution, 'reference_slip': _slip}
-#: Cause -> the shapes of it that a fit finds; all that are no conventions.
-_FITTED_OF_THE_REFERENCE = {'reference_once_per_rev': (), 'reference_slip': (0,)}
+#: Effects of the reference -> columns by log and shapes, and the shapes that a fit finds.
+_OF_THE_REFERENCE: Mapping[str, tuple[Callable[..., Sequence[Array]], list[int]]] = {
+    'reference_once_per_rev': (lambda each: (
+        -each.channels.rate * np.sin(each.channels.heading),
+        -each.channels.rate * np.cos(each.channels.heading)), []),
+    'reference_slip': (lambda each, width, *moments: tuple(
+        -pulse(each.channels.time, moment, width) for moment in moments), [0])}
 
 
 def fitted_shapes(candidate: Candidate) -> list[int]:
     """Return the places of the shapes that are no conventions."""
     if candidate.cause not in CATALOGUE:
-        return list(_FITTED_OF_THE_REFERENCE.get(candidate.cause, ()))
+        return _OF_THE_REFERENCE[candidate.cause][1] if is_named(candidate) else []
     parameters = CATALOGUE[candidate.cause].parameters[:len(candidate.shapes)]
     return [place for place, parameter in enumerate(parameters) if parameter.default is None]
 
@@ -152,14 +146,60 @@ def observed_range(replays: Sequence[Replay]) -> dict[str, float]:
     return numbers
 
 
-def candidates(replays: Sequence[Replay]) -> list[Candidate]:
-    """Return all causes that these logs may show, each with the shapes to begin with."""
+def candidates(replays: Sequence[Replay]) -> Iterator[Candidate]:
+    """Give all causes that these logs may show, each with the shapes to begin with."""
     has = frozenset.intersection(*(each.has for each in replays)) - constant(replays)
+    duration, interval = max(each.duration for each in replays), replays[0].interval
+    fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
     moves = any(np.ptp(each.channels.rate) > 0.0 for each in replays)
-    found = [*_of_time(replays), *(_of_temperature(replays) if 'temperature' in has else []),
-             *_of_surroundings(has),
-             *(effect(name, *shapes) for name, shapes in added_effects(has, moves))]
-    return [*found, *(_of_rate(replays, has) if moves else [])]
+    middle = reference_temperatures(replays)[2] if 'temperature' in has else 0.0
+    yield effect('rate_ramp')
+    for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
+        yield effect('warm_up', time_constant)
+    for run, each in enumerate(replays):
+        begin, spacing = (float(each.channels.time[each.kept][0]),
+                          spacing_of_steps(each, len(replays)))
+        for number in range(1, _steps(len(replays)) + 1):
+            yield effect('bias_step', begin + number * spacing, run=run)
+    if 'temperature' in has:
+        yield effect('bias_temperature', middle)
+        for reference in reference_temperatures(replays):
+            yield effect('bias_temperature_quadratic', reference)
+        for filter_time in (0.3, 1.0, 3.0, 10.0):
+            yield effect('bias_temperature_rate', filter_time)
+        for time_constant in np.geomspace(FASTEST_LAG, min(duration, 3000.0), 8):
+            yield effect('thermal_lag', time_constant)
+        for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)):
+            yield effect('thermal_hysteresis', filter_time, threshold)
+    if 'specific_force' in has:
+        yield effect('acceleration_sensitivity')
+        for time_constant in (0.1, 0.3, 1.0):
+            yield effect('vibration_rectification', time_constant)
+    if 'supply' in has:
+        yield effect('supply_sensitivity', 5.0)
+    yield from (effect(name, *shapes) for name, shapes in added_effects(has, moves))
+    if not moves:
+        return
+    for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity'):
+        yield effect(name)
+    for angle in (0.5, 1.0, 1.5, 2.0):
+        yield effect('sine_response', angle / fastest)
+    yield effect('heading_sensitivity')
+    yield effect('reference_once_per_rev')
+    if 'temperature' in has:
+        yield effect('scale_factor_temperature', middle)
+    # Slower than so many steps a second, it is the encoder that stands still.
+    slowest = max(1e-5 * fastest, STEPS_A_SECOND * max(each.rounded for each in replays))
+    for zone in np.geomspace(slowest, 0.5 * fastest, 14):
+        yield effect('dead_zone', zone)
+    for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
+        yield effect('saturation', limit * fastest)
+    for offset in (0.2 * interval, 0.02, 0.1, 0.3):
+        yield effect('time_offset', offset)
+        yield effect('time_offset', -offset)
+    for lag in (0.2 * interval, 0.01, 0.03, 0.1, 0.3):
+        yield effect('bandwidth', lag)
+    yield effect('clock_rate', 1e-6)
 
 
 def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -169,18 +209,6 @@ def added_effects(has: Collection[str], moves: bool) -> Iterator[tuple[str, tupl
         if own.looks_at & LEAST_CHANGE.keys() <= set(has) and (moves or not turned):
             yield from ((name, shapes) for shapes in product(*(
                 shape.begin_with or (shape.default or 0.0,) for shape in own.shapes)))
-
-
-def _of_time(replays: Sequence[Replay]) -> Iterator[Candidate]:
-    duration = max(each.duration for each in replays)
-    yield effect('rate_ramp')
-    for time_constant in np.geomspace(duration / 100.0, duration * 0.7, 9):
-        yield effect('warm_up', time_constant)
-    for run, each in enumerate(replays):
-        begin, spacing = (float(each.channels.time[each.kept][0]),
-                          spacing_of_steps(each, len(replays)))
-        for number in range(1, _steps(len(replays)) + 1):
-            yield effect('bias_step', begin + number * spacing, run=run)
 
 
 def _steps(logs: int) -> int:
@@ -197,57 +225,6 @@ def reference_temperatures(replays: Sequence[Replay]) -> list[float]:
     """Return the temperatures that a parabola may count from: the usual, the first, the mean."""
     known = np.concatenate([each.channels.temperature for each in replays])
     return [25.0, 20.0, float(known.mean()), float(known[0])]
-
-
-def _of_temperature(replays: Sequence[Replay]) -> Iterator[Candidate]:
-    middle = reference_temperatures(replays)[2]
-    duration = max(each.duration for each in replays)
-    yield effect('bias_temperature', middle)
-    for reference in reference_temperatures(replays):
-        yield effect('bias_temperature_quadratic', reference)
-    for filter_time in (0.3, 1.0, 3.0, 10.0):
-        yield effect('bias_temperature_rate', filter_time)
-    for time_constant in np.geomspace(FASTEST_LAG, min(duration, 3000.0), 8):
-        yield effect('thermal_lag', time_constant)
-    for filter_time, threshold in ((1.0, 2e-3), (3.0, 5e-4), (3.0, 2e-3)):
-        yield effect('thermal_hysteresis', filter_time, threshold)
-
-
-def _of_surroundings(has: frozenset[str]) -> Iterator[Candidate]:
-    if 'specific_force' in has:
-        yield effect('acceleration_sensitivity')
-        for time_constant in (0.1, 0.3, 1.0):
-            yield effect('vibration_rectification', time_constant)
-    if 'supply' in has:
-        yield effect('supply_sensitivity', 5.0)
-
-
-def _of_rate(replays: Sequence[Replay], has: frozenset[str]) -> Iterator[Candidate]:
-    fastest = max(float(np.abs(each.channels.rate).max()) for each in replays)
-    for name in ('scale_factor_asymmetry', 'quadratic_nonlinearity', 'cubic_nonlinearity'):
-        yield effect(name)
-    for phase in (0.5, 1.0, 1.5, 2.0):
-        yield effect('sine_response', phase / fastest)
-    yield effect('heading_sensitivity')
-    yield effect('reference_once_per_rev')
-    if 'temperature' in has:
-        yield effect('scale_factor_temperature', reference_temperatures(replays)[2])
-    # Slower than so many steps a second, it is the encoder that stands still.
-    slowest = max(1e-5 * fastest, STEPS_A_SECOND * max(each.rounded for each in replays))
-    for zone in np.geomspace(slowest, 0.5 * fastest, 14):
-        yield effect('dead_zone', zone)
-    for limit in (0.5, 0.65, 0.8, 0.9, 0.97):
-        yield effect('saturation', limit * fastest)
-    yield from _of_the_signal(replays[0].interval)
-
-
-def _of_the_signal(interval: float) -> Iterator[Candidate]:
-    for offset in (0.2 * interval, 0.02, 0.1, 0.3):
-        yield effect('time_offset', offset)
-        yield effect('time_offset', -offset)
-    for lag in (0.2 * interval, 0.01, 0.03, 0.1, 0.3):
-        yield effect('bandwidth', lag)
-    yield effect('clock_rate', 1e-6)
 
 
 def by_cause(found: Sequence[Candidate]) -> Mapping[str, list[int]]:
@@ -306,7 +283,7 @@ def generic_terms(replays: Sequence[Replay]) -> list[Candidate]:
     return found
 
 
-def _term(name: str, columns: Callable[[Replay], Sequence[Array]], run: int | None = None,
+def _term(name: str, columns: Columns, run: int | None = None,
           *shapes: float) -> Candidate:
     return Candidate(UNNAMED + name, shapes, columns, run)
 
@@ -333,13 +310,17 @@ def _scaled(of: Of, low: float, high: float) -> Of:
 
 
 def _of(of: Of, shape: Callable[..., Sequence[Array]],
-        value: Array | float) -> Callable[[Replay], Sequence[Array]]:
+        value: Array | float) -> Columns:
     """Return the columns of a function of a variable and a value."""
     return lambda each: shape(of(each), value)
 
 
-def _product(one: Of, other: Of) -> Callable[[Replay], Sequence[Array]]:
+def _product(one: Of, other: Of) -> Columns:
     return lambda each: (one(each) * other(each),)
+
+
+def _bump(middle: float, width: float) -> Columns:
+    return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
 
 
 def _of_one(name: str, of: Of) -> Iterator[Candidate]:
@@ -373,12 +354,8 @@ def _of_turning(variables: Mapping[str, Of]) -> Iterator[Candidate]:
             yield _term(f'{name} and heading', _harmonic(1, variables[name]))
 
 
-def _harmonic(number: int, times: Of | None) -> Callable[[Replay], Sequence[Array]]:
+def _harmonic(number: int, times: Of | None) -> Columns:
     def columns(each: Replay) -> Sequence[Array]:
         phase, factor = number * each.channels.heading, 1.0 if times is None else times(each)
         return factor * np.sin(phase), factor * np.cos(phase)
     return columns
-
-
-def _bump(middle: float, width: float) -> Callable[[Replay], Sequence[Array]]:
-    return lambda each: (np.exp(-0.5 * ((each.channels.time - middle) / width) ** 2),)
