@@ -41,46 +41,6 @@ Group = Sequence[int]
 
 
 @dataclass(frozen=True)
-class Sums:
-    """
-    What the bands know of the columns: b bands, q nuisances, p columns of candidates.
-
-    Attributes
-    ----------
-    own : N'N of the nuisances, shape (b, q, q)
-    towards : N'X, shape (b, q, p)
-    blocks : of each candidate, X'X of its columns, shape (b, k, k)
-    count : coefficients of each band, shape (b,)
-
-    All are of coefficients divided by the standard deviation that a first noise gives them.
-
-    """
-
-    own: Array
-    towards: Array
-    blocks: tuple[Array, ...]
-    count: Array
-
-
-@dataclass(frozen=True)
-class Sample:
-    """
-    What the bands know of residuals: d of them at once, one measured, or many drawn.
-
-    Attributes
-    ----------
-    own : N'z, shape (d, b, q)
-    crossed : X'z, shape (d, b, p)
-    squared : z'z, shape (d, b)
-
-    """
-
-    own: Array
-    crossed: Array
-    squared: Array
-
-
-@dataclass(frozen=True)
 class Noises:
     """
     The noises that are tried, relative to the first noise: g noises, b bands.
@@ -98,40 +58,6 @@ class Noises:
     def take(self, kept: Places) -> Noises:
         """Return some of them."""
         return Noises(self.weights[kept], self.log_determinant[kept])
-
-
-def sums(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Places) -> Sums:
-    """
-    Sum whitened columns over bands.
-
-    Parameters
-    ----------
-    nuisances : shape (q, m)
-    columns : of the candidates, shape (p, m)
-    groups : the places of the columns of each candidate
-    starts : first index of each band, shape (b,)
-
-    """
-    parts = [slice(begin, end) for begin, end in zip(starts, [*starts[1:], nuisances.shape[1]])]
-    own = np.array([nuisances[:, part] @ nuisances[:, part].T for part in parts])
-    towards = np.array([nuisances[:, part] @ columns[:, part].T for part in parts])
-    squares = (np.add.reduceat(columns ** 2, starts, axis=1) if len(columns)
-               else np.empty((0, len(starts))))
-    blocks = tuple(squares[group[0], :, None, None] if len(group) == 1
-                   else _block(columns[list(group)], parts) for group in groups)
-    return Sums(own, towards, blocks, np.array([part.stop - part.start for part in parts], float))
-
-
-def _block(columns: Array, parts: Sequence[slice]) -> Array:
-    return np.array([columns[:, part] @ columns[:, part].T for part in parts])
-
-
-def sample(residuals: Array, nuisances: Array, columns: Array, starts: Places) -> Sample:
-    """Sum whitened residuals, shape (d, m), over bands."""
-    parts = [slice(begin, end) for begin, end in zip(starts, [*starts[1:], nuisances.shape[1]])]
-    own = np.stack([residuals[:, part] @ nuisances[:, part].T for part in parts], axis=1)
-    crossed = np.stack([residuals[:, part] @ columns[:, part].T for part in parts], axis=1)
-    return Sample(own, crossed, np.add.reduceat(residuals ** 2, starts, axis=1))
 
 
 def drawn(noises: Noises, count: Array, probability: Array, draws: int,
@@ -172,20 +98,45 @@ class Marginalized:
     freedom: float
 
 
-def marginalized(known: Sums, groups: Sequence[Group], noises: Noises) -> Marginalized:
-    """Take the nuisances out of all candidates."""
-    own = np.tensordot(noises.weights, known.own, 1)
-    crossing = np.tensordot(noises.weights, known.towards, 1)
+def _parts(starts: Places, size: int) -> list[slice]:
+    return [slice(begin, end) for begin, end in zip(starts, [*starts[1:], size])]
+
+
+def marginalized(nuisances: Array, columns: Array, groups: Sequence[Group], starts: Places,
+                 noises: Noises) -> Marginalized:
+    """
+    Take the nuisances out of all candidates.
+
+    Parameters
+    ----------
+    nuisances : over the standard deviation that a first noise gives them, shape (q, m)
+    columns : of the candidates, likewise, shape (p, m)
+    groups : the places of the columns of each candidate
+    starts : first coefficient of each band, shape (b,)
+    noises : that are tried
+
+    """
+    parts = _parts(starts, nuisances.shape[1])
+
+    def products(one: Array, other: Array) -> Array:
+        """Return the products of rows under each noise, shape (g, rows, rows of the other)."""
+        return np.tensordot(noises.weights, np.array(
+            [one[:, part] @ other[:, part].T for part in parts]), 1)
+
+    own, crossing = products(nuisances, nuisances), products(nuisances, columns)
     towards = np.linalg.solve(own, crossing)
+    squares = (noises.weights @ np.add.reduceat(columns ** 2, starts, axis=1).T if len(columns)
+               else np.empty((len(noises.weights), 0)))
     left, unidentifiable = [], []
-    for group, block in zip(groups, known.blocks):
-        whole = np.tensordot(noises.weights, block, 1)
-        part = whole - np.swapaxes(crossing[:, :, list(group)], 1, 2) @ towards[:, :, list(group)]
+    for group in map(list, groups):
+        whole = (squares[:, group, None] if len(group) == 1
+                 else products(columns[group], columns[group]))
+        part = whole - np.swapaxes(crossing[:, :, group], 1, 2) @ towards[:, :, group]
         left.append(part)
         unidentifiable.append(bool((_diagonal(part) <= LEAST_LEFT * _diagonal(whole)).any()))
     return Marginalized(own, towards, tuple(left),
                         noises.log_determinant + np.linalg.slogdet(own)[1], tuple(unidentifiable),
-                        float(known.count.sum()) - own.shape[1])
+                        float(nuisances.shape[1] - len(nuisances)))
 
 
 def _diagonal(matrices: Array) -> Array:
@@ -195,18 +146,20 @@ def _diagonal(matrices: Array) -> Array:
 @dataclass(frozen=True)
 class NoiseLikelihood:
     """
-    Residuals beside the nuisances, under each noise.
+    Residuals beside the nuisances, under each noise: d of them, one measured, or many drawn.
 
     Attributes
     ----------
     likelihood : restricted log likelihood without any candidate, shape (d, g)
     squares : sum of whitened squares that are left, shape (d, g)
-    pull : X'z beside the nuisances, shape (d, g, p)
+    towards : of the nuisances, N'z, shape (d, g, q)
+    pull : of the candidates, X'z beside the nuisances, shape (d, g, p)
 
     """
 
     likelihood: Array
     squares: Array
+    towards: Array
     pull: Array
 
     @property
@@ -216,14 +169,19 @@ class NoiseLikelihood:
         return top / top.sum(axis=1, keepdims=True)
 
 
-def noise_likelihood(given: Sample, noises: Noises, by: Marginalized) -> NoiseLikelihood:
-    """Take the nuisances out of residuals."""
-    own = noises.weights @ given.own
-    value = np.linalg.solve(by.own, own[..., None])[..., 0]
-    squares = given.squared @ noises.weights.T - (value * own).sum(axis=-1)
+def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts: Places,
+                     noises: Noises, by: Marginalized) -> NoiseLikelihood:
+    """Take the nuisances out of residuals, shape (d, m), in units of the first noise, too."""
+    parts = _parts(starts, nuisances.shape[1])
+    towards, crossed = (noises.weights @ np.stack(
+        [residuals[:, part] @ each[:, part].T for part in parts], axis=1)
+        for each in (nuisances, columns))
+    value = np.linalg.solve(by.own, towards[..., None])[..., 0]
+    squares = (np.add.reduceat(residuals ** 2, starts, axis=1) @ noises.weights.T
+               - (value * towards).sum(axis=-1))
     likelihood = -0.5 * (by.freedom * np.log(squares) + by.log_determinant)
-    pull = noises.weights @ given.crossed - (own[:, :, None, :] @ by.towards)[:, :, 0]
-    return NoiseLikelihood(likelihood, squares, pull)
+    pull = crossed - (towards[:, :, None, :] @ by.towards)[:, :, 0]
+    return NoiseLikelihood(likelihood, squares, towards, pull)
 
 
 def evidence(judged: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:

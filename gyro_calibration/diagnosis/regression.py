@@ -25,9 +25,6 @@ from gyro_calibration.diagnosis.noise_likelihood import (
     NoiseLikelihood,
     Noises,
     Places,
-    Sample,
-    sample,
-    sums,
 )
 from gyro_calibration.diagnosis.replay import (
     angles,
@@ -167,7 +164,7 @@ class Fitted:
     owner : of each column: (place of the cause, or -1 for the scale; place of its value, or minus
         one less place of its shape)
     widths : of each cause, how many columns with free values it has
-    sample, marginalized, by_noise : see `evidence`
+    marginalized, by_noise : see `noise_likelihood`
 
     """
 
@@ -178,7 +175,6 @@ class Fitted:
     columns: Array
     owner: tuple[tuple[int, int], ...]
     widths: tuple[int, ...]
-    sample: Sample
     marginalized: Marginalized
     by_noise: NoiseLikelihood
 
@@ -223,8 +219,7 @@ class Fitted:
         kept = np.flatnonzero(probable > 1e-3 * probable.max())
         weights = probable[kept] / probable[kept].sum()
         covariance = np.linalg.inv(self.marginalized.own[kept])
-        crossed = self.problem.noises.weights[kept] @ self.sample.own[0]
-        values = np.einsum('gpq,gq->gp', covariance, crossed)
+        values = np.einsum('gpq,gq->gp', covariance, self.by_noise.towards[0, kept])
         mean = weights @ values
         variances = weights * self.by_noise.squares[0, kept] / self.marginalized.freedom
         inside = np.einsum('g,gpq->pq', variances, covariance)
@@ -402,12 +397,11 @@ def _judged(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Na
             widths: tuple[int, ...]) -> Fitted:
     """Sum whitened residual and columns, those that are independent, and judge them."""
     kept = _independent(columns)
-    of = columns[kept]
-    nothing = np.empty((0, len(residual)))
-    given = sample(residual[None], of, nothing, whole.starts)
-    by = marginalized(sums(of, nothing, (), whole.starts), (), whole.noises)
+    of, nothing = columns[kept], np.empty((0, len(residual)))
+    by = marginalized(of, nothing, (), whole.starts, whole.noises)
     return Fitted(whole, plain, named, residual, of, tuple(owner[place] for place in kept), widths,
-                  given, by, noise_likelihood(given, whole.noises, by))
+                  by, noise_likelihood(residual[None], of, nothing, whole.starts, whole.noises,
+                                       by))
 
 
 def _independent(columns: Array) -> list[int]:

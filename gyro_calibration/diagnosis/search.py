@@ -46,8 +46,6 @@ from gyro_calibration.diagnosis.noise_likelihood import (
     marginalized,
     noise_likelihood,
     Places,
-    sample,
-    sums,
 )
 from gyro_calibration.diagnosis.regression import (
     Fitted,
@@ -201,11 +199,9 @@ class Search:
 def screen(done: Fitted, stock: Bank) -> Array:
     """Return the evidence of all candidates beside what is named, shape (candidates,)."""
     noises, starts = done.problem.noises, done.problem.starts
-    by = marginalized(sums(done.columns, stock.columns, stock.groups, starts), stock.groups,
-                      noises)
-    judged = noise_likelihood(sample(done.residual[None], done.columns, stock.columns, starts),
-                              noises, by)
-    return _priced(evidence(judged, by, stock.groups), stock)[0]
+    by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
+    shown = noise_likelihood(done.residual[None], done.columns, stock.columns, starts, noises, by)
+    return _priced(evidence(shown, by, stock.groups), stock)[0]
 
 
 def _priced(found: Array, stock: Bank) -> Array:
@@ -218,15 +214,15 @@ def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance
     probable = done.by_noise.probability[0]
     kept = np.sort(np.argsort(-probable)[:MOST_NOISES])
     noises = done.problem.noises.take(kept)
-    known = sums(done.columns, stock.columns, stock.groups, done.problem.starts)
-    by = marginalized(known, stock.groups, noises)
+    starts = done.problem.starts
+    by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
+    count = np.diff(np.append(starts, len(done.residual)))
     single = done.columns.astype(np.float32), stock.columns.astype(np.float32)
     found = []
     for _ in range(DRAWS // 100):
-        residuals = drawn(noises, known.count, probable[kept] / probable[kept].sum(), 100,
-                          generator)
-        judged = noise_likelihood(sample(residuals, *single, done.problem.starts), noises, by)
-        found.append(_priced(evidence(judged, by, stock.groups), stock))
+        residuals = drawn(noises, count, probable[kept] / probable[kept].sum(), 100, generator)
+        shown = noise_likelihood(residuals, *single, starts, noises, by)
+        found.append(_priced(evidence(shown, by, stock.groups), stock))
     every = np.concatenate(found)
     start, scale, share = {}, {}, 0.15
     for cause, own in by_cause(stock.candidates).items():
