@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from gyro_calibration.diagnosis.findings import Estimate, Finding
+from gyro_calibration.diagnosis.findings import Estimate, Finding, RULED_OUT
 from gyro_calibration.model.effects import CATALOGUE, Effect
 from gyro_calibration.model.gyro_model import GyroModel
 
@@ -162,6 +162,14 @@ def finding(name: str, parameters: Mapping[str, Estimate], p_value: float,
                    ambiguous_with=tuple(confounders), **{**usual, **known})
 
 
+def as_suspected(found: Finding) -> Finding:
+    """Return a finding that is not established, and what would show whether it is."""
+    separate_by = CAUSES[found.effect].separate_by
+    return replace(found, status='suspected', remedy=(
+        f'record again: {separate_by}' if separate_by
+        else 'record longer, and see whether it is found again'))
+
+
 _REMEDIES = {
     'gyro': 'add it to the model of the gyro',
     'reference': 'mend or replace the reference, or see that it does not enter a calibration',
@@ -211,6 +219,8 @@ _EXPERIMENTS: Mapping[str, str] = {
     'step the supply by 5 % each minute at one temperature and at rest':
         'bias_temperature supply_sensitivity',
 }
+#: More logs than this are not proposed.
+_MOST_LOGS = 10
 _OF_PAIRS = {frozenset(pair.split()): words
              for words, pairs in _EXPERIMENTS.items() for pair in pairs.split(', ')}
 
@@ -219,6 +229,9 @@ def experiment(name: str, others: Sequence[tuple[str, float]],
                numbers: Mapping[str, float]) -> str:
     """
     Return what to record next to distinguish a cause from others, in words.
+
+    With that are the sigmas that the data at hand bring, and what like logs given together would:
+    the information of independent logs adds up, so that sigmas grow with the root of their number.
 
     Parameters
     ----------
@@ -233,7 +246,11 @@ def experiment(name: str, others: Sequence[tuple[str, float]],
         words = _OF_PAIRS.get(frozenset((name, other)), '')
         if not words or any(f'{{{key}:' in words for key in {'top', 'low'} - numbers.keys()):
             words = CAUSES[name].separate_by or CAUSES[other].separate_by
-        found.setdefault(words.format(**numbers), []).append(
-            f'{other.replace("_", " ")} by {math.sqrt(2.0 * max(lack, 0.0)):.1f}')
-    return '; '.join(f'{words} (the data at hand distinguish {", ".join(names)} sigma)'
-                     for words, names in found.items() if words)
+        sigmas = math.sqrt(2.0 * max(lack, 0.0))
+        text = f'{other.replace("_", " ")} by {sigmas:.1f} sigma'
+        if RULED_OUT / _MOST_LOGS < lack < RULED_OUT:
+            logs = math.ceil(RULED_OUT / lack)
+            text += f', {logs} such logs together by {math.sqrt(logs) * sigmas:.1f}'
+        found.setdefault(words.format(**numbers), []).append(text)
+    return '; '.join(f'{words} (the data at hand distinguish {", ".join(texts)})'
+                     for words, texts in found.items() if words)

@@ -24,6 +24,11 @@ from gyro_calibration.model.noise import Noise
 SCHEMA = 'gyro_calibration/diagnosis/2'
 #: Smaller probabilities are not stated: the assumptions on the noise do not carry them.
 LEAST_PROBABILITY = 1e-4
+#: A lasting cause is suspected where it shows more than chance does at so many times the level.
+SUSPECTED = 5.0
+#: A cause that explains the data less well than the best by more than this, in logarithms of the
+#: likelihood (2.5 sigma), is ruled out.
+RULED_OUT = 3.2
 
 
 @dataclass(frozen=True)

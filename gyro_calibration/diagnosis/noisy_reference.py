@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.diagnosis.candidates import added_effects, LEAST_CHANGE
-from gyro_calibration.diagnosis.causes import CAUSES, finding, with_remedies
+from gyro_calibration.diagnosis.causes import as_suspected, CAUSES, finding, with_remedies
 from gyro_calibration.diagnosis.cross_validation import (
     gain_of,
     heading_curve,
@@ -47,6 +47,7 @@ from gyro_calibration.diagnosis.findings import (
     LEAST_PROBABILITY,
     probabilities,
     Reference,
+    SUSPECTED,
     Trace,
 )
 from gyro_calibration.diagnosis.spans import (
@@ -98,8 +99,6 @@ _ALWAYS_SEEN = {*PLAIN, 'outliers', 'stuck_samples', 'dropped_samples', 'unit_er
                 'quantization', 'saturation'}
 #: Most causes that are added, and parts of a log for cross-fitting.
 MOST, FOLDS = 4, 5
-#: A cause is suspected up to so many times the level.
-_SUSPECTED = 5.0
 #: By how many standard deviations a cause must win on stretches that are held out (one-sided 5 %),
 #: where a stretch counts no more than so much log-likelihood, a ratio of 20: no single stretch
 #: establishes a cause.
@@ -252,18 +251,15 @@ def _finding(each: Confirmed, extended: SpanFit, plain: SpanFit) -> Finding:
     for parameter, value in zip(() if effect is None else effect.shapes, each.column.shapes):
         if parameter.default is None and parameter.name not in parameters:
             parameters[parameter.name] = Estimate.about(value, 0.0, parameter.unit)
-    remedy = '' if each.established else (
-        f'record again: {known.separate_by}' if known.separate_by
-        else 'record longer, and see whether it is found again')
-    return finding(
+    shown = finding(
         name, parameters, each.p_value, [other for other in each.probability if other != name],
         minimum_detectable=(SEEN * float(half[0]) / 1.96
                             if len(values) == 1 and name != 'bandwidth' else None),
         evidence=f'it adds {each.predicted:.1f} to the log-likelihood of stretches that took no '
         f'part in choice and fit, and is chosen in {100.0 * each.chosen:.0f} % of them',
-        status='established' if each.established else 'suspected', probability=each.probability,
-        where=(each.column.shapes[0], float(plain.spans.time[-1])) if each.column.once else None,
-        remedy=remedy)
+        probability=each.probability,
+        where=(each.column.shapes[0], float(plain.spans.time[-1])) if each.column.once else None)
+    return shown if each.established else as_suspected(shown)
 
 
 def _lag(square: float, half: float) -> Estimate:
@@ -500,7 +496,7 @@ def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Seq
              for each, (chance, _, _) in zip(open_ones, chances)]
     strongest = int(np.argmin(tried))
     once = open_ones[strongest].once
-    if min(tried[strongest], 1.0) > (level if once else _SUSPECTED * level):
+    if min(tried[strongest], 1.0) > (level if once else SUSPECTED * level):
         return None
     best_of: dict[str, int] = {}
     for other, each in enumerate(open_ones):

@@ -25,6 +25,7 @@ from gyro_calibration.diagnosis.candidates import (
     observed_range,
 )
 from gyro_calibration.diagnosis.causes import (
+    as_suspected,
     CAUSES,
     experiment,
     finding,
@@ -89,6 +90,7 @@ from gyro_calibration.diagnosis.search import (
     pruned,
     Search,
     searched,
+    suspected,
 )
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.logs.log import Log
@@ -225,7 +227,15 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     findings += [*best.values(), *(each for each in changed if each.effect not in covered)]
     if model is not None:
         findings += _of_noise(figures, model, rate, found.replays)
-    findings.sort(key=lambda each: each.p_value)
+    if more := suspected(search, (*named, *unnamed)):
+        everything = polished(search, more.named)
+        place, with_more = len(everything) - 1, FittedValues(
+            fitted(search.problem, everything), found.replays)
+        chance = search.chance.p_value(everything[-1].candidate.cause,
+                                       evidence_of(search, everything, place))
+        findings.append(as_suspected(named_finding(
+            search, with_more, place, chance, [(everything[-1], 0.0)], '')))
+    findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # the causes that the model can hold, without those that would be a second of a kind
     inside = FittedValues(fitted(search.problem, [each for each in named if each not in out])
                           if out else found.fitted, found.replays, lasting=True)

@@ -39,6 +39,7 @@ from gyro_calibration.diagnosis.candidates import (
     spacing_of_steps,
     with_shape,
 )
+from gyro_calibration.diagnosis.findings import RULED_OUT, SUSPECTED
 from gyro_calibration.diagnosis.noise_likelihood import (
     drawn,
     evidence,
@@ -68,9 +69,6 @@ from scipy.signal import correlate
 DRAWS = 400
 #: Of the noises that are likely, so many are used to learn it.
 MOST_NOISES = 60
-#: A cause that explains the data less well than the best by more than this, in logarithms of the
-#: likelihood, is ruled out.
-RULED_OUT = 3.2
 #: What a shape costs at least, for it is known to some part of where it may be.
 PRICE_OF_SHAPE = 2.0
 #: Causes that have no first shapes, but are scanned for.
@@ -191,9 +189,9 @@ class Search:
         """Return all causes with their first shapes."""
         return self.bank.candidates
 
-    def excess(self, cause: str, found: float) -> float:
-        """Return what an evidence is above what chance may show."""
-        return found - self.chance.threshold(cause, self.rate)
+    def excess(self, cause: str, found: float, times: float = 1.0) -> float:
+        """Return what an evidence is above what chance shows at so many times the rate."""
+        return found - self.chance.threshold(cause, times * self.rate)
 
 
 def screen(done: Fitted, stock: Bank) -> Array:
@@ -522,7 +520,10 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
 def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
     done = fitted(search.problem, named)
     first = _first(search, done, named)
-    if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
+    beyond_chance, may_be = (any(search.excess(
+        each.candidate.cause, each.mean, _times(each.candidate) if loosely else 1.0) > 0.0
+        for each in first) for loosely in (False, True))
+    if not may_be:
         return None, []
     top = max(first, key=lambda each: each.most)
     # Causes that change the rate look alike to first order; large ones need refined shapes.
@@ -540,7 +541,21 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
                    key=lambda step: -step.score)
     beyond = (step for step in steps
               if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
-    return next(beyond, None), steps
+    return next(beyond, None) if beyond_chance else None, steps
+
+
+def _times(candidate: Candidate) -> float:
+    """Return at how many times the rate a candidate counts: lasting causes are suspected, too."""
+    return SUSPECTED if is_named(candidate) and candidate.run is None else 1.0
+
+
+def suspected(search: Search, named: Sequence[Named]) -> Step | None:
+    """Return the named causes with one more that chance shows at `SUSPECTED` times the rate."""
+    _, steps = strongest(search, named)
+    score = fitted(search.problem, named).score if steps else 0.0
+    candidates = ((step, step.named[-1].candidate) for step in steps)
+    return next((step for step, candidate in candidates if _times(candidate) > 1.0
+                 and search.excess(candidate.cause, step.score - score, SUSPECTED) > 0.0), None)
 
 
 def _first(search: Search, done: Fitted, named: Sequence[Named]) -> list[_First]:

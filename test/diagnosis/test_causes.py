@@ -76,7 +76,8 @@ def _laid():
 def test_twins_are_given_the_experiment_that_physics_wants_in_either_order(pair, laid):
     for one, other in (pair, pair[::-1]):
         words = experiment(one, [(other, 2.0)], observed_range([laid]))
-        assert WANTED[pair] in words and f'{other.replace("_", " ")} by 2.0 sigma' in words
+        assert WANTED[pair] in words
+        assert f'{other.replace("_", " ")} by 2.0 sigma, 2 such logs together by 2.8' in words
 
 
 def test_the_numbers_of_an_experiment_are_those_of_the_log(laid):
@@ -95,7 +96,7 @@ def test_a_set_of_three_names_each_experiment_once(laid):
     words = experiment('cubic_nonlinearity', [('sine_response', 0.0), ('saturation', 0.5)],
                        observed_range([laid]))
     assert words.count('turn both ways') == 1
-    assert 'sine response by 0.0, saturation by 1.0' in words
+    assert 'sine response by 0.0 sigma, saturation by 1.0 sigma, 7 such logs' in words
     assert not experiment('outliers', [('dropped_samples', 0.0)], {})
 
 

@@ -10,6 +10,7 @@
 
 """The search covers all logs, pays for all that it could have found, and bounds each value."""
 
+from dataclasses import replace
 import math
 import zlib
 
@@ -27,7 +28,7 @@ from gyro_calibration.diagnosis.candidates import (
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.regression import fitted, Named, regression_problem
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.search import begin, evidence_of, searched
+from gyro_calibration.diagnosis.search import begin, evidence_of, searched, strongest, suspected
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE
 from gyro_calibration_bench.hidden import hide
@@ -90,6 +91,17 @@ def test_what_may_be_anywhere_pays_for_the_places_to_the_end(cause, added, place
     search, named = found_in([laid(resting(added))])
     assert [each.candidate.cause for each in named] == [cause]
     assert evidence_of(search, named, 0) < gained(search, named) - math.log(places)
+
+
+def test_a_lasting_cause_is_suspected_up_to_five_times_the_level():
+    search = begin([laid(resting(5e-7 * TIME))], np.random.default_rng(1))
+    answers = []
+    for level in np.geomspace(2e-2, 2e-5, 13):
+        at_level = replace(search, rate=level, found_before={})
+        answers.append('named' if strongest(at_level, ())[0]
+                       else 'suspected' if suspected(at_level, ()) else 'nothing')
+    assert list(dict.fromkeys(answers)) == ['named', 'suspected', 'nothing']
+    assert answers.count('suspected') * np.log(1e3) / 12.0 == pytest.approx(np.log(5.0), abs=0.58)
 
 
 # shapes
