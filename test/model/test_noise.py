@@ -13,6 +13,7 @@
 import math
 from pathlib import Path
 
+from chance import mean_bound
 from gyro_calibration.model.model_file import read_model
 from gyro_calibration.model.noise import ALLAN_FLOOR, CALIBRATED, Noise, simulate_noise
 from gyro_calibration.model.presets import XV3500
@@ -72,9 +73,8 @@ def test_means_wander_as_predicted(noise, apart):
         means = simulate_noise(noise, 2 ** 16 // size * size, INTERVAL,
                                generator).reshape(-1, size).mean(axis=1)[20:]
         squares.append(np.mean((means[apart:] - means[:-apart]) ** 2))
-    deviation = np.std(squares) / math.sqrt(len(squares))
     assert np.mean(squares) == pytest.approx(noise.wander(apart * duration, duration),
-                                             abs=4.0 * deviation, rel=0.12)
+                                             abs=mean_bound(squares), rel=0.12)
 
 
 def test_the_allan_variance_is_the_sum_of_its_parts():

@@ -64,8 +64,8 @@ def test_the_noise_of_gazebo_has_the_allan_deviation_of_the_model():
     chart = allan_deviation(made, 0.1, [0.1, 1.0, 10.0, 100.0, 1000.0])
     wanted = np.sqrt(NOISE.allan_variance(np.array(chart.time)))
     ratio = np.array(chart.deviation) / wanted
-    # 40 independent means of 1000 s know it to 15 %, the others better
-    assert (np.abs(ratio - 1.0) < error + np.array([0.01, 0.01, 0.02, 0.1, 0.3])).all()
+    # five times the scatter of 40 seeds, which is 13 % for 40 means of 1000 s
+    assert (np.abs(ratio - 1.0) < error + np.array([0.01, 0.02, 0.04, 0.15, 0.7])).all()
 
 
 def test_a_gauss_markov_process_has_the_allan_variance_of_its_simulation():
@@ -76,8 +76,9 @@ def test_a_gauss_markov_process_has_the_allan_variance_of_its_simulation():
             ('dynamic_bias_correlation_time', process.correlation_time))],
         400_000, interval, np.random.default_rng(2))
     chart = allan_deviation(made, interval, [1.0, 10.0, 100.0])
-    np.testing.assert_allclose(
-        chart.deviation, np.sqrt(process.allan_variance(np.array(chart.time))), rtol=0.06)
+    ratio = chart.deviation / np.sqrt(process.allan_variance(np.array(chart.time)))
+    # five times the scatter of 40 seeds
+    assert (np.abs(ratio - 1.0) < [0.02, 0.06, 0.13]).all()
 
 
 @pytest.mark.parametrize('span', [100.0, 3600.0, 1e5])

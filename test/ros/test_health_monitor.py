@@ -12,7 +12,9 @@
 
 from dataclasses import replace
 import math
+import re
 
+from chance import fewest, mean_bound, most
 from gyro_calibration.allan import even_record, fit_noise
 from gyro_calibration.logs.log import DEGREE, read_log
 from gyro_calibration.model.gyro_model import SelfCalibration
@@ -25,6 +27,7 @@ import pytest
 INTERVAL = 0.02
 MEMS = Noise(1e-4, 3e-5, 2e-6)
 FOG = Noise(3e-5, 5e-6, 1e-7)
+SELDOM = 2e-5  # false alarms an hour: one in 40 000 of these tests, with an hour of rest each
 
 
 def stretches(noise, hours, generator, scale=1.0):
@@ -57,8 +60,7 @@ def test_single_stretches_give_false_alarms_no_more_often_than_stated(noise, ste
         rests += examined(outputs, noise, stated, step)
         alarms.append(sum(not rest.noise_fits or not rest.bias_fits
                           for rest in rests[-len(outputs):] if rest is not None))
-    assert (np.mean(alarms) <= stated * minutes / 60.0
-            + 4.0 * np.std(alarms) / math.sqrt(len(alarms)))
+    assert np.mean(alarms) <= stated * minutes / 60.0 + mean_bound(alarms)
     assert sum(rest is not None for rest in rests) > 0.98 * len(rests), (
         'rest is not taken for motion')
 
@@ -71,7 +73,7 @@ def test_the_level_of_the_bias_is_used_up_and_not_only_kept():
                + generator.normal(0.0, deviation, (4000, 1)))
     misfits = sum(not examine(time, output, output, Noise(1e-4), level, 0.0,
                               deviation ** 2).bias_fits for output in outputs)
-    assert misfits == pytest.approx(4000 * 2.0 * level, abs=4.0 * math.sqrt(4000 * 2.0 * level))
+    assert fewest(4000, 2.0 * level) <= misfits <= most(4000, 2.0 * level)
 
 
 def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.0):
@@ -83,7 +85,7 @@ def fed(check, outputs, promised=False, begin=0.0, bias_variance=1e-12, age=600.
 
 
 def test_a_check_of_a_day_at_rest_is_silent():
-    check, generator = HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(13)
+    check, generator = HealthMonitor(MEMS, SELDOM, 0.3 * DEGREE), np.random.default_rng(13)
     for hour in range(24):
         fed(check, stretches(MEMS, 1.0, generator)[:20], begin=3600.0 * hour)
         assert not check.noise_alarm and not check.bias_alarm, hour
@@ -93,8 +95,9 @@ def test_a_check_of_a_day_at_rest_is_silent():
 @pytest.mark.parametrize('noise', [MEMS, FOG], ids=['MEMS', 'FOG'])
 def test_three_times_the_noise_is_found_in_one_promised_rest_or_three_others(noise):
     outputs = stretches(noise, 0.1, np.random.default_rng(14), 3.0)
-    assert 'the noise at rest is 3.' in fed(HealthMonitor(noise, 0.001), outputs[:2],
-                                            promised=True).noise_alarm.replace('2.9', '3.0')
+    alarm = fed(HealthMonitor(noise, 0.001), outputs[:2], promised=True).noise_alarm
+    assert float(re.search(r'the noise at rest is ([\d.]+)', alarm)[1]) == pytest.approx(
+        3.0, rel=0.2)
     assert not fed(HealthMonitor(noise, 0.001), outputs[:2]).noise_alarm
     assert 'or the robot vibrates' in fed(HealthMonitor(noise, 0.001), outputs[:5]).noise_alarm
 
@@ -118,7 +121,7 @@ def test_a_bias_that_moved_is_found(moved):
     assert not fed(check, outputs[5:8] - moved, begin=100.0).bias_alarm
 
 
-def test_a_bias_whose_uncertainty_nobody_knows_is_not_judged():
+def test_a_bias_of_unknown_uncertainty_is_not_examined():
     outputs = 0.01 + stretches(MEMS, 0.1, np.random.default_rng(17))
     check = fed(HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), outputs[:5], bias_variance=math.nan)
     assert not check.bias_alarm and math.isnan(check.last.sigmas)
@@ -127,7 +130,7 @@ def test_a_bias_whose_uncertainty_nobody_knows_is_not_judged():
 def test_motion_is_not_taken_for_a_misfit():
     """The robot stands half of the time and turns half of it, with a wobble of 1 % of its rate."""
     time = np.arange(0.0, ROBOT.duration, INTERVAL)
-    check, generator = HealthMonitor(MEMS, 0.001, 0.3 * DEGREE), np.random.default_rng(18)
+    check, generator = HealthMonitor(MEMS, SELDOM, 0.3 * DEGREE), np.random.default_rng(18)
     for drive in range(20):
         wobble = (np.convolve(generator.normal(0.0, 0.01, len(time)), np.ones(25) / 5.0, 'same')
                   * ROBOT.rate_at(time))
@@ -136,7 +139,7 @@ def test_motion_is_not_taken_for_a_misfit():
         assert not check.noise_alarm and not check.bias_alarm, drive
 
 
-def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(data):
+def test_a_measured_gyro_is_silent_for_hours_and_not_by_a_model_of_half_its_noise(data):
     """10 000 s of an ADIS16405 at rest; the model has its noise and the bias of its first 15 s."""
     log = read_log(data / 'mems_static' / 'adis16405_1.csv.gz', rate=100.0)
     record = even_record(log.time, log.output)
@@ -153,7 +156,7 @@ def test_a_measured_gyro_is_silent_for_hours_and_not_beside_half_of_its_noise(da
         assert check.examined == length // 1001 and bool(alarmed) == (claimed is half)
 
 
-def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_judged():
+def test_a_gap_begins_a_stretch_anew_and_a_gyro_that_never_changes_is_not_examined():
     check = HealthMonitor(MEMS, 0.001)
     assert not any(check.add(number * 0.02 + (0.0 if number < 300 else 1.0), 0.0, 0.0)
                    for number in range(600))
@@ -169,7 +172,7 @@ def test_a_dead_gyro_is_reported_once_its_quantization_is_known():
 
 
 @pytest.mark.filterwarnings('error')
-def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_judged():
+def test_a_stretch_whose_samples_came_nearly_all_at_once_is_not_examined():
     """As where a busy computer gave a gyro the stamps of one second."""
     time = np.append(np.linspace(0.0, 0.9, 490), np.linspace(1.5, STRETCH, 10))
     output = 7e-4 * np.random.default_rng(21).standard_normal(len(time))
@@ -183,15 +186,15 @@ def test_without_noise_figures_there_is_nothing_to_check():
 
 def test_a_change_of_the_calibration_is_a_false_alarm_as_often_as_stated():
     generator, deviations, age = np.random.default_rng(20), np.array([1e-3, 1e-4]), 600.0
-    covariance, said, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
+    covariance, alarms, level = tuple(map(tuple, np.diag(deviations ** 2))), 0, 0.05
     wander = math.sqrt(MEMS.wander(age, STRETCH))
     for _ in range(2000):
         first, second = (SelfCalibration(*(generator.normal(size=2) * deviations).tolist(),
                                          covariance) for _ in range(2))
         second = SelfCalibration(second.scale_factor_error,
                                  second.bias + wander * generator.normal(), covariance)
-        said += bool(changed(first, second, MEMS, age, level))
-    assert said == pytest.approx(2000 * level, abs=4.0 * math.sqrt(2000 * level))
+        alarms += bool(changed(first, second, MEMS, age, level))
+    assert fewest(2000, level) <= alarms <= most(2000, level)
     moved = changed(first, SelfCalibration(first.scale_factor_error + 0.02,
                                            first.bias + 1.0 * DEGREE, covariance), MEMS, age, 1e-3)
     assert 'the scale factor error changed by 2.000 % (' in moved
