@@ -25,7 +25,6 @@ from gyro_calibration.heading.assumptions import Assumptions
 from gyro_calibration.heading.bias_table import BiasTable
 from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.heading.integration import filter_rates, Threshold, ThresholdFilter
-from gyro_calibration.heading.log_compensation import compensate_log, LogCompensation
 from gyro_calibration.heading.tracker import HeadingTracker, Settings
 from gyro_calibration.logs.log import DEGREE, Log, write_log
 from gyro_calibration.model.compensation import compensate
@@ -289,75 +288,21 @@ def test_a_bias_table_stays_finite(rests, temperature, time):
 
 # verbs
 
-COLUMN = st.one_of(st.floats(-1e20, 1e20), st.floats(-3.0, 3.0),
-                   st.sampled_from([500.0, 1e16, -1e20, math.nan]))
-TURNING = np.concatenate([np.zeros(100), np.full(150, 0.7), np.zeros(100), np.full(150, -0.7),
-                          np.zeros(100)])
-MODELS = ['effects: {bias: {bias: 0.002}}\nnoise: {angle_random_walk: 7.3e-4}',
-          'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\n'
-          'valid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}']
-
-
-def absurd_log(changes):
-    """Return a log of a robot that turns both ways, with some values changed."""
-    time = np.arange(len(TURNING)) * INTERVAL
-    output, temperature = TURNING + REST[:len(time)], np.full(len(time), 25.0)
-    for place, rate, degc in changes:
-        output[place], temperature[place] = rate, degc
-    heading = np.concatenate([[0.0], np.cumsum(0.5 * INTERVAL * (TURNING[1:] + TURNING[:-1]))])
-    return Log(output=output, time=time, temperature=temperature, reference_rate=TURNING,
-               reference_heading=heading)
-
-
-CHANGES = st.lists(st.tuples(st.integers(0, len(TURNING) - 1), COLUMN,
-                             st.one_of(st.just(25.0), st.floats(-1e5, 1e5))), max_size=20)
-
-
-def no_constant(name):
-    raise AssertionError(f'{name} is no JSON')
-
-
-@pytest.mark.parametrize('verb', [('compensate', '--out'), ('compensate', '--rest', '--out'),
-                                  ('compensate', '--hindsight', '--out'), ('turn', ),
-                                  ('self-calibrate', )], ids=' '.join)
-@pytest.mark.parametrize('text', MODELS, ids=['bias', 'cubic'])
-def test_the_verbs_answer_in_json_whatever_a_log_holds(run, tmp_path, verb, text):
-    (tmp_path / 'model.yaml').write_text(text)
-    out = [tmp_path / 'out.csv'] if '--out' in verb else []
-
-    @tries(6)
-    @hypothesis.given(CHANGES)
-    def holds(changes):
-        write_log(tmp_path / 'log.csv', absurd_log(changes))
-        code, said, problem = run(verb[0], tmp_path / 'log.csv',
-                                  '--model', tmp_path / 'model.yaml', '--json', *verb[1:], *out)
-        assert code in (0, 1), problem
-        if code == 0:
-            assert json.loads(said, parse_constant=no_constant)
-        else:
-            assert problem.count('\n') == 1 and problem.startswith('gyro_calibration: ')
-
-    holds()
-
-
 def test_a_log_with_a_lost_decimal_point_keeps_its_heading_and_counts_the_row(run, tmp_path):
-    (tmp_path / 'model.yaml').write_text(MODELS[1])
-    headings = []
-    for changes in ([], [(200, 700.0, 25.0), (300, 1e155 ** 0.1, 25.0), (400, 0.0, 9e4)]):
-        write_log(tmp_path / 'log.csv', absurd_log(changes))
-        code, said, _ = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'model.yaml',
-                            '--out', tmp_path / 'out.csv', '--json')
-        answer = json.loads(said)
+    (tmp_path / 'model.yaml').write_text(
+        'effects: {cubic_nonlinearity: {cubic_nonlinearity: -1.0e-3}}\n'
+        'valid: {rate: [-2, 2]}\nnoise: {angle_random_walk: 7.3e-4}')
+    rate, headings = np.repeat([0.0, 0.7, 0.0, -0.7, 0.0], [100, 150, 100, 150, 100]), []
+    for changes in ([], [(200, 700.0, 25.0), (300, 3e15, 25.0), (400, 0.0, 9e4)]):
+        output, temperature = rate + REST[:600], np.full(600, 25.0)
+        for place, *wrong in changes:
+            output[place], temperature[place] = wrong
+        write_log(tmp_path / 'log.csv', Log(output=output, time=np.arange(600) * INTERVAL,
+                                            temperature=temperature))
+        code, text, _ = run('compensate', tmp_path / 'log.csv', '--model',
+                            tmp_path / 'model.yaml', '--out', tmp_path / 'out.csv', '--json')
+        answer = json.loads(text)
         assert code == 0 and answer['refused_samples'] == len(changes) == answer['lost_samples']
         headings.append((answer['heading_rad'], answer['heading_std_rad']))
     (whole, sure), (gaps, less) = headings
     assert abs(whole - gaps) < 3.0 * less and less > sure
-
-
-def test_a_log_is_compensated_without_its_absurd_rows():
-    model, log = (GyroModel((Term(CATALOGUE['cubic_nonlinearity'], (-1e-3,)),)),
-                  absurd_log([(7, 1e20, 25.0), (8, 0.1, -1e5)]))
-    rate = compensate_log(model, log)
-    assert np.flatnonzero(np.isnan(rate)).tolist() == [7, 8]
-    assert np.isfinite(LogCompensation(model).add(log)[0].rate).all(), (
-        'asked for all the same, they stay finite')

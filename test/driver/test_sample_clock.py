@@ -146,7 +146,7 @@ def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
     assert run.clock.lost == run.truly_lost
     # For 0.3 s the number of wraps of the sequence is unknown.
     late = (run.times > 45.0) | (run.times < 40.0)
-    assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.35 / rate
+    assert np.abs(run.stamps - run.times)[late & (run.times > LEARNED)].max() < 0.7 / rate
 
 
 @pytest.mark.parametrize(('rate', 'begin'), [(1000, 0.0), (1000, 10.0), (5000, 0.5)])

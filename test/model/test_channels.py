@@ -63,16 +63,6 @@ def test_a_corner_between_uneven_stamps_is_answered_exactly():
     assert lagged == pytest.approx(expected, rel=0.0, abs=1e-10)
 
 
-def test_a_sine_is_damped_and_delayed_as_its_transfer_function_says():
-    time, pulsation, time_constant = np.arange(0.0, 2000.0, 0.05), 0.05, 30.0
-    lagged = channels_of(Log(output=time, time=time, temperature=np.sin(pulsation * time))).lagged(
-        'temperature', time_constant)
-    gain = 1.0 / (1.0 + 1j * pulsation * time_constant)
-    settled = time > 500.0
-    assert lagged[settled] == pytest.approx((gain * np.exp(1j * pulsation * time)).imag[settled],
-                                            abs=1e-6)
-
-
 def test_a_lag_starts_in_the_first_value_and_a_constant_stays():
     channels = channels_of(Log(output=UNEVEN, time=UNEVEN, temperature=np.full(len(UNEVEN), 31.7)))
     assert (set(channels.lagged('temperature', 50.0)) == {31.7}
@@ -116,14 +106,6 @@ def test_blocks_of_a_log_say_what_the_whole_says(cuts):
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
-def test_a_stream_says_what_the_log_says():
-    whole = everything(History().follow(UNEVEN, *surroundings(UNEVEN)))
-    history = History()
-    stream = [everything(history.follow(*sample))
-              for sample in zip(*(each.tolist() for each in (UNEVEN, *surroundings(UNEVEN))))]
-    assert np.transpose(stream) == pytest.approx(whole, rel=1e-12, abs=1e-12)
-
-
 def test_a_lag_goes_on_in_blocks_in_which_nobody_asks_for_it():
     history, (temperature, *_) = History(), surroundings(UNEVEN)
     history.follow(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
@@ -158,9 +140,10 @@ def test_what_is_not_known_says_so():
             and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
 
 
-def test_a_million_samples_take_well_under_a_second():
-    time = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 6))
-    channels = channels_of(Log(output=time, time=time, temperature=np.sin(time / 100.0)))
-    begin = clock.process_time()
-    channels.lagged('temperature', 120.0)
-    assert clock.process_time() - begin < 0.5
+def test_a_lag_of_a_million_samples_takes_no_longer_than_thirty_sines_of_them():
+    time, begin = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 6)), []
+    channels = channels_of(Log(output=time, time=time, temperature=time))
+    for work in (lambda: np.sin(time), lambda: channels.lagged('temperature', 120.0)):
+        begin.append(clock.process_time())
+        work()
+    assert clock.process_time() - begin[1] < 30.0 * (begin[1] - begin[0])

@@ -40,10 +40,6 @@ MODEL = GyroModel((Term(BIAS, (0.01,)), Term(SCALE_FACTOR_ERROR, (0.001,))), np.
                   (-2.0, 2.0), (10.0, 40.0))
 
 
-def test_no_model_changes_nothing():
-    assert compensate(GyroModel(), 0.123).rate == 0.123
-
-
 def test_the_self_calibration_comes_after_the_model():
     """Eq. 13 of Ojeda et al., then eq. 3 of Hong and Park."""
     done = compensate(replace(MODEL, self_calibration=CALIBRATION), 0.5)
@@ -225,10 +221,3 @@ def test_the_covariance_has_the_order_of_the_sensitivity():
     assert whole[2, 3] == 1e-8 and not whole[:2, 2:].any()
     assert covariance(GyroModel()).shape == (0, 0)
     assert rate_sensitivity(GyroModel(), np.zeros(3), np.zeros(3), np.zeros(3)).shape == (0, 3)
-
-
-def test_the_quadratic_form_serves_one_vector_and_many():
-    matrix, vectors = (np.array([[2.0, 1.0], [1.0, 3.0]]),
-                       np.array([[1.0, 0.0, 2.0], [0.0, 1.0, 1.0]]))
-    assert quadratic_form(matrix, vectors).tolist() == [2.0, 3.0, 15.0]
-    assert quadratic_form(matrix, vectors[:, 2]) == 15.0

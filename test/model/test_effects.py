@@ -187,11 +187,6 @@ def test_columns_have_the_shape_of_the_rates():
                 effect.columns(Channels(w, w, 25.0), *shapes)), effect
 
 
-def test_the_sine_response_is_the_sine_of_the_sagnac_phase():
-    model = GyroModel((Term(CATALOGUE['sine_response'], (0.5, 1.0)),))
-    assert model.output(1.2, 25.0) == pytest.approx(math.sin(0.5 * 1.2) / 0.5, abs=1e-15)
-
-
 def test_an_effect_depends_on_no_other_channels_than_it_names():
     effects = [*CATALOGUE.values(), POLYNOMIAL, rate_temperature_polynomial(3, 0)]
     base = {'rate': 0.3, 'output': 0.4, 'temperature': 30.0, 'time': 0.2, 'specific_force': 1.0,
@@ -239,14 +234,6 @@ def test_a_centred_and_scaled_polynomial_is_written_out_as_eq_11():
     for output, degc in [(-90.0, 26.0), (0.0, 35.0), (55.0, 44.0)]:
         error = Term(effect, values).error(Channels(math.nan, output * DEGREE, degc))
         assert eq_12(matrix, output, degc) == pytest.approx(error / DEGREE, abs=1e-9)
-
-
-def test_every_product_of_powers_has_a_column_of_its_own():
-    """By the printed index of eq. 10, i + (j - 1) p, ten of twelve (test_reproduction.py)."""
-    generator = np.random.default_rng(0)
-    channels = Channels(math.nan, generator.uniform(-1, 1, 50), generator.uniform(-1, 1, 50))
-    columns = rate_temperature_polynomial(3, 2).columns(channels, 0.0, 1.0, 0.0, 1.0)
-    assert np.linalg.matrix_rank(np.array(columns)) == 12
 
 
 @pytest.mark.parametrize('matrix', [

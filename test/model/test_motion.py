@@ -10,13 +10,11 @@
 
 """Motions: the heading is the exact integral of the rate; files are read by their columns."""
 
-import math
 
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.motion import (
     CALIBRATION,
     from_headings,
-    from_rates,
     MotionError,
     NAMED,
     read_motion,
@@ -36,11 +34,6 @@ def test_the_heading_is_the_integral_of_the_rate(name):
     rate = motion.rate_at(time)
     heading = np.concatenate([[0.0], np.cumsum((rate[1:] + 4 * middle + rate[:-1]) / 6 / 20.0)])
     assert motion.heading_at(time) == pytest.approx(heading, abs=1e-12)
-
-
-def test_a_ramp_turns_half_of_what_its_end_rate_would():
-    motion = from_rates(np.array([5.0, 7.0, 8.0]), np.array([0.0, 1.0, 1.0]))
-    assert motion.heading_at(np.array([0.0, 1.0, 2.0, 3.0])).tolist() == [0.0, 0.25, 1.0, 2.0]
 
 
 def test_before_and_after_a_motion_stands():
@@ -136,7 +129,3 @@ def test_what_is_no_profile_is_refused(tmp_path, text, message):
     with pytest.raises(MotionError) as refused:
         read_motion(path)
     assert str(refused.value).startswith(f'{path}: ') and message in str(refused.value)
-
-
-def test_a_still_motion_is_one():
-    assert math.fsum(np.abs(NAMED['rest'].heading_at(np.arange(60.0)))) == 0.0
