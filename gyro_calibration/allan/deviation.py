@@ -25,7 +25,7 @@ import math
 from typing import Any
 
 from gyro_calibration.allan.record import angle_of, lost_before, refuse_few, whole
-from gyro_calibration.logs.log import Array, DataRefused, Progress
+from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.stamps import Integers
 from gyro_calibration.model.noise import (
     ALLAN_FLOOR,
@@ -124,8 +124,8 @@ def averaging_sizes(samples: int, per_decade: int = 10) -> Integers:
         np.logspace(0.0, decades, round(decades * per_decade) + 1)).astype(np.int64))
 
 
-def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array | None = None,
-                    progress: Progress = iter) -> AllanChart:
+def allan_deviation(rate: Array, interval: float,
+                    times: Sequence[float] | Array | None = None) -> AllanChart:
     """
     Return the overlapping Allan deviation (IEEE Std 952, C.1; NIST SP 1065, eq. 11).
 
@@ -135,7 +135,6 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
     interval : s
     times : averaging times, s, taken to the nearest whole number of intervals; default: ten a
         decade, up to a third of the record
-    progress : is given the blocks of the record to go through, such as a progress bar
 
     Raises
     ------
@@ -154,7 +153,7 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
             raise DataRefused(f'averaging times: {given}; wanted at least one sample, '
                               f'{interval:g} s, and at most half the record, '
                               f'{samples // 2 * interval:g} s: choose others, or record longer')
-    sums, counts = _square_sums(rate, sizes, progress)
+    sums, counts = _square_sums(rate, sizes)
     some = counts > 0
     sizes, counts = sizes[some], counts[some]
     variance = sums[some] / (2.0 * sizes.astype(float) ** 2 * counts)
@@ -168,12 +167,12 @@ def allan_deviation(rate: Array, interval: float, times: Sequence[float] | Array
                       *chi_squared_bounds(variance, freedom))
 
 
-def _square_sums(rate: Array, sizes: Integers, progress: Progress) -> tuple[Array, Integers]:
+def _square_sums(rate: Array, sizes: Integers) -> tuple[Array, Integers]:
     """Return the sums of the squared second differences of the angle, and their numbers."""
     angle, lost = angle_of(rate), lost_before(rate)
     twice, buffer = 2.0 * angle, np.empty(_BLOCK)
     sums, counts = np.zeros(len(sizes)), np.zeros(len(sizes), dtype=np.int64)
-    for begin in progress(range(0, len(angle), _BLOCK)):
+    for begin in range(0, len(angle), _BLOCK):
         for place, size in enumerate(sizes.tolist()):
             end = min(begin + _BLOCK, len(angle) - 2 * size)
             if end <= begin:

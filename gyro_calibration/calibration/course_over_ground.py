@@ -41,7 +41,7 @@ from gyro_calibration.calibration.noise_grid import (
     wander,
 )
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Progress
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
@@ -133,13 +133,13 @@ class _Drive:
             (later - 2.0 * middle + earlier) / base**2,
         )
 
-    def coarse_offset(self, largest: float, progress: Progress = iter) -> float:
+    def coarse_offset(self, largest: float) -> float:
         """Return the offset at which course less integral is straight for most of the time."""
         offsets = np.arange(-round(largest / 0.05), round(largest / 0.05) + 1) * 0.05
         line = np.column_stack([np.ones(len(self.time)), self.time])
         misfits = [
             float(np.mean(np.abs(robust_residual(line, self.course - self.turned(offset), 3))))
-            for offset in progress(offsets)
+            for offset in offsets
         ]
         return float(offsets[int(np.argmin(misfits))])
 
@@ -150,7 +150,6 @@ def fit_course(
     motion: Motion,
     technology: str = 'mems',
     largest_time_offset: float = LARGEST_TIME_OFFSET,
-    progress: Progress = iter,
 ) -> Fit:
     """
     Fit scale factor error, bias and time offset to a drive.
@@ -162,7 +161,6 @@ def fit_course(
     motion : the courses that are known
     technology : of the gyro, one of `PRIORS`
     largest_time_offset : how late or early the gyro's stamps may be, s
-    progress : is given the offsets to try
 
     Raises
     ------
@@ -170,7 +168,7 @@ def fit_course(
 
     """
     drive = _Drive(time, rate, motion)
-    offset = drive.coarse_offset(largest_time_offset, progress)
+    offset = drive.coarse_offset(largest_time_offset)
     spans = drive.spans(offset)
     if len(spans.time) < FEWEST_SPANS:
         raise DataRefused(
@@ -198,7 +196,7 @@ def fit_course(
     )
 
 
-def is_course(time: Array, rate: Array, motion: Motion, progress: Progress = iter) -> bool:
+def is_course(time: Array, rate: Array, motion: Motion) -> bool:
     """
     Tell whether a reference is a course over ground: lost now and then, or noisy, and no encoder.
 
@@ -209,7 +207,6 @@ def is_course(time: Array, rate: Array, motion: Motion, progress: Progress = ite
     ----------
     time, rate : of the gyro, s since the reference began and rad/s, shape (n,)
     motion : by the reference
-    progress : is given the offsets to try
 
     """
     if quantization_step(motion.heading) > ROUNDED:
@@ -219,7 +216,7 @@ def is_course(time: Array, rate: Array, motion: Motion, progress: Progress = ite
     if lost > LOST * float(time[-1] - time[0]):
         return True
     drive = _Drive(time, rate, motion)
-    spans = drive.spans(drive.coarse_offset(LARGEST_TIME_OFFSET, progress))
+    spans = drive.spans(drive.coarse_offset(LARGEST_TIME_OFFSET))
     if len(spans.time) < FEWEST_SPANS:
         return False
     residual = robust_residual(_columns(spans), np.diff(spans.course), 10)

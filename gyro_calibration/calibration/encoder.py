@@ -33,7 +33,7 @@ from gyro_calibration.calibration.fit_quality import DRIVE
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Progress, refuse_wrapped
+from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
 from gyro_calibration.logs.quality import refuse_dead
 from gyro_calibration.logs.stamps import lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
@@ -126,7 +126,7 @@ class EncoderCalibration:
 
 def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None = None,
                       limits: Limits | None = None,
-                      technology: str = 'mems', progress: Progress = iter) -> EncoderCalibration:
+                      technology: str = 'mems') -> EncoderCalibration:
     """
     Find scale factor error and bias from a log with a reference heading.
 
@@ -139,7 +139,6 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     limits : what is believed
     technology : of the gyro, one of `course_over_ground.PRIORS`; with 'course' its prior decides
         what a drive leaves open
-    progress : is given the offsets of gyro and reference that are tried, such as a progress bar
 
     Raises
     ------
@@ -148,12 +147,12 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     """
     limits = limits or Limits(time_offset=LARGEST_TIME_OFFSET)
     time, output, motion = _pair(log)
-    method = method or ('course' if is_course(time, output, motion, progress) else 'likelihood')
+    method = method or ('course' if is_course(time, output, motion) else 'likelihood')
     if method == 'course':
-        return _on_course(log, time, output, motion, noise, technology, progress)
+        return _on_course(log, time, output, motion, noise, technology)
     _refuse_motion(motion, limits)
     refuse_dead(output)
-    fit = METHODS[method](time, output, motion, limits, progress)
+    fit = METHODS[method](time, output, motion, limits)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
     drift = _drift(motion.time, _after(time, output, motion, fit).heading, noise or Noise())
     _refuse_useless(fit.bias, drift.mean, limits.heading)
@@ -161,17 +160,18 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     _refuse_uncertain(fit, limits)
     before, after = (_residual(time - np.nan_to_num(fit.time_offset), output, motion),
                      _after(time, output, motion, fit))
-    model = _model(output, log.temperature, fit, noise or Noise(drift.angle_random_walk))
+    walk = fit.angle_random_walk if method == 'likelihood' else drift.angle_random_walk
+    model = _model(output, log.temperature, fit, noise or Noise(walk))
     return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time),
                               _remarks(fit, method))
 
 
 def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Noise | None,
-               technology: str, progress: Progress) -> EncoderCalibration:
+               technology: str) -> EncoderCalibration:
     """Calibrate against a course over ground."""
     _refuse_length(motion)
     refuse_dead(output)
-    fit = fit_course(time, output, motion, technology, progress=progress)
+    fit = fit_course(time, output, motion, technology)
     before, after = (_residual(time - fit.time_offset, output, motion),
                      _after(time, output, motion, fit))
     drift = _drift(motion.time, after.heading, noise or Noise())
@@ -248,12 +248,11 @@ def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
                           'a heading is as good. Turn more slowly, with rests, or for longer')
 
 
-def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits,
-                   progress: Progress) -> Fit:
-    return fit_likelihood(time, output, motion, limits.time_offset, LAG, progress=progress)
+def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -> Fit:
+    return fit_likelihood(time, output, motion, limits.time_offset, LAG)
 
 
-def _by_rate(time: Array, output: Array, motion: Motion, _: Limits, __: Progress) -> Fit:
+def _by_rate(time: Array, output: Array, motion: Motion, _: Limits) -> Fit:
     """Fit by the rate of the encoder; the stamps are taken as exact."""
     inside = (time >= 0.0) & (time <= motion.duration)
     time, output = time[inside], output[inside]

@@ -28,7 +28,7 @@ import math
 
 from gyro_calibration.calibration.noise_grid import Tridiagonal
 from gyro_calibration.heading.integration import integrate
-from gyro_calibration.logs.log import Array, DataRefused, Progress
+from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.logs.quality import quantization_step
 from gyro_calibration.model.motion import Motion
 import numpy as np
@@ -263,7 +263,7 @@ class _Pairing:
                   + 0.5 * (inside - self._time[index]) * (rate + self._rate[index]))
         return within + (at - inside) * rate
 
-    def coarse_offset(self, largest: float, progress: Progress = iter) -> float:
+    def coarse_offset(self, largest: float) -> float:
         """
         Return the offset, s, at which most increments fit.
 
@@ -274,7 +274,7 @@ class _Pairing:
         # a profile is smoother than what was measured
         step = 0.02 if self.sampled else 0.04
         offsets = np.arange(-round(largest / step), round(largest / step) + 1) * step
-        misfits = np.array([self._misfit(offset) for offset in progress(offsets)])
+        misfits = np.array([self._misfit(offset) for offset in offsets])
         padded = np.pad(misfits, 1, constant_values=math.inf)
         bottoms = offsets[(misfits <= np.minimum(padded[:-2], padded[2:]))
                           & (misfits <= 6.0 * misfits.min())]
@@ -610,8 +610,7 @@ def _away_from_zero(scale: float) -> float:
 
 
 def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset: float = 1.0,
-                   lag: float = LAG_DEVIATION, slip: float = 0.0,
-                   progress: Progress = iter) -> Fit:
+                   lag: float = LAG_DEVIATION, slip: float = 0.0) -> Fit:
     """
     Fit scale factor error, bias and time offset by likelihood.
 
@@ -636,7 +635,6 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     largest_time_offset : how late or early the gyro's stamps may be against the motion, s
     lag : prior standard deviation of the lag, s²; a sine does not separate it from the scale
     slip : largest standard deviation of the slip of each turn of a profile, as a part of it
-    progress : is given the offsets to try, most of the work, such as a progress bar
 
     Raises
     ------
@@ -645,7 +643,7 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
     """
     pairing = _Pairing(time, rate, motion, lag, slip)
     offset, found_lag = pairing.coarse_offset(
-        largest_time_offset + (0.0 if pairing.sampled else FOLLOWING), progress), 0.0
+        largest_time_offset + (0.0 if pairing.sampled else FOLLOWING)), 0.0
     data = pairing.aligned(offset, found_lag)
     for parts in (data.parts[:1], data.parts, data.parts):
         before = offset

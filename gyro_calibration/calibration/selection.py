@@ -29,7 +29,7 @@ from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.rate_table import Calibration, fit_effects
 from gyro_calibration.calibration.scatter import find_scatter, Scatter
 from gyro_calibration.calibration.tolerance import BIAS_SLOPE, SCALE_SLOPE
-from gyro_calibration.logs.log import Array, DataRefused, Progress
+from gyro_calibration.logs.log import Array, DataRefused
 from gyro_calibration.model.effects import (
     BIAS,
     BIAS_TEMPERATURE,
@@ -122,8 +122,7 @@ class Selection:
     confounders: tuple[Confounders, ...]
 
 
-def select_effects(dwells: Dwells, technology: str | None = None,
-                   progress: Progress = iter) -> Selection:
+def select_effects(dwells: Dwells, technology: str | None = None) -> Selection:
     """
     Fit the effects that the dwells support, each with its reason.
 
@@ -131,32 +130,30 @@ def select_effects(dwells: Dwells, technology: str | None = None,
     ----------
     dwells : of a rate table or a log
     technology : one of `TECHNOLOGIES`, of the instrument; it decides where causes tie
-    progress : is given the effects to go through, such as a progress bar
 
     Raises
     ------
     DataRefused : too few dwells for anything
 
     """
-    best, confounders = supported_effects(dwells, technology, progress)
+    best, confounders = supported_effects(dwells, technology)
     best = with_slopes(best)
     if technology is None:
         best, confounders = decided(best, None, SINE_RESPONSE)
     tried = _tried(best.effects)
-    choices = tuple(_choice(best, effect, tried, confounders)
-                    for effect in progress(list(STEADY.values())))
+    choices = tuple(_choice(best, effect, tried, confounders) for effect in STEADY.values())
     return Selection(best, choices, confounders)
 
 
-def supported_effects(dwells: Dwells, technology: str | None = None, progress: Progress = iter,
-                      rate: float = FALSE_ALARM_RATE
-                      ) -> tuple[Calibration, tuple[Confounders, ...]]:
+def supported_effects(
+        dwells: Dwells, technology: str | None = None,
+        rate: float = FALSE_ALARM_RATE) -> tuple[Calibration, tuple[Confounders, ...]]:
     """Fit the supported effects, without reasons, at a false alarm rate."""
     scatter = find_scatter(dwells)
     base = _base(dwells, scatter)
     candidates = [effect for effect in STEADY.values() if effect not in base.effects]
     limit = rate / len(candidates)
-    best = _grow(base, candidates, limit, progress)
+    best = _grow(base, candidates, limit)
     best = _prune(best, base.effects, limit)
     return decided(best, technology)
 
@@ -200,13 +197,12 @@ def _supported(smaller: Calibration, larger: Calibration, limit: float) -> bool:
     return predicts and all(larger.chance_of(effect) < limit for effect in added)
 
 
-def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float,
-          progress: Progress) -> Calibration:
+def _grow(fit: Calibration, candidates: Sequence[Effect], limit: float) -> Calibration:
     """Add the effect that predicts left-out sweeps best, until none is supported."""
     while True:
         new = [effect for effect in candidates if _may_join(effect, fit.effects)]
         tried = [_try(fit.dwells, _joined(fit.effects, effect), fit.scatter)
-                 for effect in progress(new)]
+                 for effect in new]
         better = [each for each in tried if each is not None and _supported(fit, each, limit)]
         if not better:
             return fit

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from functools import partial
 import math
 from typing import Any
 
@@ -28,10 +27,10 @@ from gyro_calibration.allan import (
     Record,
 )
 from gyro_calibration.cli.plots import draw_allan
+from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
-    bar,
     output_of,
     picture_file,
     read,
@@ -71,9 +70,9 @@ def _allan(given: argparse.Namespace) -> Answer:
     try:
         time = time_of(given, log)
         record = even_record(time, output_of(given, log), log.moving)
-        chart = allan_deviation(record.rate, record.interval,
-                                progress=partial(bar, what='Allan deviation'))
-        fit = fit_noise(record.rate, record.interval)
+        with under_way('noise figures from the Allan deviation'):
+            chart = allan_deviation(record.rate, record.interval)
+            fit = fit_noise(record.rate, record.interval)
     except DataRefused as error:
         raise DataRefused(f'{given.log}: {error}') from None
     if given.picture:

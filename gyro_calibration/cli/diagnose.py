@@ -19,6 +19,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -40,12 +41,6 @@ from gyro_calibration.logs.log import Log
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import model_text, read_model
 import numpy as np
-from tqdm import tqdm
-
-#: Shares of the time of a diagnosis, %, as measured on samples/settling.csv.gz; a reference with
-#: noise goes from the gates to the search, which then takes the rest.
-_SHARES = {'gates': 5, 'data quality': 4, 'replay': 1, 'search': 70, 'sets': 1, 'noise': 12,
-           'gain': 5, 'report': 2}
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -74,22 +69,15 @@ def _diagnose(given: argparse.Namespace) -> Answer:
 
 def _found(given: argparse.Namespace, logs: Sequence[Log], model: GyroModel | None) -> Diagnosis:
     """Diagnose logs in time, or a rate table; the extended model gets its origin."""
-    generator = np.random.default_rng(given.seed)
-    if any(log.time is None for log in logs):
-        if len(logs) > 1:
-            raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate '
-                             'table alone, or give the sample rate in Hz with --rate')
-        found = diagnose_table(logs[0], None if model is None else calibrated(model))
-    else:
-        with tqdm(total=sum(_SHARES.values()), bar_format='{desc:12} |{bar}| {percentage:.0f} %',
-                  delay=2.0, leave=False, disable=None) as bar:
-            def on_progress(step: str) -> None:
-                before = list(_SHARES.values())[:list(_SHARES).index(step)]
-                bar.set_description_str(step)
-                bar.update(sum(before) - bar.n)
-
-            found = diagnose(logs, generator, model, names=given.log, on_progress=on_progress,
-                             kind=given.reference_kind)
+    table = any(log.time is None for log in logs)
+    if table and len(logs) > 1:
+        raise UsageError(f'{len(logs)} logs were given, and one has no time_s; give a rate table '
+                         'alone, or give the sample rate in Hz with --rate')
+    with under_way('diagnosis') as on_progress:
+        found = (diagnose_table(logs[0], None if model is None else calibrated(model),
+                                on_progress=on_progress) if table
+                 else diagnose(logs, np.random.default_rng(given.seed), model, names=given.log,
+                               on_progress=on_progress, kind=given.reference_kind))
     return _with_origin(replace(found, logs=tuple(given.log)), model)
 
 

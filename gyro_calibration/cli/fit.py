@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +38,10 @@ from gyro_calibration.cli.fit_answer import (
     value_data,
     value_lines,
 )
+from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
-    bar,
     origin_of,
     picture_file,
     read_each,
@@ -143,12 +142,13 @@ def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
 def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if given.matrix and not given.polynomial:
         raise UsageError('--matrix needs --polynomial: other effects have no matrix')
-    table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '')
-                  for path, log in logs.items()])
     effects = given.effects or given.polynomial
-    selection = (Selection(fit_effects(table, effects), (), ()) if effects
-                 else select_effects(table, given.technology,
-                                     progress=partial(bar, what='effects')))
+    with under_way('dwells') as on_progress:
+        table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '')
+                      for path, log in logs.items()])
+        on_progress(None, 'fit of effects')
+        selection = (Selection(fit_effects(table, effects), (), ()) if effects
+                     else select_effects(table, given.technology))
     fit = selection.calibration
     model = _written(given, fit.model)
     if given.picture:
@@ -181,8 +181,8 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         raise UsageError('a reference heading determines bias and scale_factor_error only; for '
                          'other effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
-    found = calibrate_encoder(log, given.method, technology=given.technology or 'mems',
-                              progress=partial(bar, what='delay of the reference'))
+    with under_way('fit of scale factor error, bias and delay'):
+        found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
     model = _written(given, found.model)
     if given.picture:
         plots.draw_reference(given.picture, *headings(log, found))

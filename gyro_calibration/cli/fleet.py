@@ -24,7 +24,8 @@ import textwrap
 from typing import Any
 
 from gyro_calibration.calibration.course_over_ground import PRIORS
-from gyro_calibration.cli.verb import Answer, bar, origin_of, positive, UsageError, verb, whole
+from gyro_calibration.cli.progress import bar
+from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole
 from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.words import amount, quantity
 from gyro_calibration.files import plain, write_atomically

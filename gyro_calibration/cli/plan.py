@@ -26,7 +26,8 @@ from gyro_calibration.calibration.motion_design import (
     Prediction,
 )
 from gyro_calibration.cli.plots import draw_motion
-from gyro_calibration.cli.verb import Answer, bar, picture_file, positive, UsageError, verb, whole
+from gyro_calibration.cli.progress import under_way
+from gyro_calibration.cli.verb import Answer, picture_file, positive, UsageError, verb, whole
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -87,12 +88,16 @@ def _plan(given: argparse.Namespace) -> Answer:
         forecast = Forecast(noise, seconds, drive, given.drive)
         return best(ability, forecast, seconds, np.random.default_rng(given.seed),
                     generations), forecast
-    plan, forecast = planned(given.seconds, 60)
+    lengths = [each for each in LENGTHS if each > given.seconds]
+    with under_way(f'search for the best motion of {given.seconds:g} s') as on_progress:
+        plan, forecast = planned(given.seconds, 60)
+        more = {}
+        for seconds in lengths:
+            on_progress(None, f'for comparison, the best motion of {seconds:g} s')
+            more[seconds] = planned(seconds)[0].prediction
     built_in = Forecast(noise, CALIBRATION.duration, drive, given.drive).predict(CALIBRATION)
     rows = {'planned': plan.prediction,
             'plain': forecast.predict(plain(ability, given.seconds)), 'built_in': built_in}
-    more = {seconds: planned(seconds)[0].prediction for seconds in bar(
-        [each for each in LENGTHS if each > given.seconds], 'more seconds')}
     if given.out:
         write_motion(given.out, plan.motion)
     if given.picture:

@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from functools import partial
+from itertools import count
 import textwrap
 from typing import Any
 
-from gyro_calibration.cli.verb import Answer, bar, verb, whole
+from gyro_calibration.cli.progress import bar
+from gyro_calibration.cli.verb import Answer, verb, whole
+from gyro_calibration.logs.log import Progress
 from gyro_calibration_reproduction import SOURCES
 from gyro_calibration_reproduction.finding import Comparison, Reproduction
 import numpy as np
@@ -41,11 +43,17 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 def _reproduce(given: argparse.Namespace) -> Answer:
     """Give every source its own generator, so that its numbers do not depend on the others."""
     names = [given.source] if given.source else list(SOURCES)
-    found = {name: SOURCES[name](np.random.default_rng(given.seed),
-                                 progress=partial(bar, what=name)) for name in names}
+    found = {name: SOURCES[name](np.random.default_rng(given.seed), progress=_bars(name))
+             for name in names}
     text = '\n\n'.join(page(reproduction) for reproduction in found.values())
     return Answer(text, {'seed': given.seed, 'sources': {
         name: reproduction.data() for name, reproduction in found.items()}})
+
+
+def _bars(name: str) -> Progress:
+    """Return what shows a bar for each simulation of a source, numbered."""
+    number = count(1)
+    return lambda items: bar(items, f'{name}, simulation {next(number)}')
 
 
 def page(reproduction: Reproduction) -> str:

@@ -31,6 +31,7 @@ from gyro_calibration.calibration.self_calibration import (
 )
 from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING, Turns
 from gyro_calibration.cli.plots import draw_run
+from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -120,9 +121,10 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     time, known = time - begin, _plausible(given, model, log)
     run = known & (time >= -1.0) & (time <= motion.duration + 1.0)
     rates = compensate_log(with_self_calibration(model, None), log)
-    fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
-                         reference=_goodness(given, motion), output=output[run],
-                         prior=model.prior)
+    with under_way('fit of scale factor error, bias and delay'):
+        fit = self_calibrate(time[run], rates[run], motion, given.method, noise=model.noise,
+                             reference=_goodness(given, motion), output=output[run],
+                             prior=model.prior)
     if given.picture:
         draw_run(given.picture, time[run] - _late(fit), rates[run],
                  (rates[run] - fit.bias) / (1.0 + fit.scale_factor_error), motion)

@@ -31,6 +31,7 @@ from gyro_calibration.calibration.turn_error import (
     TurnErrors,
 )
 from gyro_calibration.cli.plots import draw_turn_errors
+from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
     Answer,
@@ -77,9 +78,10 @@ def _turn(given: argparse.Namespace) -> Answer:
     log = read(given)
     output_of(given, log)  # counts alone are wrong use here, as for other verbs
     found = dwells(log)
-    rate, kept, remarks, data = (_fitted(found) if given.model is None else
-                                 _as_given(given, read_model(given.model), log, found))
-    errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
+    with under_way('fit of effects, and errors of turns'):
+        rate, kept, remarks, data = (_fitted(found) if given.model is None else
+                                     _as_given(given, read_model(given.model), log, found))
+        errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
     if given.out:
         _write(given.out, errors)
     if given.picture:

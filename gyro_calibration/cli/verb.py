@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 import importlib.util
@@ -24,6 +23,7 @@ import sys
 from typing import Any
 
 from gyro_calibration import __version__
+from gyro_calibration.cli.progress import bytes_of
 from gyro_calibration.files import digest, InputError, LARGEST, plain
 from gyro_calibration.logs.columns import AXES
 from gyro_calibration.logs.log import (
@@ -39,7 +39,6 @@ from gyro_calibration.logs.log import (
 from gyro_calibration.logs.recording import blocks_of, read_recording, Topics
 from gyro_calibration.logs.ros_bag import files_of, is_recording
 from gyro_calibration.model.gyro_model import GyroModel
-from tqdm import tqdm
 
 
 class UsageError(InputError):
@@ -156,7 +155,7 @@ def read(given: argparse.Namespace) -> Log:
     if is_recording(given.log):
         log = _recorded(given)
     else:
-        with _bytes_of(given.log) as on_progress:
+        with bytes_of(given.log) as on_progress:
             log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
     if given.unwrap and log.reference_heading is not None:
@@ -198,11 +197,6 @@ def say(text: object) -> None:
     print(f'gyro_calibration: {plain(text)}', file=sys.stderr, flush=True)
 
 
-def bar(items: Iterable[Any], what: str, total: int | None = None) -> Iterable[Any]:
-    """Show on a terminal the progress over some items, if it takes longer than two seconds."""
-    return tqdm(items, desc=what, total=total, delay=2.0, leave=False, disable=None)
-
-
 def origin_of(paths: Iterable[str]) -> dict[str, Any]:
     """Return the origin of a model, for its file: logs, date, program."""
     files = [{'name': plain(file.name),
@@ -222,26 +216,17 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
     if is_recording(given.log) or given.unwrap:
         yield from blocks_of(read(given))
         return
-    with _bytes_of(given.log) as on_progress:
+    with bytes_of(given.log) as on_progress:
         blocks = read_log_blocks(given.log, sensitivity(given), given.rate,
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _inside(given, blocks):
             yield _turned(given, log)
 
 
-@contextmanager
-def _bytes_of(path: str) -> Iterator[Callable[[int], object]]:
-    """Show on a terminal how many bytes of a log are read, and give the function that counts."""
-    size = sum(os.path.getsize(file) for file in files_of(path) if os.path.isfile(file)) or None
-    with tqdm(total=size, desc=plain(path), unit='B', unit_scale=True, delay=2.0, leave=False,
-              disable=None) as shown:
-        yield lambda place: shown.update(place - shown.n)
-
-
 def _recorded(given: argparse.Namespace) -> Log:
     """Read a recording, and print on standard error what was used and corrected."""
     topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
-    with _bytes_of(given.log) as on_progress:
+    with bytes_of(given.log) as on_progress:
         return read_recording(given.log, topics, given.rate, on_progress, say)
 
 

@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
@@ -92,6 +92,7 @@ from gyro_calibration.diagnosis.search import (
     searched,
     suspected,
 )
+from gyro_calibration.diagnosis.steps import CHECKS, OnProgress, Steps
 from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import CATALOGUE, QUANTIZATION
@@ -120,13 +121,17 @@ _HARDLY = {'temperature': 'the temperature hardly changes',
            'specific_force': 'the specific force does not change'}
 _WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
+#: Steps beside an exact reference, % of the time as measured on 25 min of an encoder at 100 Hz.
+_SHARES = {CHECKS: 1, 'data quality': 1, 'replay of the model': 1, 'search for causes': 78,
+           'alternatives': 11, 'noise figures': 1, 'cross-validation': 3, 'findings': 4}
+
 #: Causes that may stand in the place of one, itself too, with what each lacks in likelihood.
 Members = Sequence[tuple[Named, float]]
 
 
 def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroModel | None = None,
              rate: float = 0.01, names: Sequence[str] = (),
-             on_progress: Callable[[str], object] = lambda step: None,
+             on_progress: OnProgress = lambda share, words: None,
              kind: str | None = None) -> Diagnosis:
     """
     Say what a simulation gets wrong, and why.
@@ -139,7 +144,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         where it is None
     rate : of false alarms a diagnosis
     names : of the logs, for people
-    on_progress : is given the name of each step as it begins
+    on_progress : is given the share of the work that is done, and what begins
     kind : of the reference, one of `reference.KINDS`; found where it is None
 
     Raises
@@ -147,7 +152,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
     DataRefused : the logs allow no diagnosis
 
     """
-    on_progress('gates')
+    on_progress(0.0, CHECKS)
     given, model = model, None if model is None else calibrated(model)
     checked: list[Gate] = []
     for place, log in enumerate(logs):
@@ -166,8 +171,7 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
         checked += passed
     references = [reference_of(log, kind) for log in logs]
     if len(logs) == 1 and not rests(logs[0]) and limits(logs[0], references[0]):
-        on_progress('search')
-        found = diagnose_by_noisy_reference(logs[0], references[0], model, rate)
+        found = diagnose_by_noisy_reference(logs[0], references[0], model, rate, on_progress)
     else:
         found = _by_exact_reference(logs, generator, model, rate, names, on_progress)
         found = replace(found, reference=references[0] if len(logs) == 1 else None)
@@ -178,31 +182,32 @@ def diagnose(logs: Sequence[Log], generator: np.random.Generator, model: GyroMod
 
 def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
                         model: GyroModel | None, rate: float, names: Sequence[str],
-                        on_progress: Callable[[str], object]) -> Diagnosis:
+                        on_progress: OnProgress) -> Diagnosis:
     """Diagnose logs whose reference errs less than the gyro."""
-    on_progress('data quality')
+    steps = Steps(on_progress, _SHARES)
+    steps.begin('data quality')
     quality = [decided(inspect(log, model)) for log in logs]
-    on_progress('replay')
+    steps.begin('replay of the model')
     replays = [replay(log if clean.factor == 1.0 or log.output is None
                       else replace(log, output=log.output * clean.factor), clean.trusted,
                       generator, clean.update_interval, clean.heading_step, clean.step, model)
                for log, clean in zip(logs, quality)]
-    on_progress('search')
-    search, everything = _searched(replays, generator, _OF_SEARCH * rate)
+    steps.begin('search for causes')
+    search, everything = _searched(replays, generator, _OF_SEARCH * rate, steps)
     named, unnamed = _withdrawn(search, everything)
     named, contradicted = _without_contradictions(search, named)
-    on_progress('sets')
+    steps.begin('alternatives')
     named, sets = _simplest(search, named, unnamed)
     found = FittedValues(fitted(search.problem, named), search.problem.replays)
     out = left_out(model or GyroModel(), found)
-    on_progress('noise')
+    steps.begin('noise figures')
     # without a model, what rounds the output is a finding or nothing
     rounds = (any(each.effect == QUANTIZATION.name for clean in quality for each in clean.findings)
               if model is None else any(term.effect is QUANTIZATION for term in model.terms))
     simulated = Noise() if model is None else model.noise
     figures = noise_parameters(found.fitted, simulated, rounds)
     noise = figures.noise
-    on_progress('gain')
+    steps.begin('cross-validation')
     changed = [] if model is None else _of_model(found, model, noise, rate)
     causes = {each.candidate.cause for known, members in zip(named, sets) if known not in out
               for each, _ in members}
@@ -210,7 +215,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     won = (gain(search, causes, model is not None)
            if (lasting or changed) and not implausible_scale(found) else None)
     offered = won is None or not won.worse
-    on_progress('report')
+    steps.begin('findings')
     findings = []
     for place, (known, members) in enumerate(zip(named, sets)):
         chance = search.chance.p_value(known.candidate.cause,
@@ -260,15 +265,15 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         heading_shares=of_heading)
 
 
-def _searched(replays: Sequence[Replay], generator: np.random.Generator,
-              rate: float) -> tuple[Search, tuple[Named, ...]]:
+def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: float,
+              steps: Steps) -> tuple[Search, tuple[Named, ...]]:
     """Search, and once more where what is left is filtered noise, which passes for causes."""
-    search = begin(replays, generator, rate)
+    search = begin(replays, generator, rate, steps.within)
     everything = searched(search)
     as_filtered = filtered(fitted(search.problem, everything))
     if as_filtered is search.problem.replays:
         return search, everything
-    search = begin(as_filtered, generator, rate)
+    search = begin(as_filtered, generator, rate, steps.within)
     return search, searched(search)
 
 

@@ -24,7 +24,7 @@ from gyro_calibration.allan import allan_deviation
 from gyro_calibration.diagnosis.findings import Curve, HeadingCurve, NoiseCurve
 from gyro_calibration.diagnosis.regression import Fitted, FittedValues
 from gyro_calibration.diagnosis.replay import angles, differentiated, Replay, transform
-from gyro_calibration.logs.log import Array
+from gyro_calibration.logs.log import Array, Mask
 from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.model.noise import Noise
 import numpy as np
@@ -33,6 +33,8 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 NAMES = ('angle_random_walk', 'bias_instability', 'rate_random_walk')
+#: Of logs with nothing but noise, so many lose a band of frequencies.
+_BY_CHANCE = 1e-3
 #: Bins of a curve, and points of a line over time.
 BINS, POINTS = 40, 600
 #: Samples of which the Allan deviation is taken.
@@ -89,6 +91,9 @@ def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> Noi
     """
     Fit noise figures to the residual, and compare them with those of a model.
 
+    Frequencies with more than the noise, such as those of a vibration, are left out, as `allan`
+    leaves out averaging times that a filter or interference affects.
+
     Parameters
     ----------
     done : what was found
@@ -97,7 +102,7 @@ def noise_parameters(done: Fitted, expected: Noise, rounds: bool = False) -> Noi
         that; otherwise it may be with it
 
     """
-    bands = _bands(done)
+    bands = _without_tones(_bands(done))
     without = _compared(bands, expected)
     if rounds or not bands.known.any():
         return without
@@ -140,6 +145,21 @@ def _bands(done: Fitted) -> _Bands:
     kept = count > 0.0
     known, *means = (total[kept] / count[kept] for total in totals)
     return _Bands(energy[kept], count[kept], np.column_stack(means), known)
+
+
+def _without_tones(bands: _Bands) -> _Bands:
+    """Leave out bands with more energy than the noise of the others, the most unlikely first."""
+    kept: Mask = np.ones(len(bands.energy), dtype=bool)
+    while kept.sum() > len(kept) / 2:
+        inside = _Bands(bands.energy[kept], bands.count[kept], bands.parts[kept],
+                        bands.known[kept])
+        chances = np.where(kept, chi2.sf(
+            bands.energy / bands.variance(_fit(inside, {})[0]), bands.count), 1.0)
+        weakest = int(chances.argmin())
+        if chances[weakest] > _BY_CHANCE / len(kept):
+            return inside
+        kept[weakest] = False
+    return bands
 
 
 def _fit(bands: _Bands, held: dict[int, float], start: Array | None = None) -> tuple[Array, float]:

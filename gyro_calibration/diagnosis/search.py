@@ -60,6 +60,7 @@ from gyro_calibration.diagnosis.regression import (
     with_one_more,
 )
 from gyro_calibration.diagnosis.replay import inverse, Replay, transform
+from gyro_calibration.diagnosis.steps import OnPart
 from gyro_calibration.logs.log import Array, DataRefused
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -172,6 +173,7 @@ class Search:
     scanned : causes that are scanned for over all frequencies, or all moments
     unidentifiable : causes of which these logs leave nothing beside bias and scale factor error
     banks, found_before : what was made before, by the causes that were named then
+    on_part : is told each part of the work as it begins, in words
 
     """
 
@@ -183,6 +185,7 @@ class Search:
     unidentifiable: frozenset[str] = frozenset()
     banks: dict[Key, Bank] = field_of(default_factory=dict)
     found_before: dict[Key, tuple[Step | None, list[Step]]] = field_of(default_factory=dict)
+    on_part: OnPart = lambda words: None
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -232,9 +235,10 @@ def chances(done: Fitted, stock: Bank, generator: np.random.Generator) -> Chance
     return Chance(start, scale, share)
 
 
-def begin(replays: Sequence[Replay], generator: np.random.Generator,
-          rate: float = 0.006) -> Search:
+def begin(replays: Sequence[Replay], generator: np.random.Generator, rate: float = 0.006,
+          on_part: OnPart = lambda words: None) -> Search:
     """Lay out logs and learn what chance shows in them."""
+    on_part('candidate causes')
     found = [*candidates(replays), *generic_terms(replays)]
     everywhere = regression_problem(replays)
     whole = _of_likely_noises(everywhere, found)
@@ -244,8 +248,9 @@ def begin(replays: Sequence[Replay], generator: np.random.Generator,
         whole, done = everywhere, fitted(everywhere, [])
     hidden = frozenset(cause for cause, own in places.items()
                        if not np.isfinite(shown[own]).any())
+    on_part('significance, by simulated noise')
     return Search(whole, stock, chances(done, stock, generator), rate / len(places),
-                  unidentifiable=hidden)
+                  unidentifiable=hidden, on_part=on_part)
 
 
 def relaid(search: Search, replays: Sequence[Replay], causes: Collection[str],
@@ -513,6 +518,8 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
                 for each in named)
     if key not in search.found_before:
+        search.on_part(f'search for causes beside {len(named)}' if named
+                       else 'search for causes')
         search.found_before[key] = _strongest(search, named)
     return search.found_before[key]
 

@@ -64,16 +64,11 @@ def test_a_late_gyro_is_found_late_and_nothing_else():
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
 
 
-def test_the_offsets_that_are_tried_are_its_progress():
-    tried = []
-
-    def progress(offsets):
-        for offset in offsets:
-            tried.append(float(offset))
-            yield offset
-    found = calibrate_encoder(CLEAN, progress=progress).fit
-    assert found.bias == calibrate_encoder(CLEAN).fit.bias
-    assert len(tried) > 10 and min(tried) < -0.2 and max(tried) > 0.2
+def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
+    noise = Noise(angle_random_walk=5e-4)
+    found = calibrate_encoder(log_of(SWING, 100.0, noise, np.random.default_rng(8)))
+    assert found.model.noise.angle_random_walk == found.fit.angle_random_walk
+    assert found.fit.angle_random_walk == pytest.approx(5e-4, rel=0.25)
 
 
 def test_the_model_holds_what_was_found():

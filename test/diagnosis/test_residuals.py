@@ -12,7 +12,13 @@
 
 from gyro_calibration.diagnosis.regression import fitted, FittedValues, regression_problem
 from gyro_calibration.diagnosis.replay import replay
-from gyro_calibration.diagnosis.residuals import curves, what_is_left
+from gyro_calibration.diagnosis.residuals import (
+    _Bands,
+    _fit,
+    _without_tones,
+    curves,
+    what_is_left,
+)
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.noise import Noise, simulate_noise
 import numpy as np
@@ -56,3 +62,18 @@ def test_bands_hold_where_samples_are_averaged_before_the_search():
     held, count = np.sum([inside(record(NOISES['flicker'], generator, 600.0, 0.002), generator)
                           for _ in range(2)], axis=0)
     assert 0.9 < held / count < 0.99, held / count
+
+
+@pytest.mark.parametrize('tone', [1.0, 4.0])
+def test_a_vibration_is_not_in_the_angle_random_walk(tone):
+    generator = np.random.default_rng(3)
+    frequency = np.geomspace(0.01, 25.0, 60)
+    count = np.maximum(np.round(100.0 * frequency), 1.0)
+    parts = np.column_stack([np.ones(60), 1.0 / frequency, 1.0 / frequency ** 2])
+    energy = 4.0 * generator.chisquare(count)
+    energy[56] *= tone
+    bands = _Bands(energy, count, parts, np.zeros(60))
+    used = _without_tones(bands)
+    assert len(used.energy) == (60 if tone == 1.0 else 59)
+    assert np.exp(0.5 * _fit(used, {})[0][0]) == pytest.approx(2.0, rel=0.03)
+    assert tone == 1.0 or np.exp(0.5 * _fit(bands, {})[0][0]) > 2.2

@@ -1,0 +1,54 @@
+# Copyright 2026 The gyro_calibration maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations
+# under the License.
+
+"""How far a diagnosis is, and what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from itertools import accumulate
+from typing import TypeAlias
+
+#: The first step of every diagnosis in time.
+CHECKS = 'checks of the log'
+#: Is given the share of a diagnosis that is done, which never falls, and what begins, in words.
+OnProgress: TypeAlias = Callable[[float, str], object]
+#: Is told what begins, in words.
+OnPart: TypeAlias = Callable[[str], object]
+#: A part of a step that has an unknown number of parts takes so much of what is left of the step.
+_PART = 0.12
+
+
+class Steps:
+    """
+    The steps of a diagnosis, each with its share of the time.
+
+    Parameters
+    ----------
+    on_progress : is told each step as it begins
+    shares : words -> part of the time of a long diagnosis, in order
+
+    """
+
+    def __init__(self, on_progress: OnProgress, shares: Mapping[str, float]) -> None:
+        self.on_progress = on_progress
+        ends = [end / sum(shares.values()) for end in accumulate(shares.values())]
+        self._span = dict(zip(shares, zip([0.0, *ends], ends)))
+        self._done = self._end = 0.0
+
+    def begin(self, words: str) -> None:
+        """Report that a step begins."""
+        self._done, self._end = self._span[words]
+        self.on_progress(self._done, words)
+
+    def within(self, words: str) -> None:
+        """Report that a part of the step under way begins; how many follow is not known."""
+        self.on_progress(self._done, words)
+        self._done += _PART * (self._end - self._done)
