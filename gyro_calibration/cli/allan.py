@@ -30,14 +30,15 @@ from gyro_calibration.cli.plots import draw_allan
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
+    add_picture,
     Answer,
     output_of,
-    picture_file,
     read,
     time_of,
     UsageError,
     verb,
     with_origin,
+    written,
 )
 from gyro_calibration.logs.log import DataRefused, DEGREE
 from gyro_calibration.model.gyro_model import GyroModel
@@ -55,8 +56,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                   'find the noise figures of a gyro in a record at rest, by its Allan deviation',
                   'rest.csv --rate 100 --picture allan.png --model model.yaml --out model.yaml')
     add_log(parser)
-    parser.add_argument('--picture', type=picture_file, metavar='FILE',
-                        help='draw the chart, .png or .svg')
+    add_picture(parser, 'the chart')
     parser.add_argument('--model', metavar='MODEL.yaml', help='with --out: the model to add the '
                         'noise figures to; default: a new one')
     parser.add_argument('--out', metavar='MODEL.yaml',
@@ -65,7 +65,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _allan(given: argparse.Namespace) -> Answer:
-    _check(given)
+    if given.model and not given.out:
+        raise UsageError('--model was given without --out; give the file to write with --out')
     model, log = read_model(given.model) if given.model else GyroModel(), read(given)
     try:
         time = time_of(given, log)
@@ -80,18 +81,11 @@ def _allan(given: argparse.Namespace) -> Answer:
     if given.out:
         write_model(given.out, replace(with_origin(given, model), noise=fit.noise,
                                        noise_bounds=fit.noise_bounds))
-    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
-    if given.out:
-        written.insert(0, 'The bias instability of the model is that of the fit of all parts, '
-                       'since the model adds N and K to it.')
-    return Answer('\n'.join([*lines(record, chart, fit), *written]),
+    of_model = ['The bias instability of the model is that of the fit of all parts, '
+                'since the model adds N and K to it.'] if given.out else []
+    return Answer('\n'.join([*lines(record, chart, fit), *of_model,
+                             *written(given.picture, given.out)]),
                   _data(given, record, chart, fit))
-
-
-def _check(given: argparse.Namespace) -> None:
-    """Refuse what cannot work before the work is done."""
-    if given.model and not given.out:
-        raise UsageError('--model was given without --out; give the file to write with --out')
 
 
 def lines(record: Record, chart: AllanChart, fit: NoiseFit) -> list[str]:
@@ -118,13 +112,8 @@ def _line(symbol: str, figure: Figure) -> str:
 
 def names(fit: NoiseFit) -> dict[str, str]:
     """Return what a chart calls the figures that are seen, by symbol."""
-    return {symbol: _named(symbol, figure) for symbol, figure in fit.figures.items()
-            if figure.value}
-
-
-def _named(symbol: str, figure: Figure) -> str:
-    unit, factor = UNITS[symbol]
-    return f'{_words(figure)} {symbol} = {figure.value * factor:.3g} {unit}'
+    return {symbol: f'{_words(figure)} {symbol} = {figure.value * UNITS[symbol][1]:.3g} '
+            f'{UNITS[symbol][0]}' for symbol, figure in fit.figures.items() if figure.value}
 
 
 def _words(figure: Figure) -> str:

@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,12 +40,13 @@ from gyro_calibration.cli.fit_answer import (
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
+    add_picture,
     Answer,
     origin_of,
-    picture_file,
     read_each,
     UsageError,
     verb,
+    written,
 )
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import Effect, rate_temperature_polynomial, STEADY
@@ -82,10 +82,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
     parser.add_argument('--matrix', action='store_true', help='print the polynomial as the '
                         'matrix C of Ojeda et al., in deg/s and degC')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE',
-                        help='draw the errors before and after, .png or .svg')
-    parser.add_argument('--surface', type=picture_file, metavar='FILE',
-                        help='draw the error over rate and temperature, .png or .svg')
+    add_picture(parser, 'the errors before and after')
+    add_picture(parser, 'the error over rate and temperature', '--surface')
     return parser
 
 
@@ -126,7 +124,7 @@ def _method(given: argparse.Namespace, logs: dict[str, Log]) -> str:
     return '' if heading_alone and not chosen else 'dwells'
 
 
-def _written(given: argparse.Namespace, model: GyroModel) -> GyroModel:
+def _stored(given: argparse.Namespace, model: GyroModel) -> GyroModel:
     """Return the model with its origin, and write it where --out is given."""
     identity = {'name': given.gyro_name, 'serial_number': given.serial_number,
                 'technology': given.technology}
@@ -150,7 +148,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
         selection = (Selection(fit_effects(table, effects), (), ()) if effects
                      else select_effects(table, given.technology))
     fit = selection.calibration
-    model = _written(given, fit.model)
+    model = _stored(given, fit.model)
     if given.picture:
         plots.draw_residuals(given.picture, fit)
     if given.surface:
@@ -167,7 +165,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
                      'influence, since the effects were given.')
     if given.matrix and matrix is not None:
         lines += ['', *matrix_lines(matrix)]
-    return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
+    return Answer('\n'.join([*lines, *written(given.out)]), data)
 
 
 # a reference heading
@@ -176,25 +174,21 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if len(logs) > 1:
         raise UsageError(f'--method {given.method or "likelihood"} takes one log; '
                          'give one log, or use --method dwells')
-    if (_names(given.effects) - {'bias', 'scale_factor_error'} or given.polynomial
-            or given.surface or given.matrix):
+    others = {effect.name for effect in given.effects or ()} - {'bias', 'scale_factor_error'}
+    if others or given.polynomial or given.surface or given.matrix:
         raise UsageError('a reference heading determines bias and scale_factor_error only; for '
                          'other effects, --matrix and --surface use --method dwells')
     (path, log), = logs.items()
     with under_way('fit of scale factor error, bias and delay'):
         found = calibrate_encoder(log, given.method, technology=given.technology or 'mems')
-    model = _written(given, found.model)
+    model = _stored(given, found.model)
     if given.picture:
         plots.draw_reference(given.picture, *headings(log, found))
     data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
             **model_data(model), **heading_data(found), 'remarks': list(found.remarks)}
     lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',
              *heading_lines(found), *sentences(found.remarks)]
-    return Answer('\n'.join(lines + ([f'Written to {given.out}.'] if given.out else [])), data)
-
-
-def _names(effects: Sequence[Effect] | None) -> set[str]:
-    return {effect.name for effect in effects or ()}
+    return Answer('\n'.join([*lines, *written(given.out)]), data)
 
 
 def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, str]:

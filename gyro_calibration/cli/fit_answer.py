@@ -21,7 +21,7 @@ from gyro_calibration.calibration.dwells import listed
 from gyro_calibration.calibration.encoder import EncoderCalibration
 from gyro_calibration.calibration.rate_table import Bin, binned, Calibration
 from gyro_calibration.calibration.scatter import FEWEST_SWEEPS
-from gyro_calibration.calibration.selection import Choice, Confounders, Selection
+from gyro_calibration.calibration.selection import Selection
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.effects import Parameter, polynomial_to_matrix
 from gyro_calibration.model.gyro_model import GyroModel
@@ -84,25 +84,19 @@ def dwell_data(selection: Selection) -> dict[str, Any]:
         'rms_left_out_rad_s': _finite(fit.left_out_rms),
         'scatter': {'dwell_rad_s': scatter.dwell, 'dwell_scale': scatter.dwell_scale,
                     'sweep_bias_rad_s': scatter.sweep_bias, 'sweep_scale': scatter.sweep_scale},
-        'choices': [_choice_data(choice) for choice in selection.choices],
-        'look_alikes': [_confounders_data(pair) for pair in selection.confounders],
+        'choices': [{
+            'effect': choice.effect, 'taken': choice.taken,
+            'left_out_without_rad_s': _finite(choice.without),
+            'left_out_with_rad_s': _finite(choice.with_it), 'chance': _finite(choice.chance),
+            'reason': choice.reason} for choice in selection.choices],
+        'look_alikes': [{
+            'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
+            'parted': pair.distinguishable, 'parting_rate_rad_s': pair.rate,
+            'reason': pair.reason} for pair in selection.confounders],
         'by_rate': [_bin_data(part, 'rad_s') for part in binned(fit, table.rate)],
         'by_temperature': [] if table.temperature is None
         else [_bin_data(part, 'degc') for part in binned(fit, table.temperature)],
     }
-
-
-def _choice_data(choice: Choice) -> dict[str, Any]:
-    return {'effect': choice.effect, 'taken': choice.taken,
-            'left_out_without_rad_s': _finite(choice.without),
-            'left_out_with_rad_s': _finite(choice.with_it), 'chance': _finite(choice.chance),
-            'reason': choice.reason}
-
-
-def _confounders_data(pair: Confounders) -> dict[str, Any]:
-    return {'taken': pair.taken, 'other': pair.other, 'sigmas': pair.sigmas,
-            'parted': pair.distinguishable, 'parting_rate_rad_s': pair.rate,
-            'reason': pair.reason}
 
 
 def _bin_data(part: Bin, unit: str) -> dict[str, Any]:
@@ -195,20 +189,18 @@ def quality_lines(fit: Calibration) -> Iterator[str]:
     yield _wrapped(f'Dwells scatter by {scatter.dwell / DEGREE:.4f} deg/s '
                    f'and {100.0 * scatter.dwell_scale:.3f} % of the rate, {wander}. '
                    f'Condition number {fit.condition:.1f}.')
-    yield from map(_wrapped, _warnings(fit))
-
-
-def _warnings(fit: Calibration) -> Iterator[str]:
     excess = math.sqrt(fit.misfit / fit.freedom) if fit.freedom else 1.0
     if excess > 1.2:
-        yield (f'The residual is {excess:.1f} times the scatter of the dwells about a smooth '
-               'surface: the model lacks an effect. The intervals are widened by this factor.')
+        yield _wrapped(f'The residual is {excess:.1f} times the scatter of the dwells about a '
+                       'smooth surface: the model lacks an effect. The intervals are widened by '
+                       'this factor.')
     if fit.folded_beyond is not None:
-        yield (f'Above {fit.folded_beyond / DEGREE:.0f} deg/s the modelled output does not '
-               'increase with the rate, so one output has two rates: do not use the model there.')
+        yield _wrapped(f'Above {fit.folded_beyond / DEGREE:.0f} deg/s the modelled output does '
+                       'not increase with the rate, so one output has two rates: do not use the '
+                       'model there.')
     if not fit.freedom:
-        yield ('There are as many values as dwells, so their standard deviations are unknown: '
-               'add dwells.')
+        yield _wrapped('There are as many values as dwells, so their standard deviations are '
+                       'unknown: add dwells.')
 
 
 def bin_lines(fit: Calibration) -> Iterator[str]:
@@ -239,15 +231,13 @@ def choice_lines(selection: Selection) -> Iterator[str]:
         numbers = f'{without} {with_it} {_shown(choice.chance, ".1g"):>7s}'
         yield _wrapped(f'{choice.effect:26s} {numbers}  '
                        f'{"taken" if choice.taken else "not taken"}: {choice.reason}', 54)
-    yield from (_wrapped(_alike(pair)) for pair in selection.confounders
-                if not pair.distinguishable)
-
-
-def _alike(pair: Confounders) -> str:
-    remedy = ('no rate up to three times the fastest' if pair.rate is None
-              else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
-    return (f'These data do not distinguish {pair.taken} from {pair.other}: {pair.reason}. '
-            f'They differ beyond the calibrated rates; {remedy} would distinguish them.')
+    for pair in selection.confounders:
+        remedy = ('no rate up to three times the fastest' if pair.rate is None
+                  else f'two dwells each way at {pair.rate / DEGREE:.0f} deg/s')
+        if not pair.distinguishable:
+            yield _wrapped(f'These data do not distinguish {pair.taken} from {pair.other}: '
+                           f'{pair.reason}. They differ beyond the calibrated rates; {remedy} '
+                           'would distinguish them.')
 
 
 def _shown(value: float, form: str) -> str:

@@ -27,7 +27,15 @@ from gyro_calibration.calibration.motion_design import (
 )
 from gyro_calibration.cli.plots import draw_motion
 from gyro_calibration.cli.progress import under_way
-from gyro_calibration.cli.verb import Answer, picture_file, positive, UsageError, verb, whole
+from gyro_calibration.cli.verb import (
+    add_picture,
+    Answer,
+    positive,
+    UsageError,
+    verb,
+    whole,
+    written,
+)
 from gyro_calibration.files import reason, write_atomically
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.model.model_file import read_model
@@ -62,8 +70,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='length of the motion; default: 20')
     parser.add_argument('--out', metavar='PROFILE.csv',
                         help='write the motion, for self-calibrate and the node')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE',
-                        help='draw the motion, .png or .svg')
+    add_picture(parser, 'the motion')
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model with noise figures; default: that of the Epson XV-3500')
     parser.add_argument('--motion', default='robot', metavar='FILE|NAME',
@@ -183,8 +190,7 @@ def _text(given: argparse.Namespace, plan: Plan, rows: dict[str, Prediction],
         f'Angle random walk contributes {plan.prediction.floor / DEGREE:.3f} deg to the error, '
         'independent of the calibration.',
         'The accuracy of the bias depends on the length of the motion only.']
-    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
-    return '\n'.join(lines + written)
+    return '\n'.join([*lines, *written(given.picture, given.out)])
 
 
 def _row(name: str, row: Prediction) -> str:

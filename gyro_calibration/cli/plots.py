@@ -62,8 +62,6 @@ def draw_headings(path: str | Path | None, time: Array, true: Array,
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    for axes in (above, below):
-        axes.grid(alpha=0.3)
     return _save(figure, path, 'Below: the flatter a line and the nearer to zero, the better.')
 
 
@@ -93,8 +91,6 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(ylabel=f'gyro less {name} [deg]', title=f'Gyro {when}: rms {_rms(error):.3g} deg')
     below.set_xlabel('time [s]')
-    for axes in (above, middle, below):
-        axes.grid(alpha=0.3)
     return _save(figure, path, 'The lower panels have their own scales. A slope is bias; what '
                  'follows the turns is scale factor error; an even band is the '
                  'resolution of the reference.')
@@ -126,8 +122,6 @@ def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array
     below.axhline(0.0, color='black', linewidth=0.5)
     below.set(xlabel='time [s]', ylabel='heading error [deg]')
     below.legend(loc='best')
-    for axes in (above, below):
-        axes.grid(alpha=0.3)
     return _save(figure, path, 'Above: both turn at the same times. Below: the error before '
                  'follows the turns; after, it stays near zero.')
 
@@ -153,8 +147,6 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     above.legend(loc='best')
     below.plot(time, motion.heading_at(time) / DEGREE, color='black')
     below.set(xlabel='time [s]', ylabel='heading [deg]')
-    for axes in (above, below):
-        axes.grid(alpha=0.3)
     return _save(figure, path, 'Turns both ways separate the scale factor error from the bias; '
                  'rests show the bias alone.')
 
@@ -252,7 +244,6 @@ def draw_error_surface(path: str | Path | None, model: GyroModel, rate_range: tu
     axes.set(xlabel='gyro output [deg/s]', ylabel='error: output less rate [deg/s]',
              title='Error over the output')
     axes.legend(loc='best')
-    axes.grid(alpha=0.3)
     return _save(figure, path, 'The error that the model removes; red: the output is above the '
                  'true rate, blue: below it.' if thermal else 'The error that the model removes.')
 
@@ -263,6 +254,7 @@ def _draw_contours(axes: Any, model: GyroModel, output: Array, temperature: Arra
     error = (across - model.rate(across.ravel(), up.ravel()).reshape(across.shape)) / DEGREE
     levels = _levels(error)
     largest = float(np.abs(levels).max())
+    axes.grid(False)
     axes.contourf(across / DEGREE, up, error, levels=levels, cmap=_DIVERGING, alpha=0.8,
                   vmin=-largest, vmax=largest, extend='both')
     lines = axes.contour(across / DEGREE, up, error, levels=levels, colors='black', linewidths=0.8)
@@ -347,7 +339,6 @@ def _draw_errors(axes: Any, across: Array, error: Array, kept: Mask, shade: Arra
                   label=f'{len(shown)} outlying{beyond}')
         axes.legend(loc='best')
     axes.axhline(0.0, color='black', linewidth=0.5)
-    axes.grid(alpha=0.3)
     return dots
 
 
@@ -379,7 +370,6 @@ def draw_turn_errors(path: str | Path | None, errors: TurnErrors, slowest: float
         percent = axes.secondary_yaxis('right', functions=(lambda degrees: degrees / 3.6,
                                                            lambda percents: percents * 3.6))
         percent.set_ylabel('error [% of a turn]')
-        axes.grid(alpha=0.3)
     if temperature is not None:
         figure.colorbar(dots, ax=panels[:, 0], label='temperature [°C]', aspect=40, pad=0.02)
     return _save(figure, path, f'Hatched: slower than {slowest / DEGREE:g} deg/s, left out. The '
@@ -391,8 +381,11 @@ def _panels(rows: int, columns: int, inches: tuple[float, float],
     """Return a figure and its panels, shape (rows, columns); with heights they share the time."""
     from matplotlib.figure import Figure  # not needed on a robot, and slow to load
     figure = Figure(figsize=inches, layout='constrained')
-    return figure, figure.subplots(rows, columns, squeeze=False, sharex=heights is not None,
-                                   gridspec_kw={'height_ratios': heights} if heights else None)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=heights is not None,
+                             gridspec_kw={'height_ratios': heights} if heights else None)
+    for axes in panels.flat:
+        axes.grid(alpha=0.3)
+    return figure, panels
 
 
 def _draw_dots(axes: Any, across: Array, up: Array, shade: Array | None,

@@ -29,20 +29,21 @@ from gyro_calibration.calibration.self_calibration import (
     self_calibrate,
     usual_reference,
 )
-from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING, Turns
+from gyro_calibration.calibration.whole_turns import calibrate_turns, MARKING
 from gyro_calibration.cli.plots import draw_run
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
+    add_picture,
     Answer,
     not_negative,
     output_of,
-    picture_file,
     read,
     time_of,
     UsageError,
     verb,
     with_origin,
+    written,
 )
 from gyro_calibration.heading.log_compensation import compensate_log, none_plausible, plausible
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, Mask
@@ -78,8 +79,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
         parser.add_argument(f'--reference-{name}', type=not_negative, metavar='X',
                             help=f'standard deviation of {what} of the reference, '
                             f'or of the driven profile, {unit}{default}')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE',
-                        help='draw the run, and its heading error before and after, .png or .svg')
+    add_picture(parser, 'the run, and its heading error before and after')
     parser.add_argument('--out', metavar='MODEL.yaml',
                         help='write the model with this self-calibration')
     return parser
@@ -126,7 +126,8 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
                              reference=_goodness(given, motion), output=output[run],
                              prior=model.prior)
     if given.picture:
-        draw_run(given.picture, time[run] - _late(fit), rates[run],
+        late = 0.0 if math.isnan(fit.time_offset) else fit.time_offset
+        draw_run(given.picture, time[run] - late, rates[run],
                  (rates[run] - fit.bias) / (1.0 + fit.scale_factor_error), motion)
     rest = rest_after(time[known], rates[known], fit, motion)
     check = (None if rest is None
@@ -134,11 +135,6 @@ def _of_motion(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     fit = fit if check is None else check.fit
     return _answer(given, model, log, fit, run, given.method, _figures(fit, check),
                    list(_sentences(fit, check, given.method)))
-
-
-def _late(fit: Fit) -> float:
-    """Return by how much the gyro lags the motion, s; 0 for a method that does not find it."""
-    return 0.0 if math.isnan(fit.time_offset) else fit.time_offset
 
 
 def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
@@ -149,9 +145,14 @@ def _of_turns(given: argparse.Namespace, model: GyroModel, log: Log) -> Answer:
     found = calibrate_turns(time[known], rates[known],
                             None if given.turns == NEAREST else given.turns, noise=model.noise,
                             marking=marking, output=output[known])
+    way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
+    before, after = found.rests
     data = {'turns': found.turns, 'turning_s': found.duration, 'rests_s': list(found.rests),
             'marking_rad': marking}
-    return _answer(given, model, log, found.fit, known, 'turns', data, [_turned(found, marking)])
+    return _answer(given, model, log, found.fit, known, 'turns', data, [
+        f'{abs(found.turns)} full turns {way} in {found.duration:.1f} s, between standstills '
+        f'of {before:.1f} and {after:.1f} s; standard deviation of the mark '
+        f'{marking / DEGREE:g} deg.'])
 
 
 def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
@@ -160,14 +161,6 @@ def _plausible(given: argparse.Namespace, model: GyroModel, log: Log) -> Mask:
     if not found.any() and np.isfinite(np.asarray(log.output)).any():
         raise DataRefused(f'{given.log}: {none_plausible(model)}')
     return found
-
-
-def _turned(found: Turns, marking: float) -> str:
-    way = 'counter-clockwise' if found.turns > 0 else 'clockwise'
-    before, after = found.rests
-    return (f'{abs(found.turns)} full turns {way} in {found.duration:.1f} s, between standstills '
-            f'of {before:.1f} and {after:.1f} s; standard deviation of the mark '
-            f'{marking / DEGREE:g} deg.')
 
 
 def _goodness(given: argparse.Namespace, motion: Motion) -> Reference:
@@ -187,12 +180,11 @@ def _answer(given: argparse.Namespace, model: GyroModel, log: Log, fit: Fit, use
                          temperature)
     if given.out:
         write_model(given.out, with_self_calibration(with_origin(given, model), calibration))
-    written = [f'Written to {each}.' for each in (given.picture, given.out) if each]
     refused = int(np.count_nonzero(np.isfinite(np.asarray(log.output)) & ~plausible(model, log)))
     remarks = ([f'{refused} rows have an implausible rate or temperature and are not used.']
                if refused else [])
     first = f'{str(calibration)[0].upper()}{str(calibration)[1:]}, from {used.sum()} samples.'
-    return Answer('\n'.join([first, *lines, *remarks, *written]),
+    return Answer('\n'.join([first, *lines, *remarks, *written(given.picture, given.out)]),
                   {**calibration.figures(), 'samples': int(used.sum()),
                    'refused_samples': refused, **data, 'out': given.out})
 

@@ -34,12 +34,13 @@ from gyro_calibration.cli.plots import draw_turn_errors
 from gyro_calibration.cli.progress import under_way
 from gyro_calibration.cli.verb import (
     add_log,
+    add_picture,
     Answer,
     output_of,
-    picture_file,
     positive,
     read,
     verb,
+    written,
 )
 from gyro_calibration.files import digest, write_atomically
 from gyro_calibration.heading.log_compensation import compensate_log
@@ -69,8 +70,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
                         'SI units')
-    parser.add_argument('--picture', type=picture_file, metavar='FILE',
-                        help='draw the errors over the rate, .png or .svg')
+    add_picture(parser, 'the errors over the rate')
     return parser
 
 
@@ -86,9 +86,11 @@ def _turn(given: argparse.Namespace) -> Answer:
         _write(given.out, errors)
     if given.picture:
         draw_turn_errors(given.picture, errors, given.slowest * DEGREE)
-    remarks = [*found.remarks, *errors.remarks, *remarks, *_outlying(found, kept)]
-    written = [f'Written to {path}.' for path in (given.out, given.picture) if path]
-    return Answer('\n'.join([*_text(given, errors, remarks), *written]),
+    remarks = [*found.remarks, *errors.remarks, *remarks]
+    if places := [place for place, good in zip(found.place, kept) if not good]:
+        remarks.append(f'{len(places)} outlying dwells are left out: {listed(places)}')
+    return Answer('\n'.join([*_text(given, errors, remarks),
+                             *written(given.out, given.picture)]),
                   {**_data(given, errors, remarks), **data})
 
 
@@ -140,12 +142,6 @@ def _fitted_to(model: GyroModel, log: str) -> str:
         return '; it was fitted to this log, so these are errors of a fit, not of a prediction'
     return '' if 'sha256' in str(model.origin) else (
         '; if it was fitted to this log, these are errors of a fit, not of a prediction')
-
-
-def _outlying(found: Dwells, kept: Mask) -> Iterator[str]:
-    places = [place for place, good in zip(found.place, kept) if not good]
-    if places:
-        yield f'{len(places)} outlying dwells are left out: {listed(places)}'
 
 
 # bins

@@ -62,6 +62,16 @@ def verb(verbs: Any, name: str, function: Callable[[argparse.Namespace], Answer 
     return parser
 
 
+def add_picture(parser: argparse.ArgumentParser, what: str, option: str = '--picture') -> None:
+    parser.add_argument(option, type=picture_file, metavar='FILE',
+                        help=f'draw {what}, .png or .svg')
+
+
+def written(*files: str | None) -> list[str]:
+    """Return a sentence for each file that was written."""
+    return [f'Written to {each}.' for each in files if each]
+
+
 def add_log(parser: argparse.ArgumentParser, **how: Any) -> None:
     parser.add_argument('log', metavar='LOG', help='file in the log format, .csv or .csv.gz, or a '
                         'ROS 2 recording: folder, .mcap or .db3', **how)
@@ -152,10 +162,12 @@ def picture_file(text: str) -> str:
 
 def read(given: argparse.Namespace) -> Log:
     """Read the log that a verb was given, as its options say."""
-    if is_recording(given.log):
-        log = _recorded(given)
-    else:
-        with bytes_of(given.log) as on_progress:
+    with bytes_of(given.log) as on_progress:
+        if is_recording(given.log):
+            topics = Topics(given.topic, given.reference_topic, given.temperature_topic,
+                            given.axis)
+            log = read_recording(given.log, topics, given.rate, on_progress, say)
+        else:
             log = read_log(given.log, sensitivity(given), given.rate, given.names, given.axis,
                            on_progress)
     if given.unwrap and log.reference_heading is not None:
@@ -221,13 +233,6 @@ def read_blocks(given: argparse.Namespace) -> Iterator[Log]:
                                  on_progress=on_progress, columns=given.names, axis=given.axis)
         for log in _inside(given, blocks):
             yield _turned(given, log)
-
-
-def _recorded(given: argparse.Namespace) -> Log:
-    """Read a recording, and print on standard error what was used and corrected."""
-    topics = Topics(given.topic, given.reference_topic, given.temperature_topic, given.axis)
-    with bytes_of(given.log) as on_progress:
-        return read_recording(given.log, topics, given.rate, on_progress, say)
 
 
 def sensitivity(given: argparse.Namespace) -> float | None:

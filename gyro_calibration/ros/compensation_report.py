@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 
-from gyro_calibration.heading.heading_estimator import HeadingEstimator
 from gyro_calibration.logs.log import DEGREE
 from gyro_calibration.ros.calibration_session import BLIND, Run, STANDING_TIME
 from gyro_calibration.ros.clock import Clock
@@ -75,17 +74,9 @@ class CompensationReport:
                    for channel in estimator.missing(pipeline.journal.channels)]
         others = (pipeline.session.warning, store.hint, store.shared_hint, monitor.bias_alarm,
                   monitor.noise_alarm, estimator.sentence, store.table_hint)
-        warnings = [*self._counted(growing), *_temperature(estimator), *missing,
-                    *filter(None, others)]
-        if warnings:
-            return WARN, warnings[0]
-        tracked = pipeline.estimator.tracker.slowest_noticed > 0.0
-        return OK, 'heading goes on' + ('' if tracked else '; the bias is not estimated at rest')
-
-    def _counted(self, growing: set[str]) -> list[str]:
-        low, high = self._pipeline.estimator.model.temperature_range
-        event = self._pipeline.journal.event
-        texts = {
+        low, high = estimator.model.temperature_range
+        event = pipeline.journal.event
+        counted = {
             'restarts': event, 'repeated_stamps': event, 'refused_samples': event,
             'refused_temperatures': event,
             'lost_samples': 'samples are lost: check the cable, the baud rate and the load of '
@@ -96,12 +87,30 @@ class CompensationReport:
             'temperature_clipped': f'the temperature is outside the calibrated {low:g} to '
                                    f'{high:g} degC; the correction is extrapolated, and its '
                                    'variance increases'}
-        return [text for name, text in texts.items() if name in growing]
+        temperature = ''
+        if estimator.temperature is None and estimator.model.looks_at('temperature'):
+            temperature = ('no temperature comes; the model is used at its reference temperature '
+                           f'of {estimator.model.reference_temperature:g} degC')
+        elif estimator.temperature is not None and estimator.temperature_is_lost:
+            temperature = (f'no temperature comes any more; the last one, '
+                           f'{estimator.temperature:.1f} degC, is held, and the standard '
+                           'deviation of the bias increases')
+        warnings = [*(text for name, text in counted.items() if name in growing),
+                    *filter(None, (temperature, *missing, *others))]
+        if warnings:
+            return WARN, warnings[0]
+        tracked = pipeline.estimator.tracker.slowest_noticed > 0.0
+        return OK, 'heading goes on' + ('' if tracked else '; the bias is not estimated at rest')
 
     def _values(self, rate: float) -> dict[str, object]:
         """Return all that is known, by name; `rate` of the samples in Hz."""
         pipeline, date = self._pipeline, self._clock.date()
         estimator, journal, store = pipeline.estimator, pipeline.journal, pipeline.store
+        tracker = estimator.tracker
+        heading_deviation = (math.sqrt(tracker.variance) / DEGREE
+                             if estimator.model.noise.angle_random_walk > 0.0 else math.nan)
+        low, high = estimator.model.temperature_range
+        needed = estimator.model.looks_at('temperature')
         calibration = estimator.model.self_calibration
         age = f'{estimator.age(date) / 3600.0:.2f}' if calibration else ''
         written = '' if store.written is None else f'{(date - store.written) / 60.0:.1f}'
@@ -109,9 +118,15 @@ class CompensationReport:
         return {
             **journal.counts, 'rate_hz': f'{rate:.1f}',
             'longest_gap_s': f'{estimator.tracker.intervals.longest:.3f}',
-            'clock_steps': journal.clock_steps, **_heading(estimator), **self._rest(),
+            'clock_steps': journal.clock_steps,
+            'heading_deg': f'{tracker.heading / DEGREE:.3f}',
+            'heading_standard_deviation_deg': f'{heading_deviation:.3f}',
+            'deleted_heading_deg': f'{tracker.deleted / DEGREE:.3f}', **self._rest(),
             **(calibration.figures() if calibration else {}), 'calibration_age_h': age,
-            'calibration_now': estimator.sentence, **_temperatures(estimator),
+            'calibration_now': estimator.sentence,
+            'temperature_degc': '' if estimator.temperature is None
+            else f'{estimator.temperature:.2f}',
+            'temperature_range_degc': f'{low:g} to {high:g}' if needed else '',
             'command_lateness_s': f'{commands:.3f}', 'sample_lateness_s': f'{samples:.3f}',
             'refused_calibrations': journal.refused, 'refusals': ' | '.join(journal.reasons),
             'bias_table_entries': len(estimator.table.entries),
@@ -140,34 +155,6 @@ class CompensationReport:
             if unseen else '',
             'wheels': {True: 'moving', False: 'standing', None: 'unknown'}[moving],
             'wheels_age_s': f'{age:.2f}' if math.isfinite(age) else ''}
-
-
-def _temperature(estimator: HeadingEstimator) -> list[str]:
-    """Return what is wrong with the temperature."""
-    if estimator.temperature is None:
-        reference = estimator.model.reference_temperature
-        text = (f'no temperature comes; the model is used at its reference temperature of '
-                f'{reference:g} degC')
-        return [text] if estimator.model.looks_at('temperature') else []
-    text = (f'no temperature comes any more; the last one, {estimator.temperature:.1f} degC, is '
-            'held, and the standard deviation of the bias increases')
-    return [text] if estimator.temperature_is_lost else []
-
-
-def _heading(estimator: HeadingEstimator) -> dict[str, object]:
-    tracker, noise = estimator.tracker, estimator.model.noise.angle_random_walk
-    deviation = math.sqrt(tracker.variance) / DEGREE if noise > 0.0 else math.nan
-    return {'heading_deg': f'{tracker.heading / DEGREE:.3f}',
-            'heading_standard_deviation_deg': f'{deviation:.3f}',
-            'deleted_heading_deg': f'{tracker.deleted / DEGREE:.3f}'}
-
-
-def _temperatures(estimator: HeadingEstimator) -> dict[str, object]:
-    low, high = estimator.model.temperature_range
-    now = '' if estimator.temperature is None else f'{estimator.temperature:.2f}'
-    needed = estimator.model.looks_at('temperature')
-    return {'temperature_degc': now,
-            'temperature_range_degc': f'{low:g} to {high:g}' if needed else ''}
 
 
 def _monitored(monitor: HealthMonitor) -> dict[str, object]:

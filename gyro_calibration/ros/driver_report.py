@@ -12,11 +12,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 
 from gyro_calibration.driver.connection import Connection, Counts
-from gyro_calibration.driver.protocols import Protocol, Sample, Settings
-from gyro_calibration.driver.timestamps import SampleClock
+from gyro_calibration.driver.protocols import Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, Report, WARN
 
 _LEAST_TIME = 0.5  # s; a rate over less is not meaningful
@@ -71,64 +70,15 @@ class DriverReport:
 
     def make(self) -> Report:
         """Return level, message and values."""
-        counts = self._count()
-        return *self._evaluate(), {
-            **self._of_the_port(),
-            **vars(counts),
-            'rate_hz': f'{self._rate:.1f}',
-            'longest_gap_s': f'{self._connection.longest_gap:.3f}',
-            'clock_steps': self._clock_steps,
-            **self._of_the_clock(),
-            **self._of_the_gyro(),
-            'last_event': self.event,
-        }
-
-    def _count(self) -> Counts:
-        """Return the counts, and keep by how much they have grown in the last second."""
-        counts, now = self._connection.counts(), self._clock()
+        counts, now, connection = self._connection.counts(), self._clock(), self._connection
         elapsed = now - self._last_time
         if elapsed >= _LEAST_TIME:
             self._grown = {name: count - getattr(self._last, name)
                            for name, count in vars(counts).items()}
             self._rate = self._grown.pop('samples') / elapsed
             self._last, self._last_time = counts, now
-        return counts
-
-    def _evaluate(self) -> tuple[bytes, str]:
-        state = self._connection.state
-        if state.name == 'failed':
-            return ERROR, state.problem
-        if state.name != 'reading':
-            return WARN, _OPENING[state.name]
-        warnings = list(self._losses())
-        protocol, clock = self._connection.protocol, self._connection.clock
-        if protocol is not None and clock is not None:
-            warnings += [*self._ill_health(protocol), *self._wrong_rate(protocol, clock)]
-        return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
-            OK, 'samples come')
-
-    def _losses(self) -> Iterator[str]:
-        worst = ', '.join(f'{name.replace("_", " ")} {count}'
-                          for name, count in self._grown.items() if count > 0)
-        if worst:
-            yield f'in the last second there were: {worst}'
-
-    def _ill_health(self, protocol: Protocol) -> Iterator[str]:
-        for name, (low, high) in protocol.good.items():
-            value = self._health.get(name)
-            if value is not None and not low <= value <= high:
-                yield (f'{name} is {value:.4g}, but should be from {low:g} to {high:g}: check the '
-                       'supply, then have the gyro checked')
-
-    def _wrong_rate(self, protocol: Protocol, clock: SampleClock) -> Iterator[str]:
-        """Yield a warning where rates are wrong by the factor of the interval."""
-        warning = protocol.wrong_rate(self._settings, clock.period) if clock.is_settled else ''
-        if warning:
-            yield warning
-
-    def _of_the_port(self) -> dict[str, object]:
-        connection = self._connection
-        return {
+        last = self._temperature  # which the other thread may drop meanwhile
+        return *self._evaluate(), {
             'port': self._port,
             'device': connection.path,
             'state': connection.state.name,
@@ -139,7 +89,36 @@ class DriverReport:
             'waiting_s': f'{connection.state.waiting:.1f}',
             'waited_s': f'{connection.waited:.1f}',
             'last_error': connection.last_error,
+            **vars(counts),
+            'rate_hz': f'{self._rate:.1f}',
+            'longest_gap_s': f'{self._connection.longest_gap:.3f}',
+            'clock_steps': self._clock_steps,
+            **self._of_the_clock(),
+            **({} if last is None else {'temperature_degc': f'{last:.2f}'}),
+            **{name: f'{value:.4g}' for name, value in self._health.items()},
+            'last_event': self.event,
         }
+
+    def _evaluate(self) -> tuple[bytes, str]:
+        state = self._connection.state
+        if state.name == 'failed':
+            return ERROR, state.problem
+        if state.name != 'reading':
+            return WARN, _OPENING[state.name]
+        grown = [f'{name.replace("_", " ")} {count}'
+                 for name, count in self._grown.items() if count > 0]
+        warnings = [f'in the last second there were: {", ".join(grown)}'] if grown else []
+        protocol, clock = self._connection.protocol, self._connection.clock
+        if protocol is not None and clock is not None:
+            for name, (low, high) in protocol.good.items():
+                value = self._health.get(name)
+                if value is not None and not low <= value <= high:
+                    warnings.append(f'{name} is {value:.4g}, but should be from {low:g} to '
+                                    f'{high:g}: check the supply, then have the gyro checked')
+            if clock.is_settled and (wrong := protocol.wrong_rate(self._settings, clock.period)):
+                warnings.append(wrong)
+        return (WARN, f'samples come, but {"; ".join(warnings)}') if warnings else (
+            OK, 'samples come')
 
     def _of_the_clock(self) -> dict[str, str]:
         clock, protocol = self._connection.clock, self._connection.protocol
@@ -151,8 +130,3 @@ class DriverReport:
             'jitter_before_ms': f'{1e3 * clock.jitter_before:.3g}',
             'jitter_after_ms': f'{1e3 * clock.jitter_after:.3g}',
         }
-
-    def _of_the_gyro(self) -> dict[str, str]:
-        last = self._temperature  # which the other thread may drop meanwhile
-        temperature = {} if last is None else {'temperature_degc': f'{last:.2f}'}
-        return temperature | {name: f'{value:.4g}' for name, value in self._health.items()}

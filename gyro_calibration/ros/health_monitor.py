@@ -20,7 +20,7 @@ alarms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 
 from gyro_calibration.files import LARGEST
@@ -80,13 +80,6 @@ class Rest:
     announced: bool
 
 
-@dataclass
-class _Gathered:
-    time: list[float] = field(default_factory=list)
-    output: list[float] = field(default_factory=list)
-    rate: list[float] = field(default_factory=list)
-
-
 class HealthMonitor:
     """
     Compare noise and bias at rest with the model, on a robot.
@@ -115,7 +108,7 @@ class HealthMonitor:
         self._noise, self.standing = noise, standing
         # Four ways to alarm: noise or bias, upwards or downwards.
         self._level = 0.25 * false_alarms * STRETCH / 3600.0
-        self._gathered = _Gathered()
+        self._gathered: list[tuple[float, float, float]] = []
         self._rests: list[Rest] = []
         self._step = math.inf
         self.noise_alarm = self.bias_alarm = ''
@@ -129,7 +122,7 @@ class HealthMonitor:
 
     def restart(self) -> None:
         """Drop the samples gathered so far, as after a gap."""
-        self._gathered = _Gathered()
+        self._gathered = []
 
     def recalibrated(self) -> None:
         """Drop the past biases, as another calibration is in use."""
@@ -152,14 +145,10 @@ class HealthMonitor:
         whether a stretch is complete, and `examine` is to be called
 
         """
-        gathered = self._gathered
-        if gathered.time and not 0.0 < time - gathered.time[-1] <= _GAP:
+        if self._gathered and not 0.0 < time - self._gathered[-1][0] <= _GAP:
             self.restart()
-            gathered = self._gathered
-        gathered.time.append(time)
-        gathered.output.append(output)
-        gathered.rate.append(rate)
-        return time - gathered.time[0] >= STRETCH
+        self._gathered.append((time, output, rate))
+        return time - self._gathered[0][0] >= STRETCH
 
     def examine(self, bias_variance: float, age: float, announced: bool = False) -> Rest | None:
         """
@@ -176,7 +165,7 @@ class HealthMonitor:
         the result; None where the rate is not steady, which is no rest
 
         """
-        time, output, rate = (np.array(values) for values in vars(self._gathered).values())
+        time, output, rate = np.array(self._gathered).T
         self.restart()
         if np.ptp(output) > 0.0:
             self._step = min(self._step, quantization_step(output))
@@ -189,24 +178,26 @@ class HealthMonitor:
         return rest
 
     def _set_alarms(self, rest: Rest) -> None:
+        last, several = self._rests, len(self._rests) == _IN_A_ROW
+        biases = [each.bias for each in last]
+        # the mean was the same in the last stretches, unlike that of turns
+        stays = max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in last)
         if rest.noise_fits:
             self.noise_alarm = ''
-        elif rest.announced or self._in_a_row('noise_fits'):
-            self.noise_alarm = _noise_sentence(rest)
+        elif rest.announced or several and not any(each.noise_fits for each in last):
+            remedy = ('record a log at rest, and run allan or diagnose on it'
+                      if rest.noise_ratio > 1.0 else 'check that the gyro responds to turns')
+            shaken = ('' if rest.announced or rest.noise_ratio < 1.0
+                      else ', or the robot vibrates')
+            self.noise_alarm = (f'the noise at rest is {rest.noise_ratio:.2f} times that of the '
+                                f'model{shaken}: {remedy}')
         if rest.bias_fits:
             self.bias_alarm = ''
         elif (rest.announced or abs(rest.bias) < self.standing
-              or self._in_a_row('bias_fits') and self._stays()):
-            self.bias_alarm = _bias_sentence(rest)
-
-    def _in_a_row(self, fits: str) -> bool:
-        return (len(self._rests) == _IN_A_ROW
-                and not any(getattr(each, fits) for each in self._rests))
-
-    def _stays(self) -> bool:
-        """Return whether the mean was the same in the last stretches, unlike that of turns."""
-        biases = [each.bias for each in self._rests]
-        return max(biases) - min(biases) < 6.0 * max(each.bias_deviation for each in self._rests)
+              or several and stays and not any(each.bias_fits for each in last)):
+            self.bias_alarm = (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, '
+                               f'{rest.sigmas:.0f} sigma of the model: calibrate, and if this '
+                               'occurs again, diagnose a log')
 
 
 def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
@@ -240,7 +231,9 @@ def examine(time: Array, output: Array, rate: Array, noise: Noise, level: float,
     sample_variance = noise.allan_variance(interval)
     hidden = step > 2.0 * math.sqrt(sample_variance)
     rounding = step * step * (0.25 if hidden else 1.0 / 12.0) / size
-    squares = _differences(output, size)
+    # differences of means over neighbouring blocks, each block used once
+    blocks = output[:len(output) // (2 * size) * 2 * size].reshape(-1, 2, size).mean(axis=2)
+    squares = (blocks[:, 1] - blocks[:, 0]) ** 2
     measured, claimed = 0.5 * float(np.mean(squares)), noise.allan_variance(size * interval)
     largest = max(measured, claimed + rounding)
     if not _steady(time, rate, largest * size * interval, noise):
@@ -262,12 +255,6 @@ def _bias(time: Array, rate: Array, spectrum: float, noise: Noise, level: float,
     sigmas = max(abs(mean) - unsure, 0.0) / math.sqrt(variance) if variance > 0.0 else math.nan
     fits = not math.erfc(sigmas / math.sqrt(2.0)) < 2.0 * level
     return mean, sigmas, fits, math.sqrt(of_noise + noise.wander(duration, duration))
-
-
-def _differences(output: Array, size: int) -> Array:
-    """Return the squared differences of means over neighbouring blocks, each block used once."""
-    blocks = output[:len(output) // (2 * size) * 2 * size].reshape(-1, 2, size).mean(axis=2)
-    return np.asarray((blocks[:, 1] - blocks[:, 0]) ** 2)
 
 
 def _steady(time: Array, rate: Array, spectrum: float, noise: Noise) -> bool:
@@ -305,16 +292,3 @@ def changed(before: SelfCalibration, after: SelfCalibration, noise: Noise, age: 
         if math.erfc(size / math.sqrt(2.0)) < 0.5 * level]
     return (f'{" and ".join(found)}, more than the model predicts; '
             'if this occurs again, diagnose a log' if found else '')
-
-
-def _noise_sentence(rest: Rest) -> str:
-    remedy = ('record a log at rest, and run allan or diagnose on it' if rest.noise_ratio > 1.0
-              else 'check that the gyro responds to turns')
-    shaken = '' if rest.announced or rest.noise_ratio < 1.0 else ', or the robot vibrates'
-    return (f'the noise at rest is {rest.noise_ratio:.2f} times that of the model{shaken}: '
-            f'{remedy}')
-
-
-def _bias_sentence(rest: Rest) -> str:
-    return (f'at rest the corrected rate is {rest.bias / DEGREE:.4f} deg/s, {rest.sigmas:.0f} '
-            'sigma of the model: calibrate, and if this occurs again, diagnose a log')

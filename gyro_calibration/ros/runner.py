@@ -77,6 +77,7 @@ ENDING = 10.0
 """A node that has not ended after this time is killed, s."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNAL_SEEN = 0.2  # s; a signal is seen after this time at the latest
 
 
 def publish_on(node: Node, kind: type, topic: str, qos: QoSProfile = PUBLISHED_QOS) -> Publisher:
@@ -131,23 +132,19 @@ def declare(node: Node, table: Sequence[Parameter],
             changed(current())
 
     for each in table:
-        _declare(node, each)
+        # with any type first: rclpy refuses 100 for 100.0, and in several sentences
+        several = not isinstance(each.default, (bool, int, float, str))
+        default = list(each.default) if several else each.default  # type: ignore[arg-type]
+        given = node.declare_parameter(each.name, default,
+                                       ParameterDescriptor(dynamic_typing=True)).value
+        node.undeclare_parameter(each.name)
+        node.declare_parameter(each.name, each.check(given), _descriptor(each),
+                               ignore_override=True)
     after = hasattr(node, 'add_post_set_parameters_callback')  # not in Humble
     node.add_on_set_parameters_callback(check)
     if after:
         node.add_post_set_parameters_callback(use)
     return current()
-
-
-def _declare(node: Node, parameter: Parameter) -> None:
-    """Declare with any type first: rclpy refuses 100 for 100.0, and in several sentences."""
-    several = not isinstance(parameter.default, (bool, int, float, str))
-    default = list(parameter.default) if several else parameter.default  # type: ignore[arg-type]
-    given = node.declare_parameter(parameter.name, default,
-                                   ParameterDescriptor(dynamic_typing=True)).value
-    node.undeclare_parameter(parameter.name)
-    value = parameter.check(given)
-    node.declare_parameter(parameter.name, value, _descriptor(parameter), ignore_override=True)
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -189,10 +186,17 @@ def run(node_class: Callable[[], Node]) -> int:
         standard error.
 
     """
-    stop = _stop_on_signals()
+    stop = threading.Event()
+    for number in _SIGNALS:
+        signal.signal(number, lambda *_: stop.set())
     try:
-        node = _start(node_class)
-        if node is None:
+        try:
+            rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+            node = node_class()
+        # rclpy raises RuntimeError where an argument cannot be parsed, and ParameterException
+        # where a parameter of its own is not possible
+        except (ValueError, OSError, RuntimeError, ParameterException) as error:
+            print(f'{node_class.__name__}: {error}', file=sys.stderr)
             return 2
         spin(node, stop)
         return 0
@@ -201,35 +205,6 @@ def run(node_class: Callable[[], Node]) -> int:
         # Ctrl-C under a launch file comes twice; the second would kill the interpreter at its end.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
-
-
-def _start(node_class: Callable[[], Node]) -> Node | None:
-    try:
-        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-        return node_class()
-    # rclpy raises RuntimeError where an argument cannot be parsed, and ParameterException where a
-    # parameter of its own is not possible
-    except (ValueError, OSError, RuntimeError, ParameterException) as error:
-        print(f'{node_class.__name__}: {error}', file=sys.stderr)
-        return None
-
-
-def _stop_on_signals() -> threading.Event:
-    """
-    Return an event that SIGINT and SIGTERM set.
-
-    rclpy's own handlers invalidate the context while a callback still publishes, which ends some
-    runs in a traceback.
-
-    """
-    stop = threading.Event()
-    for number in _SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
-    return stop
-
-
-#: A signal is seen after this time at the latest, s.
-_SIGNAL_SEEN = 0.2
 
 
 def answer_later(service: Service) -> None:
@@ -250,24 +225,16 @@ def answer_later(service: Service) -> None:
     service.send_response = send_when_done  # type: ignore[method-assign]
 
 
-def _executor() -> Executor:
-    """
-    Return the events executor, which takes half of the processor time, where there is one.
-
-    It awaits no ``async`` callback and passes no message information before rclpy 7.1.11 (Jazzy);
-    the nodes use neither.
-
-    """
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:  # Humble
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
 def spin(node: Node, stop: threading.Event) -> None:
     """Serve the callbacks of a node until an event is set, then close it."""
-    serving = _executor()
+    serving: Executor
+    try:
+        # It takes half of the processor time. It awaits no ``async`` callback and passes no
+        # message information before rclpy 7.1.11 (Jazzy); the nodes use neither.
+        from rclpy.experimental import EventsExecutor
+        serving = EventsExecutor()
+    except ImportError:  # Humble
+        serving = SingleThreadedExecutor()
     serving.add_node(node)
     try:
         # A node has a timer, after which a signal is seen. For this executor a time-out is one

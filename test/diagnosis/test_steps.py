@@ -8,7 +8,6 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Experiments that distinguish causes: the table of pairs, with the numbers of the log."""
 """How far a diagnosis is: never less than before, and within the step that is under way."""
 
 from gyro_calibration.diagnosis.steps import Steps
