@@ -44,8 +44,9 @@ def element(name: str, *children: str | None, **attributes: str | float | None) 
     attributes : with _ for -, and one at the end to avoid a word of Python; None is left out
 
     """
-    given = {key.rstrip('_').replace('_', '-'): _text(value) for key, value in attributes.items()
-             if value is not None}
+    given = {key.rstrip('_').replace('_', '-'): value if isinstance(value, str)
+             else f'{value:.2f}'.rstrip('0').rstrip('.')
+             for key, value in attributes.items() if value is not None}
     named = ''.join(f' {key}="{_escaped(value)}"' for key, value in given.items())
     inside = ''.join(child if isinstance(child, Markup) else _escaped(child) for child in children
                      if child is not None)
@@ -55,10 +56,6 @@ def element(name: str, *children: str | None, **attributes: str | float | None) 
 def joined(*parts: str) -> Markup:
     """Return parts one after the other, texts escaped."""
     return Markup(''.join(part if isinstance(part, Markup) else _escaped(part) for part in parts))
-
-
-def _text(value: str | float) -> str:
-    return value if isinstance(value, str) else f'{value:.2f}'.rstrip('0').rstrip('.')
 
 
 def _escaped(text: str) -> str:
@@ -140,10 +137,20 @@ class _Axis:
         return np.asarray(self.begin + (scaled - low) / (high - low) * (self.end - self.begin))
 
     def ticks(self, count: int) -> list[tuple[float, str]]:
-        """Return about so many values with their labels."""
+        """Return about so many values with their labels: round, of degrees parts of a turn."""
         if self.logarithmic:
-            return _logarithmic_ticks(self.low, self.high, count)
-        step = _step((self.high - self.low) / count, self.unit)
+            powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+            every = max(1, math.ceil((len(powers) - 2) / count))
+            ticks = [(part * 10.0 ** power, f'{part * 10.0 ** power:g}' if -4 < power < 5
+                      else f'{"" if part == 1 else f"{part} × "}10{raised(power)}')
+                     for power in powers if power % every == 0
+                     for part in ((1, 2, 5) if len(powers) < 4 else (1,))]
+            return [tick for tick in ticks if self.low <= tick[0] <= self.high]
+        least = (self.high - self.low) / count
+        power = 10.0 ** math.floor(math.log10(least))
+        steps = ((30.0, 45.0, 90.0, 180.0, 360.0) if self.unit == 'deg' and 20.0 < least <= 360.0
+                 else (power, 2.0 * power, 5.0 * power, 10.0 * power))
+        step = next(step for step in steps if step >= least * (1.0 - 1e-9))
         decimals = max(0, -math.floor(math.log10(step) + 1e-9))
         values = step * np.arange(math.ceil(self.low / step - 1e-9),
                                   math.floor(self.high / step + 1e-9) + 1)
@@ -151,36 +158,29 @@ class _Axis:
                 for value in values]
 
 
-def _logarithmic_ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
-    """Return labelled powers of ten, and values between them where they are less than three."""
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    every = max(1, math.ceil((len(powers) - 2) / count))
-    parts = (1, 2, 5) if len(powers) < 4 else (1,)
-    ticks = [(part * 10.0 ** power, _logarithmic_label(part, power))
-             for power in powers if power % every == 0 for part in parts]
-    return [tick for tick in ticks if low <= tick[0] <= high]
-
-
-def _logarithmic_label(part: int, power: int) -> str:
-    if -4 < power < 5:
-        return f'{part * 10.0 ** power:g}'
-    return f'{"" if part == 1 else f"{part} × "}10{raised(power)}'
-
-
-def _step(least: float, unit: str) -> float:
-    """Return a round step that is not smaller; of degrees, a round part of a turn."""
-    power = 10.0 ** math.floor(math.log10(least))
-    of_a_turn = unit == 'deg' and 20.0 < least <= 360.0
-    steps = ((30.0, 45.0, 90.0, 180.0, 360.0) if of_a_turn
-             else (power, 2.0 * power, 5.0 * power, 10.0 * power))
-    return next(step for step in steps if step >= least * (1.0 - 1e-9))
-
-
 def draw(chart: Chart) -> Markup:
     """Return a chart with its legend, its table of values, and a cursor for the values."""
-    if not any(_shown(chart, line).any() for line in chart.lines):
+    shown = [_shown(chart, line) for line in chart.lines]
+    if not any(each.any() for each in shown):
         return element('p', f'{chart.title}: there is nothing to draw.', class_='quiet')
-    return element('figure', element('figcaption', chart.title), _picture(chart), _legend(chart),
+    names = (_labelled(chart.across, chart.across_unit), _labelled(chart.up, chart.up_unit))
+    across, up = _axes(chart, shown)
+    at, marks, dots = across.place(chart.at), [], []
+    for line, known in zip(chart.lines, shown):
+        places = up.place(line.values)
+        marks.append(_line(line, at, places, up, known))
+        # the script moves these to the values pointed at; they are hidden without it
+        dots.append(element('circle', r=4.5, class_=line.style,
+                            data_up=_places(np.where(known, places, np.nan))))
+    picture = element(
+        'svg', element('title', chart.title, id=f'{chart.name}-title'),
+        element('desc', chart.description, id=f'{chart.name}-description'),
+        *_grid(names, across, up), *marks,
+        element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor'),
+        viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
+        aria_labelledby=f'{chart.name}-title {chart.name}-description', data_at=_places(at))
+    return element('figure', element('figcaption', chart.title), picture,
+                   element('ul', *map(_entry, chart.lines), class_='legend'),
                    element('p', chart.description, class_='readout', aria_live='polite'),
                    _table(chart), class_='chart')
 
@@ -190,24 +190,18 @@ def _shown(chart: Chart, line: Line) -> Mask:
     return known & (chart.at > 0.0) & (line.values > 0.0) if chart.logarithmic else known
 
 
-def _axes(chart: Chart) -> tuple[_Axis, _Axis]:
-    at = np.concatenate([chart.at[_shown(chart, line)] for line in chart.lines])
-    ends = np.concatenate([_ends(chart, line) for line in chart.lines])
-    return (_Axis(*_room(at, chart.logarithmic, 0.0), _LEFT, _RIGHT,
+def _axes(chart: Chart, shown: Sequence[Mask]) -> tuple[_Axis, _Axis]:
+    """Return the axes; zero is always seen, but not where there is none."""
+    at, ends = [], [] if chart.logarithmic else [np.zeros(1)]
+    for line, known in zip(chart.lines, shown):
+        deviation = (0.0 if line.deviation is None or chart.logarithmic
+                     else _BAND * np.nan_to_num(line.deviation))
+        at.append(chart.at[known])
+        ends += [(line.values - deviation)[known], (line.values + deviation)[known]]
+    return (_Axis(*_room(np.concatenate(at), chart.logarithmic, 0.0), _LEFT, _RIGHT,
                   chart.logarithmic, chart.across_unit),
-            _Axis(*_room(ends, chart.logarithmic, 0.06), _BOTTOM, _TOP,
+            _Axis(*_room(np.concatenate(ends), chart.logarithmic, 0.06), _BOTTOM, _TOP,
                   chart.logarithmic, chart.up_unit))
-
-
-def _ends(chart: Chart, line: Line) -> Array:
-    """Return all that must be seen of a line; zero is always seen, but not where there is none."""
-    shown = _shown(chart, line)
-    if chart.logarithmic:
-        return line.values[shown]
-    deviation = (np.zeros(len(shown)) if line.deviation is None
-                 else _BAND * np.nan_to_num(line.deviation))
-    return np.concatenate([[0.0], (line.values - deviation)[shown],
-                           (line.values + deviation)[shown]])
 
 
 def _room(values: Array, logarithmic: bool, margin: float) -> tuple[float, float]:
@@ -220,23 +214,11 @@ def _room(values: Array, logarithmic: bool, margin: float) -> tuple[float, float
     return low - margin * (high - low), high + margin * (high - low)
 
 
-def _picture(chart: Chart) -> Markup:
-    across, up = _axes(chart)
-    at = across.place(chart.at)
-    marks = [_line(line, at, up, _shown(chart, line)) for line in chart.lines]
-    named = f'{chart.name}-title {chart.name}-description'
-    return element('svg', element('title', chart.title, id=f'{chart.name}-title'),
-                   element('desc', chart.description, id=f'{chart.name}-description'),
-                   *_grid(chart, across, up), *marks, _cursor(chart, at, up),
-                   viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
-                   aria_labelledby=named, data_at=_places(at))
-
-
 def _places(values: Array) -> str:
     return ' '.join(f'{value:.1f}' if math.isfinite(value) else '-' for value in values)
 
 
-def _grid(chart: Chart, across: _Axis, up: _Axis) -> Iterator[Markup]:
+def _grid(names: tuple[str, str], across: _Axis, up: _Axis) -> Iterator[Markup]:
     for value, label in across.ticks(6):
         x = float(across.place(np.array(value)))
         yield element('line', x1=x, x2=x, y1=_TOP, y2=_BOTTOM, class_='grid')
@@ -246,55 +228,36 @@ def _grid(chart: Chart, across: _Axis, up: _Axis) -> Iterator[Markup]:
         yield element('line', x1=_LEFT, x2=_RIGHT, y1=y, y2=y,
                       class_='zero' if value == 0.0 else 'grid')
         yield element('text', label, x=_LEFT - 5.0, y=y + 4.0, text_anchor='end')
-    yield element('text', _labelled(chart.across, chart.across_unit), x=0.5 * (_LEFT + _RIGHT),
-                  y=_HEIGHT - 6.0, text_anchor='middle', class_='label')
-    yield element('text', _labelled(chart.up, chart.up_unit), x=4.0, y=13.0, class_='label')
+    yield element('text', names[0], x=0.5 * (_LEFT + _RIGHT), y=_HEIGHT - 6.0,
+                  text_anchor='middle', class_='label')
+    yield element('text', names[1], x=4.0, y=13.0, class_='label')
 
 
 def _labelled(name: str, unit: str) -> str:
     return f'{name} [{unit}]' if unit else name
 
 
-def _line(line: Line, at: Array, up: _Axis, shown: Mask) -> Markup:
-    y = up.place(line.values)
-    deviation = None if line.deviation is None else np.nan_to_num(line.deviation)
-    spread = [] if deviation is None else [up.place(line.values + sign * _BAND * deviation)
-                                           for sign in (1.0, -1.0)]
+def _line(line: Line, at: Array, places: Array, up: _Axis, shown: Mask) -> Markup:
+    """Return a line that breaks where there is no value, or dots, with what they deviate by."""
+    x, y = at[shown], places[shown]
+    parts = []
+    if line.deviation is not None:
+        half = _BAND * np.nan_to_num(line.deviation)
+        above, below = (up.place(line.values + side)[shown] for side in (half, -half))
+        corners = [*zip(x, above), *zip(x[::-1], below[::-1])]
+        parts.append(element('path', d=''.join(
+            f'M{each:.1f} {a:.1f}V{b:.1f}' for each, a, b in zip(x, above, below)), class_='bars')
+            if line.dots else element('path', d='M' + 'L'.join(
+                f'{each:.1f} {value:.1f}' for each, value in corners) + 'Z', class_='band'))
     if line.dots:
-        bars = [element('path', d=''.join(f'M{x:.1f} {a:.1f}V{b:.1f}' for x, a, b in
-                                          zip(at[shown], *(each[shown] for each in spread))),
-                        class_='bars')] if spread else []
-        dots = [element('circle', cx=float(x), cy=float(value), r=2.6)
-                for x, value in zip(at[shown], y[shown])]
-        return element('g', *bars, *dots, class_=line.style)
-    band = [element('path', d=_band(at[shown], *(each[shown] for each in spread)),
-                    class_='band')] if spread else []
-    return element('g', *band, element('path', d=_path(at, y, shown), class_='stroke'),
-                   class_=line.style)
-
-
-def _band(at: Array, above: Array, below: Array) -> str:
-    corners = [*zip(at, above), *zip(at[::-1], below[::-1])]
-    return 'M' + 'L'.join(f'{x:.1f} {y:.1f}' for x, y in corners) + 'Z'
-
-
-def _path(at: Array, y: Array, shown: Mask) -> str:
-    """Return a line that breaks where there is no value."""
-    begins = shown & ~np.concatenate([[False], shown[:-1]])
-    return ''.join(f'{"M" if begin else "L"}{x:.1f} {value:.1f}'
-                   for x, value, begin in zip(at[shown], y[shown], begins[shown]))
-
-
-def _cursor(chart: Chart, at: Array, up: _Axis) -> Markup:
-    """Return what the script moves to the values pointed at; hidden without it."""
-    dots = [element('circle', r=4.5, class_=line.style,
-                    data_up=_places(np.where(_shown(chart, line), up.place(line.values), np.nan)))
-            for line in chart.lines]
-    return element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor')
-
-
-def _legend(chart: Chart) -> Markup:
-    return element('ul', *(_entry(line) for line in chart.lines), class_='legend')
+        parts += [element('circle', cx=float(each), cy=float(value), r=2.6)
+                  for each, value in zip(x, y)]
+    else:
+        begins = (shown & ~np.concatenate([[False], shown[:-1]]))[shown]
+        parts.append(element('path', d=''.join(
+            f'{"M" if begin else "L"}{each:.1f} {value:.1f}'
+            for each, value, begin in zip(x, y, begins)), class_='stroke'))
+    return element('g', *parts, class_=line.style)
 
 
 def _entry(line: Line) -> Markup:
@@ -309,24 +272,23 @@ def _entry(line: Line) -> Markup:
 
 
 def _table(chart: Chart) -> Markup:
-    head = element('tr', _head(chart.across, chart.across_unit),
-                   *(_head(line.name, chart.up_unit) for line in chart.lines))
-    rows = [element('tr', element('td', number(float(at), 4)),
-                    *(element('td', _value(line, row)) for line in chart.lines))
-            for row, at in enumerate(chart.at)]
-    table = element('table', element('caption', joined(chart.title, ', ', chart.up)),
-                    element('thead', head), element('tbody', *rows))
+    def value(line: Line, row: int) -> str:
+        """Return a value with the half of its interval."""
+        if not math.isfinite(line.values[row]):
+            return '–'
+        return number(float(line.values[row])) + (
+            '' if line.deviation is None
+            else f' ± {number(_BAND * float(line.deviation[row]), 2)}')
+
+    heads = [(chart.across, chart.across_unit), *((each.name, chart.up_unit)
+                                                  for each in chart.lines)]
+    table = element(
+        'table', element('caption', joined(chart.title, ', ', chart.up)),
+        element('thead', element('tr', *(element(
+            'th', _labelled(name, unit), scope='col', data_name=name, data_unit=unit)
+            for name, unit in heads))),
+        element('tbody', *(element('tr', element('td', number(float(at), 4)), *(
+            element('td', value(line, row)) for line in chart.lines))
+            for row, at in enumerate(chart.at))))
     return element('details', element('summary', 'Values'),
                    element('div', table, class_='scroll', tabindex='0'))
-
-
-def _head(name: str, unit: str) -> Markup:
-    return element('th', _labelled(name, unit), scope='col', data_name=name, data_unit=unit)
-
-
-def _value(line: Line, row: int) -> str:
-    if not math.isfinite(line.values[row]):
-        return '–'
-    spread = ('' if line.deviation is None
-              else f' ± {number(_BAND * float(line.deviation[row]), 2)}')
-    return number(float(line.values[row])) + spread

@@ -115,19 +115,17 @@ def _header(diagnosis: Diagnosis) -> Markup:
                    element('p', _VERDICTS[diagnosis.verdict],
                            class_=f'verdict {diagnosis.verdict}'),
                    None if diagnosis.gain is None else element(
-                       'div', *(_tile(sentence(what).rstrip('.'), errors, unit)
-                                for what, errors, unit in _errors(diagnosis.gain)),
+                       'div', *(_tile(*each) for each in _errors(diagnosis.gain)),
                        class_='tiles'))
 
 
 def _tile(what: str, errors: Change, unit: str) -> Markup:
     name, factor = for_people(unit)
-    numbers = element('p', number(errors.before * factor), element('span', ' → ', class_='quiet'),
-                      number(errors.after * factor), element('span', f' {name}', class_='quiet'),
-                      class_='big')
-    return element('div', element('p', what), numbers,
-                   element('p', f'reduced by {_gained(errors, unit)}', class_='quiet'),
-                   class_='tile')
+    return element('div', element('p', sentence(what).rstrip('.')), element(
+        'p', number(errors.before * factor), element('span', ' → ', class_='quiet'),
+        number(errors.after * factor), element('span', f' {name}', class_='quiet'),
+        class_='big'), element('p', f'reduced by {_gained(errors, unit)}', class_='quiet'),
+        class_='tile')
 
 
 def _gained(errors: Change, unit: str) -> str:
@@ -142,19 +140,34 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Markup | None]:
                               for place, found in enumerate(diagnosis.findings, 1)])
     yield _section('Structure that no cause explains',
                    [_items(map(unknown, diagnosis.unexplained))] if diagnosis.unexplained else [])
-    yield _section('Shares of the heading error', _shares(diagnosis))
+    yield _section('Shares of the heading error', [
+        element('p', 'Parts of the mean square of the heading error over 60 s.'),
+        _folding(['', 'share'], heading_shares(diagnosis))] if diagnosis.heading_shares else [])
     yield _section('Gain on held-out parts' if diagnosis.gain is not None else 'Heading',
                    _gain(diagnosis))
-    measured = diagnosis.noise_curve is not None or diagnosis.noise != Noise()
-    yield _section('Noise', _noise(diagnosis) if measured else [])
-    rest = others if guilty else []
-    yield _section('Along the other variables',
-                   [_pairs(draw(_residual(curve, place)) for place, curve in rest)]
-                   if rest else [])
-    yield _section('What these data cannot show',
-                   [_reasons(diagnosis)] if diagnosis.cannot_show else [])
-    yield _section('The model', _model(diagnosis))
-    yield _section('How this was computed', _method(diagnosis))
+    noise = _folding(['', 'residual', 'simulation'], noise_figures(diagnosis))
+    if diagnosis.noise_curve is not None:
+        yield _section('Noise', [_pairs([draw(_allan(diagnosis.noise_curve)), noise])])
+    elif diagnosis.noise != Noise():
+        yield _section('Noise', [noise])
+    yield _section('Along the other variables', [_pairs(
+        draw(_residual(curve, place)) for place, curve in others)] if guilty and others else [])
+    yield _section('What these data cannot show', [element('dl', *(
+        joined(element('dt', listed(names)), element('dd', reason))
+        for reason, names in hidden(diagnosis.cannot_show).items()))]
+        if diagnosis.cannot_show else [])
+    yield _section('The model', [
+        element('p', 'This is the extended model, as model.yaml has it; compensate, simulate and '
+                'the compensation node take it as it is.' if offered(diagnosis)
+                else 'The model is as it was.'),
+        element('pre', element('code', model_text(diagnosis.model)), tabindex='0',
+                class_='scroll')])
+    logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
+    yield _section('How this was computed', [
+        element('p', sentence(diagnosis.method) or _METHOD.format(
+            logs=logs, share=f'{100.0 * diagnosis.false_alarm_rate:.2g} %')),
+        _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None,
+        element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')])
 
 
 def _section(title: str, content: Iterable[Markup | None]) -> Markup | None:
@@ -185,7 +198,7 @@ def _curves(diagnosis: Diagnosis) -> tuple[list[Numbered], list[Numbered]]:
     return guilty, [each for each in curves if each[1].along not in along]
 
 
-def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup | None]:
+def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup]:
     if guilty or diagnosis.trace is not None:
         yield element('p', 'Point at a chart, or use the arrow keys, to read its values.',
                       class_='quiet hint')
@@ -193,19 +206,13 @@ def _misfit(diagnosis: Diagnosis, guilty: Sequence[Numbered]) -> Iterator[Markup
         yield element('p', 'The stretch where they differ most:')
         yield _pairs(draw(chart) for chart in _trace(diagnosis.trace))
     for place, curve in guilty:
-        yield element('p', _misfit_sentence(curve))
+        before, after = (amount(float(np.abs(each[np.isfinite(each)]).max(initial=0.0)), 'rad/s')
+                         for each in (curve.before, curve.after))
+        yield element('p', f'Along {spoken(curve.along)}, the simulation is off by up to {before}'
+                      + ('.' if _same(curve)
+                         else f' as it was, and by up to {after} as extended.'))
         yield _pairs(draw(chart) for chart in (_predicted(curve, place), _residual(curve, place))
                      if chart is not None)
-
-
-def _misfit_sentence(curve: Curve) -> str:
-    sizes = [np.abs(each[np.isfinite(each)]).max(initial=0.0)
-             for each in (curve.before, curve.after)]
-    before, after = (amount(float(size), 'rad/s') for size in sizes)
-    if _same(curve):
-        return f'Along {spoken(curve.along)}, the simulation is off by up to {before}.'
-    return (f'Along {spoken(curve.along)}, the simulation is off by up to {before} as it was, and '
-            f'by up to {after} as extended.')
 
 
 def _same(curve: Curve) -> bool:
@@ -311,41 +318,28 @@ def _cause(place: int, found: Finding, diagnosis: Diagnosis) -> Markup:
     facts = [*certainty(found), smallest(found), remedy(found, diagnosis)]
     uncertain = (element('p', alternatives(found), class_='uncertain') if found.ambiguous_with
                  else None)
+    sizes_of = _folding(['', 'estimate', '95 % interval'], [
+        [spoken(name), size.estimate, size.bounds or '–']
+        for name, size in sizes(found).items()]) if found.parameters else None
     title = element('h3', element('span', f'{place}', class_='place'), ' ', spoken(found.effect),
                     ' ', element('code', found.effect, class_='quiet')  # as files have it
                     if spoken(found.effect) != clean(found.effect) else None)
     return element('article', title, *(element('p', text) for text in shown_by(found)),
-                   _parameters(found), uncertain,
+                   sizes_of, uncertain,
                    element('p', ' '.join(filter(None, facts)), class_='quiet'))
-
-
-def _parameters(found: Finding) -> Markup | None:
-    if not found.parameters:
-        return None
-    return _folding(['', 'estimate', '95 % interval'], [
-        [spoken(name), size.estimate, size.bounds or '–'] for name, size in sizes(found).items()])
 
 
 def _folding(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Markup:
     """Return a table whose rows become lists on a narrow screen."""
-    table = element('table', element('thead', element('tr', *(element('th', head, scope='col')
-                                                              for head in heads))),
-                    element('tbody', *(_row(heads, row) for row in rows)))
+    body = (element('tr', element('th', row[0], scope='row'), *(
+        element('td', cell, data_head=head) for head, cell in zip(heads[1:], row[1:])))
+        for row in rows)
+    table = element('table', element('thead', element('tr', *(
+        element('th', head, scope='col') for head in heads))), element('tbody', *body))
     return element('div', table, class_='fold')
 
 
-def _row(heads: Sequence[str], row: Sequence[str]) -> Markup:
-    cells = [element('td', cell, data_head=head) for head, cell in zip(heads[1:], row[1:])]
-    return element('tr', element('th', row[0], scope='row'), *cells)
-
-
 # heading, gain, noise
-
-def _shares(diagnosis: Diagnosis) -> Iterator[Markup]:
-    if diagnosis.heading_shares:
-        yield element('p', 'Parts of the mean square of the heading error over 60 s.')
-        yield _folding(['', 'share'], heading_shares(diagnosis))
-
 
 def _gain(diagnosis: Diagnosis) -> Iterator[Markup | None]:
     parts = [] if diagnosis.heading is None else [draw(_heading(diagnosis.heading))]
@@ -377,14 +371,6 @@ def _heading(curve: HeadingCurve) -> Chart:
                  unit, factor * time, 'heading error', 'deg', lines)
 
 
-def _noise(diagnosis: Diagnosis) -> Iterator[Markup | None]:
-    table = _folding(['', 'residual', 'simulation'], noise_figures(diagnosis))
-    if diagnosis.noise_curve is None:
-        yield table
-    else:
-        yield element('div', draw(_allan(diagnosis.noise_curve)), table, class_='pairs')
-
-
 def _allan(curve: NoiseCurve) -> Chart:
     factor = 3600.0 / DEGREE
     lines = [Line('residual', 'measured', factor * curve.measured, dots=True),
@@ -395,28 +381,3 @@ def _allan(curve: NoiseCurve) -> Chart:
                  'Allan deviation over averaging time, of the residual and of the noise that is '
                  'simulated.', 'averaging time', 's', curve.averaging_time, 'Allan deviation',
                  'deg/h', lines, logarithmic=True)
-
-
-# the rest
-
-def _reasons(diagnosis: Diagnosis) -> Markup:
-    return element('dl', *(joined(element('dt', listed(names)), element('dd', reason))
-                           for reason, names in hidden(diagnosis.cannot_show).items()))
-
-
-def _model(diagnosis: Diagnosis) -> Iterator[Markup]:
-    what = ('This is the extended model, as model.yaml has it; compensate, simulate and the '
-            'compensation node take it as it is.' if offered(diagnosis)
-            else 'The model is as it was.')
-    yield element('p', what)
-    yield element('pre', element('code', model_text(diagnosis.model)), tabindex='0',
-                  class_='scroll')
-
-
-def _method(diagnosis: Diagnosis) -> Iterator[Markup | None]:
-    logs = f'{len(diagnosis.logs)} logs were' if len(diagnosis.logs) > 1 else 'The log was'
-    share = f'{100.0 * diagnosis.false_alarm_rate:.2g} %'
-    yield element('p', sentence(diagnosis.method)
-                  or _METHOD.format(logs=logs, share=share))
-    yield _items(map(sentence, diagnosis.remarks)) if diagnosis.remarks else None
-    yield element('p', f'gyro_calibration {gyro_calibration.__version__}', class_='quiet')
