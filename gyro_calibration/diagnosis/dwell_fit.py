@@ -104,10 +104,6 @@ class Named:
         """Return the change that stands for an effect of the fit: itself, or its confounder."""
         return _or_confounder(effect, self.change)
 
-    def level_of(self, effect: Effect) -> float:
-        """Return the chance at which an effect is named."""
-        return _level(self.rate, effect in NUISANCES)
-
     def chance_of(self, effect: Effect) -> float:
         """Return how likely dwells without a cause show as much of any of those tried."""
         if effect in NUISANCES:
@@ -168,21 +164,21 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
     tested = model or GyroModel()
     change, _ = supported_effects(beside(dwells, tested), technology(tested), rate=_CAUSES * rate)
     change = _without(change, without)
-    change, needless = _counted_well(change, model, _level(rate))
+    change, needless = _counted_well(change, model, level_of(rate))
     guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless)
-                   and _chance(change, tested, each) < _level(rate))
+                   and _chance(change, tested, each) < level_of(rate))
     change = _without(change, frozenset(each.name for each in change.effects
                                         if each not in (*NUISANCES, *needless, *guilty)))
     if model is None:
         return Named(change, change, guilty, tested, rate)
     fit = _refitted(dwells, model, change)
     moved = [each for each in NUISANCES
-             if each in fit.effects and _chance_of_change(fit, model, each) < _level(rate, True)]
+             if each in fit.effects and _chance_of_change(fit, model, each) < level_of(rate, True)]
     return Named(fit, change, (*(_or_confounder(each, fit) for each in guilty), *moved), tested,
                  rate)
 
 
-def _level(rate: float, nuisance: bool = False) -> float:
+def level_of(rate: float, nuisance: bool = False) -> float:
     """Return the chance at which one cause is named."""
     return (_OF_NUISANCES * rate / len(NUISANCES) if nuisance
             else _CAUSES * rate / (len(STEADY) - len(NUISANCES)))
@@ -332,7 +328,10 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
     if model is None:
         return fit.model
     new = {term.effect.name: term for term in fit.terms}
-    stays = [term for term in model.terms if not _replaced(term.effect, model, fit)]
+    # the confounder of an effect of the model may stand in its place
+    stays = [term for term in model.terms
+             if (other := _confounder(term.effect)) not in fit.effects
+             or term.effect in fit.effects or any(each.effect is other for each in model.terms)]
     own = [term.effect.name for term in stays]
     terms = (*(new.get(term.effect.name, term) for term in stays),
              *(term for name, term in new.items() if name not in own))
@@ -342,13 +341,6 @@ def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> Gyro
                    rate_range=wider(model.rate_range, [dwells.output], True),
                    temperature_range=wider(model.temperature_range, temperatures, True),
                    origin=origins_before(model), self_calibration=None)
-
-
-def _replaced(effect: Effect, model: GyroModel, fit: Calibration) -> bool:
-    """Tell whether the confounder of an effect of the model stands in its place."""
-    confounder = _confounder(effect)
-    return (confounder in fit.effects and effect not in fit.effects
-            and all(term.effect is not confounder for term in model.terms))
 
 
 def _covariance(model: GyroModel, fit: Calibration, terms: Sequence[Term]) -> Array | None:
@@ -393,23 +385,8 @@ SINGLE_RATES = 'single_rates'
 _REPEATED = 4
 
 
-@dataclass(frozen=True)
-class Left:
-    """
-    Structure without a name.
-
-    Attributes
-    ----------
-    found : where it lies, the clearest first
-    misfit : by what each lowers the sum of the whitened squared residuals
-
-    """
-
-    found: tuple[Unexplained, ...]
-    misfit: Mapping[str, float]
-
-
-def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
+def what_is_left(fit: Calibration, level: float,
+                 by_model: Array) -> tuple[tuple[Unexplained, ...], Mapping[str, float]]:
     """
     Look for structure in what a fit leaves.
 
@@ -419,6 +396,11 @@ def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
     level : the chance to find any where there is none
     by_model : what deviations of the model's values add to each dwell, rad/s, shape (n, m): no
         structure
+
+    Returns
+    -------
+    structure without a name, the clearest first, and by what each lowers the sum of the whitened
+    squared residuals
 
     """
     used = take(fit.dwells, fit.scatter.kept)
@@ -435,7 +417,7 @@ def what_is_left(fit: Calibration, level: float, by_model: Array) -> Left:
         found.append(replace(best, p_value=chance))
         gains[best.along] = gain
         known = np.column_stack([known, probes.pop(best.along)])
-    return Left(tuple(found), gains)
+    return tuple(found), gains
 
 
 def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
@@ -460,19 +442,15 @@ def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
     share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
     # Columns in their own unit, for the covariance of the dwells may be another one.
     plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
-    chance = _chance_of_curve(Uncertainty.of(used, fit.scatter, np.column_stack(plain), error),
-                              new.T @ whitener.whiten(by_model))
-    return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
-
-
-def _chance_of_curve(uncertainty: Uncertainty, by_model: Array) -> float:
-    """Return how likely the model's errors make the last values, by an F test over the scatter."""
-    count = len(by_model)
-    values, covariances = (uncertainty.offsets[:, -count:],
-                           uncertainty.covariances[:, -count:, -count:] + by_model @ by_model.T)
+    # an F test over what the scatter may be, beside the errors of the model
+    uncertain = Uncertainty.of(used, fit.scatter, np.column_stack(plain), error)
+    by_model = new.T @ whitener.whiten(by_model)
+    values = uncertain.offsets[:, -count:]
+    covariances = uncertain.covariances[:, -count:, -count:] + by_model @ by_model.T
     squares = np.einsum('ki,ki->k', values,
                         np.linalg.solve(covariances, values[:, :, None])[:, :, 0])
-    return float(uncertainty.weights @ fisher.sf(squares / count, count, uncertainty.freedom))
+    chance = float(uncertain.weights @ fisher.sf(squares / count, count, uncertain.freedom))
+    return Unexplained(name, min(max(share, 0.0), 1.0), chance), gain
 
 
 # the curves
@@ -536,41 +514,18 @@ _ALWAYS = {BIAS: 'acceleration_sensitivity', SCALE_FACTOR_ERROR: 'reference_scal
 _AIM = DISTINGUISHED + 1.0
 
 
-@dataclass(frozen=True)
-class Alternatives:
-    """
-    Causes that may stand in the place of one.
-
-    Attributes
-    ----------
-    names : of them, the likeliest first
-    separate_by : the experiment that would part them; '' where there is nothing to part
-
-    """
-
-    names: tuple[str, ...] = ()
-    separate_by: str = ''
-
-
-def alternatives(fit: Calibration, effect: Effect) -> Alternatives:
-    """Return what dwells cannot rule out in place of one effect of a fit."""
+def alternatives(fit: Calibration, effect: Effect) -> tuple[list[str], str]:
+    """Return what dwells cannot rule out in place of an effect, and what would distinguish it."""
     if effect in _ALWAYS:
-        return Alternatives((_ALWAYS[effect],), CAUSES[effect.name].separate_by)
+        return [_ALWAYS[effect]], CAUSES[effect.name].separate_by
     steady = [(sigmas, other) for other in _others(fit, effect)
-              if (sigmas := sigmas_of(fit, other)) < DISTINGUISHED]
+              if (sigmas := math.sqrt(max(other.misfit - fit.misfit, 0.0))) < DISTINGUISHED]
     found = [(sigmas, other.effects[fit.effects.index(effect)].name) for sigmas, other in steady]
     found += [(sigmas, name) for name, columns in _beyond(fit, effect)
               if (sigmas := _sigmas(fit, effect, columns)) < DISTINGUISHED]
-    if not found:
-        return Alternatives()
     experiments = [_experiment(fit, steady[0][1])] if steady else []
     experiments += [CAUSES[effect.name].separate_by] if len(found) > len(steady) else []
-    return Alternatives(tuple(name for _, name in sorted(found)), '; '.join(experiments))
-
-
-def sigmas_of(fit: Calibration, other: Calibration) -> float:
-    """Return by how many sigma a fit is better than another one of the same dwells."""
-    return math.sqrt(max(other.misfit - fit.misfit, 0.0))
+    return [name for _, name in sorted(found)], '; '.join(experiments)
 
 
 def _others(fit: Calibration, effect: Effect) -> Iterator[Calibration]:

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 
@@ -42,7 +42,7 @@ from gyro_calibration.diagnosis.dwell_fit import (
     alternatives,
     assembled,
     change_of,
-    Left,
+    level_of,
     model_before,
     name_causes,
     Named,
@@ -56,7 +56,14 @@ from gyro_calibration.diagnosis.dwell_fit import (
     what_is_left,
 )
 from gyro_calibration.diagnosis.extended_model import notes_of
-from gyro_calibration.diagnosis.findings import Curve, Diagnosis, Estimate, Finding, Gain
+from gyro_calibration.diagnosis.findings import (
+    Curve,
+    Diagnosis,
+    Estimate,
+    Finding,
+    Gain,
+    Unexplained,
+)
 from gyro_calibration.diagnosis.gates import refuse
 from gyro_calibration.diagnosis.steps import OnProgress
 from gyro_calibration.diagnosis.words import amount
@@ -140,7 +147,7 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
     if after is not before:
         after = replace(after, origin={**after.origin, **notes_of(findings, [record.factor])})
     return Diagnosis(
-        tuple(findings), left.found, Noise(), Noise() if model is None else model.noise,
+        tuple(findings), left, Noise(), Noise() if model is None else model.noise,
         gain, before, after, _cannot_show(dwells),
         curves(dwells, named.fit.scatter, before, after),
         remarks=(*record.remarks, *dwells.remarks,
@@ -151,15 +158,16 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
 # the steps
 
 def _concluded(dwells: Dwells, model: GyroModel | None, rate: float,
-               withdrawn: frozenset[str] = frozenset()) -> tuple[Named, Left, frozenset[str]]:
+               withdrawn: frozenset[str] = frozenset()
+               ) -> tuple[Named, tuple[Unexplained, ...], frozenset[str]]:
     """Name causes, and withdraw names along a variable where much has none."""
     named = name_causes(dwells, model, rate, withdrawn)
-    left = what_is_left(named.fit, _LEFT * rate, uncertainty_of(named.fit, named.model))
+    left, gains = what_is_left(named.fit, _LEFT * rate, uncertainty_of(named.fit, named.model))
     if withdrawn:
         return named, left, withdrawn
     withdrawn = frozenset(
         effect.name for effect in named.causes if effect not in NUISANCES
-        and max((gain for name, gain in left.misfit.items()
+        and max((gain for name, gain in gains.items()
                  if CAUSES[effect.name].along in name.split('_times_')), default=0.0)
         > _WITHDRAWN * _strength_of(named, effect))
     return _concluded(dwells, model, rate, withdrawn) if withdrawn else (named, left, withdrawn)
@@ -237,7 +245,7 @@ def _rest(fit: Calibration, effect: Effect) -> Calibration | None:
 
 
 def _finding(named: Named, effect: Effect) -> Finding:
-    others = alternatives(named.fit, effect)
+    others, separate_by = alternatives(named.fit, effect)
     along = {'along': 'temperature_while_turning'} if effect is SCALE_FACTOR_TEMPERATURE else {}
     term, deviations = _with_deviations(named.fit, effect)
     own, parameters = _own_values(named, effect), effect.parameters
@@ -245,8 +253,8 @@ def _finding(named: Named, effect: Effect) -> Finding:
     estimates = {parameters[place].name: Estimate.about(
         term.values[place] - own[place], 1.96 * deviation, parameters[place].unit)
         for place, deviation in zip(term.fitted, deviations)}
-    return finding(effect.name, estimates, named.chance_of(effect), others.names,
-                   minimum_detectable=_smallest(named, effect), separate_by=others.separate_by,
+    return finding(effect.name, estimates, named.chance_of(effect), others,
+                   minimum_detectable=_smallest(named, effect), separate_by=separate_by,
                    evidence=_evidence(named, effect), **along)
 
 
@@ -269,7 +277,7 @@ def _with_deviations(fit: Calibration, effect: Effect) -> tuple[Term, list[float
 
 def _smallest(named: Named, effect: Effect) -> float | None:
     """Return the size from which an effect is found, in the unit of its first value."""
-    change, level = named.changed(effect), named.level_of(effect)
+    change, level = named.changed(effect), level_of(named.rate, effect in NUISANCES)
     if effect in NUISANCES:
         return _found_from(named.fit, effect, level)
     if effect not in (SINE_RESPONSE, CUBIC_NONLINEARITY):
@@ -316,7 +324,7 @@ def _evidence(named: Named, effect: Effect) -> str:
 
 # what a person should know
 
-def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Left,
+def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Sequence[Unexplained],
              withdrawn: frozenset[str], gain: Gain | None, offered: bool) -> Iterator[str]:
     fit = named.fit
     if withdrawn:
@@ -328,7 +336,7 @@ def _remarks(dwells: Dwells, model: GyroModel | None, named: Named, left: Left,
     if gain is not None:
         yield (f'Heading errors are those that the error of a dwell makes in {WINDOW:g} s at its '
                'rate.')
-    if any(each.along == SINGLE_RATES for each in left.found):
+    if any(each.along == SINGLE_RATES for each in left):
         yield ('What repeats at single rates may be of the table, or of the place within a sweep '
                'where all sweeps have the same order.')
     scatter = fit.scatter

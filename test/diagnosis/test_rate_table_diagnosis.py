@@ -245,10 +245,10 @@ def test_structure_without_a_name_comes_with_the_chance_of_any_that_was_looked_f
     fit = fit_effects(table, [term.effect for term in LINEAR])
     certain = np.zeros((np.count_nonzero(fit.scatter.kept), 1))
     probes = dwell_fit._probes(table)
-    found = dwell_fit.what_is_left(fit, 1e-3, certain).found[0]
+    found = dwell_fit.what_is_left(fit, 1e-3, certain)[0][0]
     monkeypatch.setattr(dwell_fit, '_probes',
                         lambda dwells: {found.along: probes[found.along]})
-    alone = dwell_fit.what_is_left(fit, 1e-3, certain).found[0]
+    alone = dwell_fit.what_is_left(fit, 1e-3, certain)[0][0]
     tried = sum(columns.shape[1] > 0 for columns in probes.values())
     assert tried > 3 and found.p_value == pytest.approx(tried * alone.p_value)
 
