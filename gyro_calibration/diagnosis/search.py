@@ -512,7 +512,8 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
 
     Returns
     -------
-    the best, None where nothing is beyond chance, and all that were refined, the best first
+    the best, None where nothing is beyond chance, and all that were refined, the best first;
+    where nothing is, those that are suspected
 
     """
     key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
@@ -527,11 +528,10 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
 def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list[Step]]:
     done = fitted(search.problem, named)
     first = _first(search, done, named)
-    beyond_chance, may_be = (any(search.excess(
-        each.candidate.cause, each.mean, _times(each.candidate) if loosely else 1.0) > 0.0
-        for each in first) for loosely in (False, True))
-    if not may_be:
-        return None, []
+    if not any(search.excess(each.candidate.cause, each.mean) > 0.0 for each in first):
+        found = [refined(done, each.candidate, each.most - each.mean) for each in first
+                 if search.excess(each.candidate.cause, each.mean, _times(each.candidate)) > 0.0]
+        return None, sorted(found, key=lambda step: -step.score)
     top = max(first, key=lambda each: each.most)
     # Causes that change the rate look alike to first order; large ones need refined shapes.
     alike = is_of_the_rate(top.candidate.cause)
@@ -548,12 +548,18 @@ def _strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, lis
                    key=lambda step: -step.score)
     beyond = (step for step in steps
               if search.excess(step.named[-1].candidate.cause, step.score - done.score) > 0.0)
-    return next(beyond, None) if beyond_chance else None, steps
+    return next(beyond, None), steps
 
 
 def _times(candidate: Candidate) -> float:
-    """Return at how many times the rate a candidate counts: lasting causes are suspected, too."""
-    return SUSPECTED if is_named(candidate) and candidate.run is None else 1.0
+    """
+    Return at how many times the rate a candidate counts: lasting causes of a size are suspected.
+
+    A limit or a delay has no size beside its shape, and refined it explains single peaks.
+
+    """
+    lasts = is_named(candidate) and candidate.run is None and candidate.amplitude is None
+    return SUSPECTED if lasts else 1.0
 
 
 def suspected(search: Search, named: Sequence[Named]) -> Step | None:
