@@ -28,7 +28,7 @@ from gyro_calibration.diagnosis.findings import (
     Unexplained,
 )
 from gyro_calibration.logs.log import DEGREE
-from gyro_calibration.model.gyro_model import same_effects, Term
+from gyro_calibration.model.gyro_model import same_effects
 
 _HOUR = 3600.0
 
@@ -215,17 +215,25 @@ def headline(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == 'adequate':
         return ('Simulation and measurement differ by no more than noise.',
                 _gained(diagnosis))
-    established = [each for each in diagnosis.findings if each.status == 'established']
-    named = [f'because of {_named(established)}'] if established else []
-    left = [_left(diagnosis.unexplained, bool(named))] if diagnosis.unexplained else []
-    return f'Simulation and measurement differ {", and ".join(named + left)}.', _gained(diagnosis)
+    parts = []
+    if established := [each for each in diagnosis.findings if each.status == 'established']:
+        parts.append(f'because of {_named(established)}')
+    if unexplained := diagnosis.unexplained:
+        most = max(each.share_of_variance for each in unexplained)
+        up_to = 'up to ' if len(unexplained) > 1 and most >= 1e-3 else ''
+        parts.append(f'along {listed([spoken(each.along) for each in unexplained[:_NAMED]])} by '
+                     f'{"something" if parts else "structure"} that no cause in the catalogue '
+                     f'explains ({up_to}{_share(most)} of the variance of the residual)')
+    return f'Simulation and measurement differ {", and ".join(parts)}.', _gained(diagnosis)
 
 
 def _named(findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
+        shown = [spoken(each.effect) + (' (or {})'.format(
+            listed([spoken(name) for name in each.ambiguous_with], 'or'))
+            if each.ambiguous_with else '') for each in findings[:_NAMED]]
         more = [f'{len(findings) - _NAMED} more'] if len(findings) > _NAMED else []
-        return f'{len(findings)} causes: ' + listed(
-            [_beside_others(each) for each in findings[:_NAMED]] + more)
+        return f'{len(findings)} causes: {listed(shown + more)}'
     (found,) = findings
     size = next(iter(sizes(found).values()), None)
     if not found.ambiguous_with:
@@ -235,24 +243,9 @@ def _named(findings: Sequence[Finding]) -> str:
     return f'{names}, which these data cannot distinguish{taken}'
 
 
-def _beside_others(found: Finding) -> str:
-    others = listed([spoken(name) for name in found.ambiguous_with], 'or')
-    return spoken(found.effect) + (f' (or {others})' if others else '')
-
-
 def sizes(found: Finding) -> dict[str, Quantity]:
     """Return the parameters of a cause as people read them."""
     return {name: quantity(value, name) for name, value in found.parameters.items()}
-
-
-def _left(unexplained: Sequence[Unexplained], beside: bool) -> str:
-    where = listed([spoken(each.along) for each in unexplained[:_NAMED]])
-    share = _share(max(each.share_of_variance for each in unexplained))
-    what = 'by something' if beside else 'by structure'
-    most = ('up to ' if len(unexplained) > 1
-            and max(each.share_of_variance for each in unexplained) >= 1e-3 else '')
-    return (f'along {where} {what} that no cause in the catalogue explains ({most}{share} of the '
-            'variance of the residual)')
 
 
 def _share(share: float) -> str:
@@ -270,17 +263,13 @@ def offered(diagnosis: Diagnosis) -> bool:
 
 def is_inside(found: Finding, diagnosis: Diagnosis) -> bool:
     """Tell whether the extended model has a cause: by a new value, and by shapes if several."""
-    new = [term for term in diagnosis.model.terms
-           if term.effect.name == found.effect and term not in diagnosis.before.terms]
     alone = sum(each.effect == found.effect for each in diagnosis.findings) == 1
-    return offered(diagnosis) and any(alone or _has_shapes(term, found) for term in new)
-
-
-def _has_shapes(term: Term, found: Finding) -> bool:
-    values = dict(zip((parameter.name for parameter in term.effect.parameters),
-                      term.values[:len(term.effect.shapes)]))
-    return all(found.parameters[name].estimate == value
-               for name, value in values.items() if name in found.parameters)
+    return offered(diagnosis) and any(
+        alone or all(found.parameters[shape.name].estimate == value
+                     for shape, value in zip(term.effect.shapes, term.values)
+                     if shape.name in found.parameters)
+        for term in diagnosis.model.terms
+        if term.effect.name == found.effect and term not in diagnosis.before.terms)
 
 
 def _gained(diagnosis: Diagnosis) -> str:
@@ -394,32 +383,25 @@ def lines(diagnosis: Diagnosis) -> Iterator[str]:
     """Give the diagnosis for a terminal: the finding in two sentences, then a short list."""
     yield from map(_wrapped, headline(diagnosis))
     for place, found in enumerate(diagnosis.findings, 1):
+        mark = f'{place}. '
+        parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}'
+                      for name, size in sizes(found).items()]
         yield ''
-        yield from _finding_lines(f'{place}. ', found, diagnosis)
-    for title, items in _lists(diagnosis):
-        if items:
-            yield from ('', title, *(_wrapped(f'- {item}', 2) for item in items))
-
-
-def _finding_lines(mark: str, found: Finding, diagnosis: Diagnosis) -> Iterator[str]:
-    indent = len(mark)
-    parameters = [str(size) if name == found.effect else f'{spoken(name)} {size}'
-                  for name, size in sizes(found).items()]
-    yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}'
-                   f'{", ".join(parameters)}', indent)
-    for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]),
-                 alternatives(found), remedy(found, diagnosis)):
-        if text:
-            yield _wrapped(' ' * indent + text, indent)
-
-
-def _lists(diagnosis: Diagnosis) -> Iterator[tuple[str, list[str]]]:
-    yield 'Structure that no cause explains:', [unknown(each) for each in diagnosis.unexplained]
-    yield 'Shares of the mean square heading error over 60 s:', [
-        f'{name}: {share}' for name, share in heading_shares(diagnosis)]
-    yield 'These data cannot show:', [f'{listed(names)}: {reason}'
-                                      for reason, names in hidden(diagnosis.cannot_show).items()]
-    yield 'Remarks:', [sentence(remark) for remark in diagnosis.remarks]
+        yield _wrapped(f'{mark}{spoken(found.effect)}{": " if parameters else ""}'
+                       f'{", ".join(parameters)}', len(mark))
+        for text in (' '.join([*shown_by(found), *certainty(found), smallest(found)]),
+                     alternatives(found), remedy(found, diagnosis)):
+            if text:
+                yield _wrapped(' ' * len(mark) + text, len(mark))
+    for title, items in (
+            ('Structure that no cause explains:', map(unknown, diagnosis.unexplained)),
+            ('Shares of the mean square heading error over 60 s:',
+             [f'{name}: {share}' for name, share in heading_shares(diagnosis)]),
+            ('These data cannot show:', [f'{listed(names)}: {reason}' for reason, names
+                                         in hidden(diagnosis.cannot_show).items()]),
+            ('Remarks:', map(sentence, diagnosis.remarks))):
+        if texts := list(items):
+            yield from ('', title, *(_wrapped(f'- {text}', 2) for text in texts))
 
 
 def _wrapped(text: str, indent: int = 0) -> str:
