@@ -65,8 +65,9 @@ _SAME_RUN = 3600.0
 #: No bias is better known, (rad/s)².
 _LEAST = 1e-18
 #: Sizes of coefficient and turn-on scatter, in units of `Prior`, with their probability.
-_COEFFICIENTS = {0.03: 0.1, 0.1: 0.1, 0.3: 0.2, 1.0: 0.6}
-_TURN_ONS = {0.1: 0.2, 0.5: 0.3, 1.0: 0.2, 2.0: 0.2, 5.0: 0.1}
+#: `benchmarks/bias_table.py --sizes` compares them with more, and with less.
+_COEFFICIENTS = {0.1: 0.4, 1.0: 0.6}
+_TURN_ONS = {0.3: 0.3, 1.0: 0.5, 4.0: 0.2}
 _SIZES = np.array([(coefficient, turn_on)
                    for coefficient in _COEFFICIENTS for turn_on in _TURN_ONS])
 _MET = np.array([often * also for often in _COEFFICIENTS.values() for also in _TURN_ONS.values()])
