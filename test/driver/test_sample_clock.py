@@ -141,6 +141,7 @@ RUNS = ((10.0, 1), (11.0, 2), (20.0, 50), (40.0, 300))
 def test_lost_samples_are_counted_exactly_by_the_sequence(rate, generator):
     times = true_times(rate, 0.02, 60.0)
     kept = lose(times, RUNS) & (generator.random(times.size) >= 0.01)
+    kept[[0, -1]] = True  # nobody sees these lost
     run = play(SampleClock(rate, 128), times, arrivals_of(times, generator, stalls=(30.0,)), kept,
                sequence=sequence(times))
     assert run.clock.lost == run.truly_lost
@@ -203,7 +204,7 @@ def test_what_was_counted_too_often_is_taken_back(rate, generator):
 def test_what_damage_hides_is_counted_as_the_decoder_says(generator):
     times = true_times(100, 0.01, 30.0)
     kept = generator.random(times.size) >= 0.03
-    kept[0] = True
+    kept[[0, -1]] = True
     missing = np.zeros(times.size, int)
     missing[kept] = np.diff(np.flatnonzero(kept), prepend=-1) - 1
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept, missing=missing)
@@ -215,6 +216,7 @@ def test_the_time_of_the_device_is_fitted_like_a_number(generator):
     """Here it tells of lost samples, too, and of the uneven loop of a microcontroller."""
     times = true_times(100, 0.0, 30.0) + generator.uniform(-5e-4, 5e-4, 3000)
     kept = generator.random(times.size) >= 0.01
+    kept[[0, -1]] = True
     run = play(SampleClock(100.0), times, arrivals_of(times, generator), kept,
                time=50.0 + times / 1.02)
     assert run.error() < 0.001
@@ -254,7 +256,7 @@ def test_a_long_damaged_field_loses_no_more_samples_than_the_time_has_room_for(g
     """Its bytes are as many as those of 20 lines; the time of the device knows better."""
     times = true_times(100, 0.0, 30.0)
     kept = generator.random(times.size) >= 0.01
-    kept[0] = True
+    kept[[0, -1]] = True
     missing = 20 * (np.diff(np.flatnonzero(kept), prepend=-1) > 1)
     every = np.zeros(times.size, int)
     every[kept] = missing
