@@ -266,9 +266,3 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
-
-
-def test_a_bias_that_a_log_shows_stays_as_it_is():
-    found = calibrate_encoder(log_of(SWING, 100.0, Noise(0.005 * DEGREE),
-                                     np.random.default_rng(3)))
-    assert found.fit.bias == pytest.approx(B, rel=0.02)

@@ -105,16 +105,6 @@ def test_a_log_in_blocks_gives_the_columns_of_one_piece(model, tmp_path, words, 
                                    rtol=1e-12, err_msg=name)
 
 
-def test_what_is_refused_late_leaves_no_file(model, tmp_path, small_blocks, capsys):
-    write_robot(tmp_path / 'log.csv', 1000)
-    with open(tmp_path / 'log.csv', 'a') as file:
-        file.write('3.0,0.1,30\n')
-    assert main(['compensate', str(tmp_path / 'log.csv'), '--model', str(model),
-                 '--out', str(tmp_path / 'out.csv')]) == 2
-    assert 'line 1002, column time_s: 3 s is not later than 9.99 s' in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['log.csv', 'model.yaml']
-
-
 def test_a_log_without_any_output_is_refused(model, tmp_path, small_blocks, capsys):
     (tmp_path / 'log.csv').write_text(
         'time_s,gyro_rad_s\n' + ''.join(f'{row},nan\n' for row in range(1000)))

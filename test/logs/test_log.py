@@ -52,12 +52,6 @@ def test_every_column_is_converted_to_si(tmp_path, column, attribute, factor):
     assert log.time.tolist() == [0, 1, 2] and len(log) == 3
 
 
-def test_counts_become_rates_by_the_sensitivity(tmp_path):
-    log = read_log(written(tmp_path, 'gyro_counts\n100\n-50\n'), sensitivity=0.01)
-    assert (log.output.tolist() == [1.0, -0.5] and log.counts.tolist() == [100, -50]
-            and log.time is None)
-
-
 REFUSED = {
     'empty': ('', 'line 1 is no header'),
     'only notes': ('# a\n# b\n', 'line 3 is no header'),

@@ -161,7 +161,7 @@ def test_a_robot_at_rest_is_driven_however_large_a_bias_its_rest_has_shown(tmp_p
     assert rig.pipeline.obstacle() == ''
 
 
-@pytest.mark.parametrize('speed', [0.25, 1.0, 4.0])
+@pytest.mark.parametrize('speed', [0.25, 4.0])
 def test_a_simulation_at_another_speed_is_calibrated(tmp_path, speed):
     rig = rested(tmp_path, robot=Robot(noise=5e-3), calibration_drive=True, ros=1000.0)
     rig.speed = speed
@@ -418,6 +418,7 @@ def test_a_slip_without_load_is_named_as_one(tmp_path):
     rig.go(30.0, lambda: rig.ended)
     success, message = rig.session.conclude()
     assert not success and 'busy' not in message and 'a slip or a bump' in message
+    assert not rig.calibration_file.exists()
 
 
 # Services beside each other
@@ -491,28 +492,6 @@ def test_a_bad_profile_is_refused_in_one_sentence_that_names_the_file(tmp_path):
 def test_without_a_readable_model_nothing_is_calibrated(tmp_path):
     rig = rested(tmp_path, model='effects: {bias: {bias: .nan}}')
     assert 'effects.bias.bias is nan' in rig.begin(REST)
-
-
-# Runs that must not be believed
-
-
-@pytest.mark.parametrize('change, reason', [
-    (lambda rates: np.zeros_like(rates), 'same value'),
-    (lambda rates: BIAS + 1e-4 * np.random.default_rng(1).standard_normal(rates.size),
-     'did the robot move'),
-    (lambda rates: -rates, 'invert'),
-    (lambda rates: np.where(np.arange(rates.size) // 30 == 11, 0.0, rates), 'a slip or a bump'),
-    (lambda rates: rates + np.where(np.arange(rates.size) > 2200, 2.0 * DEGREE, 0.0),
-     'after the run'),
-], ids=['dead', 'not moved', 'wrong sign', 'slip', 'drives on'])
-def test_a_run_that_cannot_be_believed_is_refused_and_changes_nothing(tmp_path, change, reason):
-    rig = Rig(tmp_path, model='')
-    rates = (1 + SCALE) * CALIBRATION.rate_at(np.arange(0.0, 24.3, 0.01)) + BIAS
-    rig.begin()
-    rig.feed(change(rates))
-    assert rig.ended
-    success, message = rig.session.conclude()
-    assert not success and reason in message and not rig.calibration_file.exists()
 
 
 # Other references
