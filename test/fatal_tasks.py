@@ -11,7 +11,12 @@
 """Tasks for workers, two of which are fatal; apart, so that a worker imports little."""
 
 import os
+from pathlib import Path
 import signal
+import sys
+import time
+
+from gyro_calibration.fleet.run import finished, processes
 
 KILLS, TAKES_ALL_MEMORY = 3, 5
 
@@ -26,3 +31,14 @@ def task(number):
         except MemoryError:
             return 'no memory'
     return number
+
+
+def begun(folder):
+    """Leave the number of the process, and take forever."""
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(3600.0)
+
+
+if __name__ == '__main__':
+    with processes(1) as create:
+        list(finished(begun, sys.argv[1:], 1, create))

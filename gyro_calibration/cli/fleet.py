@@ -27,6 +27,7 @@ from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli.progress import bar
 from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole
 from gyro_calibration.diagnosis.findings import Estimate
+from gyro_calibration.diagnosis.gates import is_confused
 from gyro_calibration.diagnosis.words import amount, quantity
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
@@ -71,6 +72,8 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                         "names, without endings, such as 'rc_car_{drive}_unit{unit}'")
     parser.add_argument('--type', metavar='NAME', dest='gyro_type', help='type of the gyro in '
                         'logs without a type')
+    parser.add_argument('--rate', type=positive, metavar='HZ',
+                        help='sample rate, for logs without a usable time_s')
     parser.add_argument('--technology', choices=list(PRIORS), default='mems',
                         help='technology of the gyros; default: mems')
     parser.add_argument('--no-diagnosis', action='store_true', help='calibrate only, which is '
@@ -110,7 +113,7 @@ def _fleet(given: argparse.Namespace) -> Answer:
     if not used:
         first = records[0]
         raise DataRefused(f'none of {len(records)} logs can be used; '
-                          f'{plain(first["log"])}: {first["reason"]}')
+                          f'{first["log"]}: {first["reason"]}')
     left = [each for each in records if each['status'] == NO_EVIDENCE]
     lines = [f'{len(used)} of {len(records)} logs are calibrated.']
     lines += [f'{each["log"]}: no evidence, {each["reason"]}.' for each in left]
@@ -131,25 +134,26 @@ def _written(given: argparse.Namespace, types: Sequence[TypeFound],
     """Write the results, and return the names of their files."""
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
                'report.html': report(types, records).encode(), **tables(types, records)}
+    told = list(content)
     for found in types:
         for unit, model in models(found):
-            name = _file_name(found.name or 'type') + (f'-unit-{_file_name(unit)}' if unit else '')
-            origin = {**model.origin, **origin_of([])}
-            text = model_text(replace(model, origin=origin))
-            content[f'models/{name}.yaml'] = text.encode()
+            words = [found.name or 'type', *(['unit', unit] if unit else [])]
+            name = 'models/' + '-'.join(re.sub(r'[^\w.-]', '_', each)[:60] for each in words)
+            while f'{name}.yaml' in content:
+                name += '_'
+            text = model_text(replace(model, origin={**model.origin, **origin_of([])}))
+            content[f'{name}.yaml'] = text.encode()
+            told += [] if unit else [f'{name}.yaml']
     for name, each in content.items():
         write_atomically(Path(given.out) / name, each)
-    return [name for name in content if '-unit-' not in name]
-
-
-def _file_name(text: str) -> str:
-    return re.sub(r'[^A-Za-z0-9_.-]', '_', text)
+    return told
 
 
 def _lines(found: TypeFound) -> Iterator[str]:
     """Give the estimates of a type, and of its units."""
-    yield (f'{found.name or "One type"}: {len(found.records)} logs of {len(found.units)} units '
-           f'on {len(found.drives)} drives.')
+    counts = ', '.join(f'{len(each)} {name}{"" if len(each) == 1 else "s"}' for each, name in (
+        (found.records, 'log'), (found.units, 'unit'), (found.drives, 'drive')) if each)
+    yield f'{found.name or "Type not stated, pooled as one"}: {counts}.'
     for each in found.values.values():
         parts = [f'{spoken} {_spread(each, each.components[name])}' for name, spoken in _SPOKEN
                  if name in each.components]
@@ -182,16 +186,21 @@ def _wrapped(line: str) -> str:
 
 def _task(given: argparse.Namespace, entry: Entry, folder: str) -> Task:
     drawn = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    return Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '')
+    return Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '',
+                given.rate)
 
 
 def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:
     """Return the record of each log, in the order of the logs, whatever was finished first."""
     found: dict[str, dict[str, Any]] = {}
-    with _executors(given) as (workers, create):
-        for task, record in bar(finished(done, tasks, workers, create), 'logs', len(tasks)):
-            found[task.entry.log] = (refused(task.entry, str(record))
-                                     if isinstance(record, Lost) else record)
+    try:
+        with _executors(given) as (workers, create):
+            for task, record in bar(finished(done, tasks, workers, create), 'logs', len(tasks)):
+                found[task.entry.log] = (refused(task.entry, str(record))
+                                         if isinstance(record, Lost) else record)
+    except KeyboardInterrupt:
+        raise DataRefused(f'interrupted after {len(found)} of {len(tasks)} logs; run the same '
+                          'command again to continue') from None
     return _usable([found[task.entry.log] for task in tasks])
 
 
@@ -218,14 +227,27 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
 
 
 def _usable(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return records in which a copy of a log, or a log without a unit, is no evidence."""
-    seen: dict[str, str] = {}
+    """Return records in which what only the whole fleet shows to be no evidence is none."""
+    first: dict[str, str] = {}
+    for each in sorted(records, key=lambda one: not one['unit']):
+        first.setdefault(each['content'], each['log'])
+    usual = {each['type']: float(np.median([
+        _noise(one) for one in records if _noise(one) and one['type'] == each['type']]))
+        for each in records if _noise(each)}
     found = []
     for each in records:
-        first = seen.setdefault(each['sha256'], each['log']) if each['sha256'] else each['log']
-        why = ('' if each['status'] != DONE
-               else f'it is a copy of {plain(first)}' if first != each['log']
-               else '' if each['unit']
-               else 'its unit is unknown; give a table or --pattern')
+        why = ''
+        if each['status'] == DONE and first[each['content']] != each['log']:
+            why = f'it is a copy of {first[each["content"]]}'
+        elif each['status'] == DONE and not each['unit']:
+            why = 'its unit is unknown; give a table or --pattern'
+        elif _noise(each) and is_confused(ratio := _noise(each) / usual[each['type']]):
+            why = (f'its white noise is {ratio:.3g} times the median of its type, as by deg/s in '
+                   'place of rad/s; mend the unit of its column, or state its type')
         found.append({**each, 'status': NO_EVIDENCE, 'reason': why} if why else each)
     return found
+
+
+def _noise(record: dict[str, Any]) -> float:
+    """Return the angle random walk of a log at rest, where motion adds nothing to it; else 0."""
+    return record['noise']['angle_random_walk'] if record.get('method') == 'rest' else 0.0

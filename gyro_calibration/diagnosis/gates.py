@@ -271,13 +271,16 @@ def _refuse_units(log: Log, output: Array, model: GyroModel) -> None:
 def _refuse_noise(measured: float, simulated: float, resting: bool) -> None:
     """Refuse an angle random walk that is absurd, or, at rest, off by the ratio of deg and rad."""
     ratio = measured / simulated
-    confused = resting and any(1.0 / _NEAR < ratio * factor < _NEAR
-                               for factor in (DEGREE, 1.0 / DEGREE))
-    if confused or not 1.0 / _ABSURD < ratio < _ABSURD:
+    if resting and is_confused(ratio) or not 1.0 / _ABSURD < ratio < _ABSURD:
         raise DataRefused(
             f'the log has {ratio:.3g} times the angle random walk of the model, {simulated:.3g} '
             'rad/√s: the model is of other units, or of another gyro; write its noise in rad/√s, '
             'or take it from `allan`')
+
+
+def is_confused(ratio: float) -> bool:
+    """Tell whether a ratio of noises at rest is that of deg and rad."""
+    return any(1.0 / _NEAR < ratio * factor < _NEAR for factor in (DEGREE, 1.0 / DEGREE))
 
 
 #: Spans that a log is cut into, and the lags that are tried, in spans, either way.

@@ -494,7 +494,7 @@ class Pooled:
         part : of a unit: 0 for its value, from 1 on for a slope
 
         """
-        count = max(len(each) for each in (unit, drive, fixed, [0]) if each is not None)
+        count = next((len(each) for each in (unit, drive, fixed) if each is not None), 1)
         none = np.full(count, -1)
         row = np.zeros((count, self._fixed.shape[1]))
         row[:, 0] = 1.0

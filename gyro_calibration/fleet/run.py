@@ -29,10 +29,12 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager
+from fcntl import F_GETFL, F_SETFL, F_SETOWN, fcntl
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 import os
 import resource
+import signal
 from typing import Any, TypeVar
 
 Task = TypeVar('Task')
@@ -65,8 +67,7 @@ def processes(workers: int, memory: float | None = None, preload: Sequence[str] 
     made: list[ProcessPoolExecutor] = []
 
     def create(wanted: int) -> Executor:
-        made.append(ProcessPoolExecutor(min(wanted, workers), context, _limit,
-                                        (memory,)))
+        made.append(ProcessPoolExecutor(min(wanted, workers), context, _begin, (memory,)))
         return made[-1]
     try:
         yield create
@@ -75,8 +76,14 @@ def processes(workers: int, memory: float | None = None, preload: Sequence[str] 
             each.shutdown(wait=True, cancel_futures=True)
 
 
-def _limit(memory: float | None) -> None:
-    """Limit what this process may allocate."""
+def _begin(memory: float | None) -> None:
+    """Limit what a worker may allocate, and let it end where the program that began it ends."""
+    parent = parent_process()
+    assert parent is not None
+    # the program holds the other end of this pipe, and SIGIO ends a process
+    fcntl(parent.sentinel, F_SETOWN, os.getpid())
+    fcntl(parent.sentinel, F_SETFL, fcntl(parent.sentinel, F_GETFL) | os.O_ASYNC)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends without a traceback
     if memory is not None:
         hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
         limit = int(memory) if hard == resource.RLIM_INFINITY else min(int(memory), hard)
@@ -91,10 +98,12 @@ def cluster(address: str) -> Iterator[Callable[[int], Executor]]:
     Raises
     ------
     ImportError : `distributed` is not installed
-    OSError : nobody answers there
+    OSError, ValueError : nobody answers there, or it is no address
 
     """
     from distributed import Client
+    if '://' not in address:  # a client of no scheduler waits for it when it is deleted
+        raise ValueError(f'{address} names no protocol')
     with Client(address, timeout='10s', set_as_default=False) as client:
         yield lambda wanted: client.get_executor(pure=False, retries=0)
 

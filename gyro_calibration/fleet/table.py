@@ -69,7 +69,7 @@ class Entry:
 
     def with_missing(self, said: Mapping[str, str]) -> Entry:
         """Return the entry with what it does not hold yet."""
-        new: dict[str, Any] = {name: text.strip() for name, text in said.items()
+        new: dict[str, Any] = {name: plain(text.strip()) for name, text in said.items()
                                if name in KEYS and text.strip()
                                and getattr(self, name) in ('', None)}
         if 'temperature' in new:
@@ -78,10 +78,23 @@ class Entry:
             new['date'] = _date(self.log, new['date'])
         return replace(self, **new)
 
+    def merged(self, other: Entry) -> Entry:
+        """Return what two tables say of one log; raise `InputError` where they contradict."""
+        new = {name: getattr(other, name) for name in KEYS
+               if getattr(other, name) not in ('', None)}
+        for name, value in new.items():
+            if getattr(self, name) not in ('', None, value):
+                raise InputError(f'{self.log}: is listed twice, with {name} '
+                                 f'{getattr(self, name)} and {value}; delete one line')
+        return replace(self, **new)
+
 
 def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
     """
     Return the logs of files, folders, globs, lists (.txt) and tables (.csv with a column log).
+
+    A log that is named several times is one entry. A table inside a folder is used as well; the
+    results of an earlier fleet are not.
 
     Parameters
     ----------
@@ -90,47 +103,49 @@ def entries(paths: Sequence[str], without: str | Path = '') -> list[Entry]:
 
     Raises
     ------
-    InputError : there is none, or a table is wrong
+    InputError : there is none, or a table is wrong or contradicts another one
     OSError : a table cannot be read
 
     """
     found: dict[str, Entry] = {}
+    visited = {os.path.realpath(without)} if without else set()
     for path in paths:
-        for entry in _of(path, Path(without).absolute() if without else None):
-            found.setdefault(os.path.abspath(entry.log), entry)
+        for entry in _of(path, visited):
+            known = os.path.abspath(entry.log)
+            found[known] = found[known].merged(entry) if known in found else entry
     if not found:
         raise InputError(f'{", ".join(map(str, paths))}: holds no log; logs end in '
                          f'{", ".join(LOGS)}, or are the folder of a ROS 2 recording')
     return list(found.values())
 
 
-def _of(path: str, without: Path | None) -> Iterator[Entry]:
+def _of(path: str, visited: set[str]) -> Iterator[Entry]:
+    """Give the logs of what a user named; a folder that was visited before has none."""
     if os.path.isdir(path):
-        yield from map(Entry, _inside(Path(path), without))
+        yield from _inside(Path(path), visited)
     elif not os.path.exists(path) and glob(path, recursive=True):
         for each in sorted(glob(path, recursive=True)):
-            yield from _of(each, without)
+            yield from _of(each, visited)
     elif path.endswith('.txt'):
         lines = (line.strip() for line in _text(path).splitlines())
         yield from (Entry(_beside(path, line)) for line in lines if line and line[0] != '#')
-    elif path.endswith('.csv') and (columns := _header(path)) and 'log' in columns:
+    elif path.endswith('.csv') and os.path.exists(path) and (columns := _header(path)):
         yield from _rows(path, columns)
     else:
         yield Entry(path)
 
 
-def _inside(folder: Path, without: Path | None) -> Iterator[str]:
+def _inside(folder: Path, visited: set[str]) -> Iterator[Entry]:
     """Give the logs in a folder and in those inside it; one with metadata.yaml is a recording."""
-    if folder.absolute() == without:
+    if os.path.realpath(folder) in visited or (folder / 'fleet.json').is_file():
         return
+    visited.add(os.path.realpath(folder))
     if (folder / 'metadata.yaml').is_file():
-        yield str(folder)
+        yield Entry(str(folder))
         return
     for path in sorted(folder.iterdir()):
-        if path.is_dir():
-            yield from _inside(path, without)
-        elif path.name.endswith(LOGS) and not path.name.startswith('.'):
-            yield str(path)
+        if path.is_dir() or path.name.lower().endswith(LOGS) and not path.name.startswith('.'):
+            yield from _of(str(path), visited)
 
 
 def _text(path: str) -> str:
@@ -143,9 +158,20 @@ def _text(path: str) -> str:
 
 
 def _header(path: str) -> list[str]:
-    with opened(path) as file:
-        line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
-    return [name.strip().lower() for name in line.split(',')]
+    """Return the columns of a table of logs; none of another file, as of a log."""
+    try:
+        with opened(path) as file:
+            line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
+    except OSError:  # told where the log is read
+        return []
+    columns = [name.strip().strip('"').lower() for name in line.split(_separator(line))]
+    is_log = any(name.startswith(('time', 'gyro')) for name in columns)
+    return columns if 'log' in columns or set(KEYS) & set(columns) and not is_log else []
+
+
+def _separator(line: str) -> str:
+    """Return what separates values, as in a log: comma, semicolon or tab."""
+    return max(',;\t', key=line.count)
 
 
 def _beside(path: str, log: str) -> str:
@@ -155,11 +181,12 @@ def _beside(path: str, log: str) -> str:
 
 
 def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
-    unknown = sorted(set(columns) - {'log', *KEYS})
-    if unknown or len(set(columns)) < len(columns):
+    if not set(columns) <= {'log', *KEYS} or 'log' not in columns or len(
+            set(columns)) < len(columns):
         raise InputError(f'{path}: its columns are {", ".join(columns)}; wanted log and any of '
                          f'{", ".join(KEYS)}, each once')
-    rows = csv.reader(_text(path).splitlines())
+    lines = _text(path).splitlines()
+    rows = csv.reader(lines, delimiter=_separator(lines[0]))
     next(rows)
     for number, row in enumerate(rows, 2):
         if not any(map(str.strip, row)):
@@ -205,9 +232,8 @@ def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
     named : how a user's files are named, of `pattern`
 
     """
-    stem = Path(entry.log).name
-    for end in sorted(LOGS, key=len, reverse=True):
-        stem = stem.removesuffix(end)
+    stem = re.sub(f'({"|".join(map(re.escape, sorted(LOGS, key=len, reverse=True)))})$', '',
+                  Path(entry.log).name, flags=re.IGNORECASE)
     if named is not None and (found := named.fullmatch(stem)):
         entry = entry.with_missing(found.groupdict())
     return entry.with_missing(_notes(entry.log)).with_missing(_usual(stem))
@@ -231,7 +257,7 @@ def _notes(path: str) -> dict[str, str]:
         return {**_custom(Path(path)), **_of_recordings(sorted(Path(path).glob('*.mcap')))}
     if path.endswith('.mcap'):
         return _of_recordings([Path(path)])
-    if not path.endswith(('.csv', '.csv.gz')):
+    if not path.lower().endswith(('.csv', '.csv.gz')):
         return {}
     with opened(path) as file:
         try:

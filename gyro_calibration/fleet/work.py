@@ -25,25 +25,29 @@ from gyro_calibration import __version__
 from gyro_calibration.calibration.dwells import dwells
 from gyro_calibration.calibration.encoder import calibrate_encoder
 from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.diagnosis.data_quality import inspect
+from gyro_calibration.diagnosis.expected_output import is_far
 from gyro_calibration.diagnosis.findings import Diagnosis
-from gyro_calibration.diagnosis.gates import gates, mismatch, rests
+from gyro_calibration.diagnosis.gates import gates, mismatch, refuse, rests
 from gyro_calibration.diagnosis.pipeline import diagnose
 from gyro_calibration.diagnosis.rate_table import diagnose_table
 from gyro_calibration.diagnosis.report import report
 from gyro_calibration.files import digest, InputError, plain, reason, write_atomically
 from gyro_calibration.fleet.slow_effects import rest_bias, slow_effects
 from gyro_calibration.fleet.table import described, Entry
-from gyro_calibration.logs.log import DataRefused, Log, read_log
+from gyro_calibration.logs.log import DataRefused, Log, QUANTITIES, read_log
+from gyro_calibration.logs.quality import white_noise
 from gyro_calibration.logs.recording import read_recording
 from gyro_calibration.logs.ros_bag import files_of, is_recording
 from gyro_calibration.model.effects import BIAS
 from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.noise import Noise
 import numpy as np
 
 #: A log that was calibrated, and one that is no evidence.
 DONE, NO_EVIDENCE = 'done', 'no evidence'
 #: Of the records; another one is not taken for this one.
-SCHEMA = 'gyro_calibration/fleet_log/1'
+SCHEMA = 'gyro_calibration/fleet_log/2'
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Task:
     named : how files are named, of `table.pattern`
     generator : for the diagnosis, the same for each log; None without a diagnosis
     usual_type : of a log whose type is not said
+    rate : Hz, of the samples of logs without a usable time
 
     """
 
@@ -68,6 +73,7 @@ class Task:
     named: re.Pattern[str] | None = None
     generator: np.random.Generator | None = None
     usual_type: str = ''
+    rate: float | None = None
 
     @property
     def name(self) -> str:
@@ -86,11 +92,13 @@ def done(task: Task) -> dict[str, Any]:
     """
     Return the record of a log, and keep it; one that was kept of the same content is taken.
 
-    It is data that JSON can hold, and the same to the bit wherever it is computed.
+    It is data that JSON can hold, and the same to the bit wherever it is computed. What a table
+    says of the log may change without that it is computed again.
 
     Returns
     -------
-    ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``values`` has name -> value,
+    ``status`` is `DONE` or `NO_EVIDENCE` with a ``reason``; ``sha256`` is of the file, and
+    ``content`` of the values in it; ``values`` has name -> value,
     standard deviation and unit; ``slow`` the same of effects that a single log cannot tell from
     the wander of the bias, each fitted alone; ``diagnosis`` a summary
 
@@ -98,22 +106,27 @@ def done(task: Task) -> dict[str, Any]:
     try:
         entry = described(task.entry, task.named).with_missing({'type': task.usual_type})
         content = digest(*files_of(task.entry.log))
-        key = _key(task, entry, content)
-        kept = _kept(task.record, key)
-        if kept is not None:
-            return kept
-        found = {'schema': SCHEMA, 'key': key, 'sha256': content, **asdict(entry),
-                 **_calibrated(task, entry)}
-        write_atomically(task.record, json.dumps(found, allow_nan=False).encode())
-        return found
+        key = _key(task, content)
+        found = _kept(task.record, key)
+        if found is None:
+            found = {'schema': SCHEMA, 'key': key, 'sha256': content, **_calibrated(task)}
+            write_atomically(task.record, json.dumps(found, allow_nan=False).encode())
+        said = _said(entry)
+        if entry.temperature is None:
+            said['temperature'] = found['mean_temperature']
+        return {**found, **said}
     except (InputError, ArithmeticError, np.linalg.LinAlgError, OSError, MemoryError) as error:
         return refused(task.entry, _why(error, task.entry.log))
 
 
 def refused(entry: Entry, why: str) -> dict[str, Any]:
     """Return the record of a log that is no evidence."""
-    return {'schema': SCHEMA, 'key': '', 'sha256': '', **asdict(entry),
+    return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_said(entry),
             'status': NO_EVIDENCE, 'reason': why}
+
+
+def _said(entry: Entry) -> dict[str, Any]:
+    return {**asdict(entry), 'log': plain(entry.log)}
 
 
 def _why(error: Exception, path: str) -> str:
@@ -124,10 +137,10 @@ def _why(error: Exception, path: str) -> str:
     return reason(error)
 
 
-def _key(task: Task, entry: Entry, content: str) -> str:
+def _key(task: Task, content: str) -> str:
     """Return what is another where another record would be found."""
     drawn = None if task.generator is None else task.generator.bit_generator.state
-    about = [SCHEMA, __version__, task.technology, asdict(entry), content, drawn]
+    about = [SCHEMA, __version__, task.technology, task.rate, task.entry.log, content, drawn]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 
@@ -139,13 +152,19 @@ def _kept(path: Path, key: str) -> dict[str, Any] | None:
         return None
 
 
-def _calibrated(task: Task, entry: Entry) -> dict[str, Any]:
-    log = read_recording(entry.log) if is_recording(entry.log) else read_log(entry.log)
+def _calibrated(task: Task) -> dict[str, Any]:
+    path = task.entry.log
+    log = (read_recording(path, rate=task.rate) if is_recording(path)
+           else read_log(path, rate=task.rate))
     method, model, more = calibrate(log, task.technology)
     temperature = None if log.temperature is None else float(np.nanmean(log.temperature))
     if temperature is not None and not math.isfinite(temperature):
         temperature = None
+    content = hashlib.sha256()
+    for values in (getattr(log, quantity) for quantity in QUANTITIES):
+        content.update(b'' if values is None else values.tobytes())
     found: dict[str, Any] = {
+        'content': content.hexdigest(), 'mean_temperature': temperature,
         'status': DONE, 'reason': '', 'method': method, 'samples': len(log),
         'duration_s': None if log.time is None else float(log.time[-1] - log.time[0]),
         'values': {**_values(model), **more},
@@ -153,8 +172,6 @@ def _calibrated(task: Task, entry: Entry) -> dict[str, Any]:
         if log.time is not None else {},
         'noise': {name: float(value) for name, value in vars(model.noise).items()},
         'diagnosis': None, 'page': ''}
-    if entry.temperature is None:
-        found['temperature'] = temperature
     if task.generator is not None:
         found |= _diagnosed(task, log)
     return found
@@ -175,7 +192,7 @@ def calibrate(log: Log, technology: str = 'mems'
     """
     if log.output is None:
         raise DataRefused('holds gyro_counts alone; convert them to gyro_dps')
-    failed = None if log.time is None else mismatch(gates(log, None))
+    failed = mismatch(gates(log, None))
     if failed is not None:
         raise DataRefused(f'{failed.evidence}: {failed.remedy}')
     if log.time is not None and log.reference_rate is None and log.reference_heading is not None:
@@ -183,14 +200,22 @@ def calibrate(log: Log, technology: str = 'mems'
         offset = {} if math.isnan(found.fit.time_offset) else {'time_offset': _value(
             found.fit.time_offset, found.fit.time_offset_deviation, 's')}
         return found.method, found.model, offset
+    refuse(log)
     if log.time is not None and rests(log):
         return 'rest', _at_rest(log), {}
+    of_table = None if log.time is not None else inspect(log)
+    if of_table is not None and is_far(of_table.factor):
+        raise DataRefused(f'{of_table.findings[0].evidence}: mend the unit or the sign of the '
+                          'column of the gyro')
     return 'dwells', select_effects(dwells(log), technology).calibration.model, {}
 
 
 def _at_rest(log: Log) -> GyroModel:
+    assert log.time is not None and log.output is not None
     bias, deviation = rest_bias(log)
-    return GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]))
+    walk = white_noise(log.output, order=1) * math.sqrt(float(np.median(np.diff(log.time))))
+    return GyroModel((Term(BIAS, (bias,)),), np.array([[deviation ** 2]]),
+                     noise=Noise(angle_random_walk=walk))
 
 
 def _values(model: GyroModel) -> dict[str, dict[str, Any]]:
@@ -216,7 +241,7 @@ def _diagnosed(task: Task, log: Log) -> dict[str, Any]:
     assert task.generator is not None
     try:
         found = (diagnose_table(log, None) if log.time is None
-                 else diagnose([log], task.generator, names=[task.entry.log]))
+                 else diagnose([log], task.generator, names=[plain(task.entry.log)]))
     except (DataRefused, ArithmeticError, np.linalg.LinAlgError) as error:
         return {'diagnosis': {'verdict': 'refused', 'reason': _why(error, task.entry.log),
                               'findings': []}}

@@ -15,8 +15,13 @@ from dataclasses import replace
 import io
 import json
 import os
+from pathlib import Path
 import struct
+import subprocess
+import sys
+import time
 
+import fatal_tasks
 from fatal_tasks import KILLS, TAKES_ALL_MEMORY, task
 from gyro_calibration.calibration.self_calibration import self_calibrate
 from gyro_calibration.cli.main import main
@@ -72,6 +77,8 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     ('log,unit,colour\na.csv,1,red\n', 'its columns are log, unit, colour'),
     ('log,unit\na.csv\n', 'line 2: holds 1 values, wanted 2'),
     ('log,unit\n,3\n', 'line 2: names no log'),
+    ('unit,drive\n1,h\n', 'its columns are unit, drive; wanted log'),
+    ('log;unit\na.csv;1\na.csv;2\n', 'a.csv: is listed twice, with unit 1 and 2'),
     ('log,date\na.csv,March\n', "its date is said to be 'March'"),
     ('log,temperature\na.csv,hot\n', "its temperature is said to be 'hot'")])
 def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
@@ -94,6 +101,14 @@ def test_folders_globs_and_lists_are_searched_for_logs_but_not_the_results(tmp_p
     assert found('list.txt') == ['x/b.csv']
     with pytest.raises(InputError, match='holds no log'):
         found('x/out')
+    (tmp_path / 'x/loop').symlink_to('.')
+    (tmp_path / 'x/earlier').mkdir()
+    for name in ('fleet.json', 'logs.csv'):
+        (tmp_path / 'x/earlier' / name).touch()
+    assert found('x') == ['x/b.csv', 'x/bag', 'x/y/a.mcap']
+    (tmp_path / 'x/table.csv').write_text('log,unit\nb.csv,7\n')
+    assert {entry.log[-5:]: entry.unit for entry in entries([str(tmp_path / 'x')])} == {
+        'b.csv': '7', 'x/bag': '', 'c.csv': '', '.mcap': ''}
 
 
 def _mcap(said):
@@ -140,24 +155,44 @@ def test_a_worker_that_is_killed_is_reported_and_the_rest_goes_on():
     assert found == {number: number for number in {*range(10)} - {KILLS, TAKES_ALL_MEMORY}}
 
 
+def test_workers_end_with_the_program_that_is_killed(tmp_path):
+    begun = subprocess.Popen([sys.executable, fatal_tasks.__file__, tmp_path])
+    try:
+        while not (begun_by := [int(each.name) for each in tmp_path.iterdir()]):
+            assert begun.poll() is None
+            time.sleep(0.01)
+    finally:
+        begun.kill()
+        begun.wait()
+    deadline = time.monotonic() + 30.0
+    while Path(f'/proc/{begun_by[0]}').exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 # the verb
 
 def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, capsys):
     logs = tmp_path / 'logs'
     for unit, seed in ((1, 0), (2, 1)):
         write_log(logs / f'a_unit{unit}.csv', drive(0.01 * unit, seed))
-    write_log(logs / 'b_unit1.csv', drive(0.01, 0))  # a double
+    (logs / 'b_unit1.csv').write_text(  # a double
+        '# again\n' + (logs / 'a_unit1.csv').read_text())
+    (logs / 'copy.csv').write_bytes((logs / 'a_unit2.csv').read_bytes())
     (logs / 'c_unit1.csv').write_text('time_s,gyro_dps\n0,x\n1,2\n')
     write_log(logs / 'nobody.csv', drive(0.01, 3))
     rates = drive(0.01, 4)
     write_log(logs / 'd_unit1.csv', replace(rates, output=rates.output / DEGREE))
     write_log(logs / 'd_unit2.csv', replace(rates, time=1000.0 * rates.time))
+    write_log(logs / 'e_unit3.csv', drive(0.01, 5))
     (logs / 'd_unit3.csv').write_text('# unit: 3, type: FOG\n' + (
-        logs / 'a_unit2.csv').read_text())
+        logs / 'e_unit3.csv').read_text())
+    (logs / 'e_unit3.csv').unlink()
     assert run(logs, '--out', tmp_path / 'out') == 0
     told = json.loads(capsys.readouterr().out)
     reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
-    assert told['logs'] == 8 and 'is a copy of' in reasons['b_unit1.csv']
+    assert told['logs'] == 9 and 'is a copy of' in reasons['b_unit1.csv']
+    assert 'a_unit2.csv' in reasons.pop('copy.csv')
     assert 'x' in reasons['c_unit1.csv'] and 'unit' in reasons['nobody.csv']
     assert 'gyro_rad_s' in reasons['d_unit1.csv'] and 'in ms' in reasons['d_unit2.csv']
     assert set(reasons) == {'b_unit1.csv', 'c_unit1.csv', 'nobody.csv', 'd_unit1.csv',
@@ -168,6 +203,58 @@ def test_logs_that_are_no_evidence_are_reported_and_the_others_done(tmp_path, ca
             for each in told['types']} == {'': ['1', '2'], 'FOG': ['3']}
 
 
+def test_gyros_of_a_laboratory_need_no_drives_and_show_wrong_units(tmp_path, capsys):
+    """At rest, and on rate tables; deg/s in place of rad/s, and a sign."""
+    generator = np.random.default_rng(1)
+    rate = np.tile(np.linspace(-1.0, 1.0, 11), 2)
+    for unit in range(5):
+        factor = 1.0 / DEGREE if unit == 3 else 1.0
+        rest = 1e-3 + 1e-4 * generator.standard_normal(1300)
+        table = 1.01 * rate + 1e-4 * generator.standard_normal(len(rate))
+        write_log(tmp_path / f'logs/rest_unit{unit}.csv',
+                  Log(time=0.05 * np.arange(1300), output=factor * rest))
+        write_log(tmp_path / f'logs/type_2_unit{unit}.csv',
+                  Log(output=(factor if unit else -1.0) * table, reference_rate=rate))
+    (tmp_path / 'logs.csv').write_text('log,unit,type\n' + ''.join(
+        f'logs/{kind}_unit{unit}.csv,{unit},{kind}\n' for kind in ('rest', 'type_2')
+        for unit in range(5)))
+    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 0
+    told = json.loads(capsys.readouterr().out)
+    reasons = {os.path.basename(each['log']): each['reason'] for each in told['no_evidence']}
+    assert set(reasons) == {f'{name}.csv' for name in (
+        'rest_unit3', 'type_2_unit0', 'type_2_unit3')}
+    assert 'its white noise is 5' in reasons['rest_unit3.csv']
+    assert '-1 is -1' in reasons['type_2_unit0.csv']
+    assert '180/pi' in reasons['type_2_unit3.csv']
+    assert [each['units'] for each in told['types']] == [list('0124'), list('124')]
+
+
+def test_names_may_hold_any_characters(tmp_path):
+    """Also bytes that are no text, and units whose names differ by letters of any language."""
+    names = {'ä': 'lauf ä', 'ö': os.fsdecode(b'b\xff'), 'a/b': '名', 'a b': 'x'}
+    for seed, name in enumerate(names.values()):
+        write_log(tmp_path / f'{name}.csv', drive(0.01, seed))
+    table = ''.join(f'{name}.csv,{unit},T\n' for unit, name in names.items())
+    (tmp_path / 'logs.csv').write_bytes(os.fsencode('log,unit,type\n' + table))
+    assert run(tmp_path / 'logs.csv', '--out', tmp_path / 'out') == 2
+    (tmp_path / 'logs.csv').unlink()
+    for unit, name in names.items():
+        path = tmp_path / f'{name}.csv'
+        path.write_text(f'# unit: {unit.replace(" ", "_")}, type: T\n' + path.read_text())
+    assert run(tmp_path, '--out', tmp_path / 'out') == 0
+    assert {each.name for each in (tmp_path / 'out/models').iterdir()} == {
+        'T.yaml', 'T-unit-ä.yaml', 'T-unit-ö.yaml', 'T-unit-a_b.yaml', 'T-unit-a_b_.yaml'}
+
+
+def test_who_interrupts_is_told_how_to_continue(tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr('gyro_calibration.cli.fleet.finished', interrupted)
+    (tmp_path / 'a.csv').touch()
+    assert run(tmp_path, '--out', tmp_path / 'out') == 1
+    assert 'interrupted after 0 of 1 logs; run the same command' in capsys.readouterr().err
+
+
 def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
     write_log(tmp_path / 'a_unit1.csv', drive(0.01, 0))
     one = Task(Entry(str(tmp_path / 'a_unit1.csv')), str(tmp_path / 'out'))
@@ -175,6 +262,9 @@ def test_what_was_done_is_not_done_again_and_is_the_same_to_the_bit(tmp_path):
     assert first == done(one) and one.record.stat().st_mtime_ns == stamp
     assert first['unit'] == '1' and first['values']['bias']['value'] == pytest.approx(
         0.01, abs=4.0 * first['values']['bias']['deviation'])
+    renamed = done(replace(one, entry=Entry(one.entry.log, unit='7', temperature=21.0)))
+    assert renamed == {**first, 'unit': '7', 'temperature': 21.0}
+    assert one.record.stat().st_mtime_ns == stamp
     one.record.write_text('{"key": "of another version"}')
     assert done(one) == first and one.record.read_bytes() == kept
 
