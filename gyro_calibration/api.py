@@ -30,7 +30,7 @@ from typing import Any
 
 from gyro_calibration.allan import allan_deviation, AllanChart, even_record, fit_noise, NoiseFit
 from gyro_calibration.calibration.dwells import dwells, join
-from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
+from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration, is_motion
 from gyro_calibration.calibration.likelihood import Fit as RunFit
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection
@@ -377,6 +377,8 @@ def fit(*logs: Log, effects: Sequence[str] | None = None, technology: str | None
         return Fitted(_of(found.model, technology), encoder=found, _log=logs[0])
     table = join([dwells(log, name=str(number) if len(logs) > 1 else '')
                   for number, log in enumerate(logs)])
+    if method is None and not effects and is_motion(logs, table):
+        return fit(logs[0], technology=technology, method='likelihood')
     selection = (Selection(fit_effects(table, [STEADY[name] for name in effects]), (), ())
                  if effects else select_effects(table, technology))
     return Fitted(_of(selection.calibration.model, technology), selection)

@@ -25,10 +25,12 @@ between pieces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.course_over_ground import fit_course, is_course, PRIORS
+from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
 from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
@@ -106,7 +108,7 @@ class EncoderCalibration:
     method : one of `METHODS`
     fit : the same with noise and time offset, as found
     drift : of the bias after the fit; the wander is part of the bias's standard deviation
-    time : of the reference's samples, s, shape (n,)
+    reference : its headings over time, s since it began
     before, after : the residual heading without calibration and with it
     lost_samples : number missing between the stamps, where these are regular enough to tell
     remarks : what to know, one sentence each
@@ -117,7 +119,7 @@ class EncoderCalibration:
     method: str
     fit: Fit
     drift: Drift
-    time: Array
+    reference: Motion
     before: Residual
     after: Residual
     lost_samples: int
@@ -132,7 +134,8 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
 
     Parameters
     ----------
-    log : with time, output and reference heading; samples without a number count as lost
+    log : with time, output and reference heading, or a reference rate, which is integrated;
+        samples without a number count as lost
     method : 'likelihood', 'course' for a course over ground, or 'rate' for the regression of the
         encoder's rate on the gyro; None for 'course' where the reference is one, else 'likelihood'
     noise : of the gyro, if it is known; goes into the model
@@ -147,7 +150,8 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     """
     limits = limits or Limits(time_offset=LARGEST_TIME_OFFSET)
     time, output, motion = _pair(log)
-    method = method or ('course' if is_course(time, output, motion) else 'likelihood')
+    method = method or ('course' if log.reference_heading is not None
+                        and is_course(time, output, motion) else 'likelihood')
     if method == 'course':
         return _on_course(log, time, output, motion, noise, technology)
     _refuse_motion(motion, limits)
@@ -162,7 +166,7 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
                      _after(time, output, motion, fit))
     walk = fit.angle_random_walk if method == 'likelihood' else drift.angle_random_walk
     model = _model(output, log.temperature, fit, noise or Noise(walk))
-    return EncoderCalibration(model, method, fit, drift, motion.time, before, after, _lost(time),
+    return EncoderCalibration(model, method, fit, drift, motion, before, after, _lost(time),
                               _remarks(fit, method))
 
 
@@ -179,8 +183,17 @@ def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Nois
     remark = ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
               f'as of a gyro of the technology {technology} (--technology); '
               'the intervals hold that')
-    return EncoderCalibration(model, 'course', fit, drift, motion.time, before, after, _lost(time),
+    return EncoderCalibration(model, 'course', fit, drift, motion, before, after, _lost(time),
                               (remark,))
+
+
+#: Fewer leave nothing over for two values, bias and scale factor error.
+FEWEST_DWELLS = 3
+
+
+def is_motion(logs: Sequence[Log], table: Dwells) -> bool:
+    """Tell whether logs are one log in time that has not enough dwells for a fit."""
+    return len(logs) == 1 and logs[0].time is not None and len(table) < FEWEST_DWELLS
 
 
 #: Largest offset of gyro and encoder on one host, s; a swing may look alike half a period later.
@@ -191,11 +204,16 @@ LAG = 2e-4
 
 def _pair(log: Log) -> tuple[Array, Array, Motion]:
     """Return time and output of the gyro, and the reference motion, without lost samples."""
-    if log.time is None or log.output is None or log.reference_heading is None:
-        raise DataRefused('the log holds no reference heading over time: '
-                          'it needs the columns time_s, gyro_dps and reference_heading_deg')
+    heading, rate = log.reference_heading, log.reference_rate
+    if log.time is None or log.output is None or (heading is None and rate is None):
+        raise DataRefused('the log holds no reference over time: it needs the columns time_s, '
+                          'gyro_dps and reference_heading_deg or reference_rate_dps')
     refuse_wrapped(log)
-    answered, seen = np.isfinite(log.output), np.isfinite(log.reference_heading)
+    if heading is None:
+        assert rate is not None
+        known, heading = np.isfinite(rate), np.full(len(log), np.nan)
+        heading[known] = integrate(log.time[known], rate[known])
+    answered, seen = np.isfinite(log.output), np.isfinite(heading)
     for known, name in ((answered, 'gyro'), (seen, 'reference')):
         if known.sum() < max(100, 0.1 * len(log)):
             raise DataRefused(f'the {name} has a value in {known.sum()} of {len(log)} samples; '
@@ -203,7 +221,7 @@ def _pair(log: Log) -> tuple[Array, Array, Motion]:
                               'mend its line and record again')
     start = log.time[seen][0]
     return (log.time[answered] - start, log.output[answered],
-            from_headings(log.time[seen], log.reference_heading[seen]))
+            from_headings(log.time[seen], heading[seen]))
 
 
 def _refuse_length(motion: Motion) -> None:

@@ -13,12 +13,18 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gyro_calibration.calibration.dwells import dwells, join, take
-from gyro_calibration.calibration.encoder import calibrate_encoder, EncoderCalibration
+from gyro_calibration.calibration.encoder import (
+    calibrate_encoder,
+    EncoderCalibration,
+    FEWEST_DWELLS,
+    is_motion,
+)
 from gyro_calibration.calibration.rate_table import fit_effects
 from gyro_calibration.calibration.selection import select_effects, Selection, TECHNOLOGIES
 from gyro_calibration.cli import plots
@@ -52,7 +58,6 @@ from gyro_calibration.logs.log import Log
 from gyro_calibration.model.effects import Effect, rate_temperature_polynomial, STEADY
 from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import write_model
-import numpy as np
 
 METHODS = ('dwells', 'likelihood', 'course', 'rate')
 
@@ -76,7 +81,7 @@ def add(verbs: Any) -> argparse.ArgumentParser:
                       'instead; default: 3,2')
     parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
                         'selects between effects that the data do not distinguish, and the prior '
-                        'for a course over ground (default there: mems)')
+                        'beside a reference heading (default there: mems)')
     parser.add_argument('--name', dest='gyro_name', metavar='TEXT',
                         help='name of the gyro, stored in the model')
     parser.add_argument('--serial-number', metavar='TEXT', help='stored in the model')
@@ -144,6 +149,8 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     with under_way('dwells') as on_progress:
         table = join([dwells(log, name=Path(path).name if len(logs) > 1 else '')
                       for path, log in logs.items()])
+        if not effects and given.method is None and is_motion(list(logs.values()), table):
+            return _fit_heading(given, logs)
         on_progress(None, 'fit of effects')
         selection = (Selection(fit_effects(table, effects), (), ()) if effects
                      else select_effects(table, given.technology))
@@ -168,7 +175,7 @@ def _fit_dwells(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     return Answer('\n'.join([*lines, *written(given.out)]), data)
 
 
-# a reference heading
+# a reference heading, or a reference rate without dwells
 
 def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     if len(logs) > 1:
@@ -184,16 +191,27 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
     model = _stored(given, found.model)
     if given.picture:
         plots.draw_reference(given.picture, *headings(log, found))
+    remarks = (*_of_motion(log), *found.remarks)
     data = {'out': given.out, 'method': found.method, 'effects': value_data(model),
-            **model_data(model), **heading_data(found), 'remarks': list(found.remarks)}
+            **model_data(model), **heading_data(found), 'remarks': list(remarks)}
     lines = [f'{len(log)} samples of {path}, {found.lost_samples} lost.', *value_lines(model), '',
-             *heading_lines(found), *sentences(found.remarks)]
+             *heading_lines(found), *sentences(remarks)]
     return Answer('\n'.join([*lines, *written(given.out)]), data)
+
+
+def _of_motion(log: Log) -> Iterator[str]:
+    """Give the remark on a reference without headings."""
+    if log.reference_heading is None:
+        yield ('the log has a reference rate, and fewer than '
+               f'{FEWEST_DWELLS} stretches of constant rate; so the rate is integrated, and '
+               'headings are compared. For other effects than bias and scale factor error, hold '
+               'each rate for some seconds')
 
 
 def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, str]:
     """Return what `plots.draw_reference` takes."""
-    assert log.reference_heading is not None
-    true = log.reference_heading[np.isfinite(log.reference_heading)]
-    name = 'course over ground' if found.method == 'course' else 'encoder'
-    return found.time, true - true[0], found.before.heading, found.after.heading, name
+    name = ('course over ground' if found.method == 'course' else
+            'reference' if log.reference_heading is None else 'encoder')
+    heading = found.reference.heading
+    return (found.reference.time, heading - heading[0], found.before.heading, found.after.heading,
+            name)

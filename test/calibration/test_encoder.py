@@ -64,6 +64,13 @@ def test_a_late_gyro_is_found_late_and_nothing_else():
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
 
 
+def test_a_reference_rate_is_integrated():
+    log = replace(CLEAN, reference_heading=None, reference_rate=SWING.rate_at(CLEAN.time))
+    found = calibrate_encoder(log)
+    assert found.method == 'likelihood'
+    assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=2e-5)
+
+
 def test_the_model_has_the_angle_random_walk_that_is_stated_and_it_is_right():
     noise = Noise(angle_random_walk=5e-4)
     found = calibrate_encoder(log_of(SWING, 100.0, noise, np.random.default_rng(8)))
@@ -123,7 +130,7 @@ def test_a_reference_that_is_lost_at_times_is_bridged_by_the_gyro():
     found = calibrate_encoder(
         replace(CLEAN, reference_heading=np.where(lost, np.nan, CLEAN.reference_heading)))
     assert (found.fit.scale_factor_error, found.fit.bias) == pytest.approx((S, B), abs=5e-5)
-    assert len(found.time) == np.sum(~lost)
+    assert len(found.reference.time) == np.sum(~lost)
 
 
 def test_a_wrong_scale_of_the_reference_is_named_with_its_number():

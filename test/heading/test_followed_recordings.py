@@ -34,7 +34,7 @@ import pytest
 
 FOLLOWED = 300.0
 STARTS = (0.0, 290.0, 580.0, 870.0, 1160.0)
-#: Of the MPU-6050 at rest, as docs/findings.md gives it.
+#: Of the MPU-6050 at rest, with its vibration at 31 Hz.
 NOISE = Noise(0.64 * DEGREE / 60.0)
 #: The gyro is mounted upside down against the encoder in the first two.
 SENSES = {'yaw_slow': -1.0, 'yaw_fast': -1.0, 'pitch_slow': 1.0}
