@@ -147,6 +147,7 @@ class _Session:
 
     def __init__(self, given: argparse.Namespace, stop: threading.Event):
         self._given, self._stop = given, stop
+        self._is_mcap = bool(given.out.endswith('.mcap'))
         self._begin = self._flushed = time.monotonic()
         self._full: DiskFull | None = None
         self._recorder: Recorder = self._open()
@@ -169,14 +170,11 @@ class _Session:
 
     def _create(self, notes: Notes, expected: tuple[str, ...] = ()) -> Recorder:
         try:
-            return (McapRecorder(self._given.out, notes) if self._is_mcap()
+            return (McapRecorder(self._given.out, notes) if self._is_mcap
                     else CsvRecorder(self._given.out, notes, expected))
         except FileExistsError:
             raise UsageError(f'{self._given.out}: exists already, and recordings are never '
                              'overwritten; give a new name') from None
-
-    def _is_mcap(self) -> bool:
-        return bool(self._given.out.endswith('.mcap'))
 
     def run(self) -> None:
         """Record until it is to end, and close the file whatever happens."""
@@ -272,7 +270,16 @@ class _PortSession(_Session):
         return about(port=self._given.port, device=found.path,
                      protocol=protocol.name if protocol else '', baud=found.baud,
                      axis=self._settings.axis,
-                     **(_scale(protocol, self._settings) if protocol else {}))
+                     **(self._scale(protocol) if protocol else {}))
+
+    def _scale(self, protocol: Protocol) -> dict[str, str]:
+        """Return the scale of the device; columns in rad/s or deg/s have the unit in the name."""
+        settings, factor = self._settings, protocol.factor(self._settings)
+        angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
+                  if protocol.sends_angles(settings) else '')
+        sensitivity = ('' if protocol is CSV and settings.sensitivity is None
+                       else f'{abs(factor)!r} rad/s a unit of the device{angles}')
+        return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
 
     def _take(self, tick: Callable[[], None]) -> None:
         for chunk in self._connection.chunks(self._stop):
@@ -315,16 +322,6 @@ class _PortSession(_Session):
                 *([f'{warning}.'] if warning else []), *super()._remarks()]
 
 
-def _scale(protocol: Protocol, settings: Settings) -> dict[str, str]:
-    """Return the scale of the device; columns in rad/s or deg/s have their unit in their names."""
-    factor = protocol.factor(settings)
-    angles = (f', an angle at {protocol.nominal_rate(settings):g} Hz'
-              if protocol.sends_angles(settings) else '')
-    sensitivity = ('' if protocol is CSV and settings.sensitivity is None
-                   else f'{abs(factor)!r} rad/s a unit of the device{angles}')
-    return {'sensitivity': sensitivity, 'inverted': 'yes' if factor < 0.0 else 'no'}
-
-
 class _TopicSession(_Session):
     """Records what comes on topics."""
 
@@ -364,7 +361,7 @@ class _TopicSession(_Session):
 
     @property
     def samples(self) -> int:
-        return self._log.samples or (self._messages if self._is_mcap() else 0)
+        return self._log.samples or (self._messages if self._is_mcap else 0)
 
     @property
     def lost(self) -> int:
@@ -404,7 +401,7 @@ class _TopicSession(_Session):
     def _remarks(self) -> list[str]:
         log, remarks = self._log, [f'{topic}: {reason}; it was not recorded.'
                                    for topic, reason in self._unknown.items()]
-        left_out = '' if self._is_mcap() else ' and were left out'
+        left_out = '' if self._is_mcap else ' and were left out'
         remarks += [f'{wrong}; it was recorded as it is.'
                     for wrong in log.of_another_kind.values()]
         if log.damaged:

@@ -19,7 +19,7 @@ names each column with its unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 import csv
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,7 +29,7 @@ import itertools
 import math
 from pathlib import Path
 import reprlib
-from typing import Any, BinaryIO
+from typing import Any
 import zlib
 
 from gyro_calibration.files import (
@@ -205,7 +205,9 @@ def read_log_blocks(path: str | Path, sensitivity: float | None = None, rate: fl
 
     """
     count, last, compressed = 0, -math.inf, str(path).endswith('.gz')
-    with _refusing(path), opened(path, pipes=True) as file, _reading(file, compressed) as text:
+    with _refusing(path), opened(path, pipes=True) as file, io.TextIOWrapper(
+            gzip.GzipFile(fileobj=file) if compressed else file,  # type: ignore[arg-type]
+            encoding='utf-8-sig', newline='') as text:
         lines = _lines(text)
         table, first_line = _head(path, _bounded(lines, _HEAD), columns, axis)
         unfolded = 0
@@ -239,11 +241,6 @@ def _refusing(path: str | Path) -> Iterator[None]:
     except (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f'{path}: cannot be read as a log ({reason(error)}); '
                        'wanted a CSV file, .csv or .csv.gz') from error
-
-
-def _reading(file: BinaryIO, compressed: bool) -> io.TextIOWrapper:
-    data: Any = gzip.GzipFile(fileobj=file) if compressed else file
-    return io.TextIOWrapper(data, encoding='utf-8-sig', newline='')
 
 
 def _lines(text: io.TextIOWrapper) -> Iterator[str]:
@@ -395,7 +392,11 @@ def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[st
     try:
         values = np.array(texts, dtype=np.float64)
     except ValueError:
-        row = next(number for number, text in enumerate(texts) if not _is_number(text))
+        row = 0  # of the first that is no number
+        with suppress(ValueError):
+            for text in texts:
+                float(text)
+                row += 1
         raise LogError(f'{path}: line {places[row]}, column {name}: {reprlib.repr(texts[row])} '
                        'is not a number') from None
     wrong = _wrong(values, quantity)
@@ -420,14 +421,6 @@ def _most(quantity: str) -> float:
 def shown(text: str) -> str:
     """Return a text of a file for a message: not more than a line."""
     return plain(text[:100])
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _refuse_time(path: str | Path, places: Sequence[int], time: Array | None,
@@ -561,14 +554,11 @@ def write_log_blocks(path: str | Path,
                      blocks: Iterable[tuple[Log, Mapping[str, Array]]]) -> None:
     """Write a log in blocks with more named columns, as `write_log`; the first has the notes."""
     with (replacing(path) as file,
-          _compressing(file) if str(path).endswith('.gz') else nullcontext(file) as data):
+          # without a time in it, since the same log must give the same file
+          gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
+          if str(path).endswith('.gz') else nullcontext(file) as data):
         for number, (log, more) in enumerate(blocks):
             data.write(_text(log, more, headed=number == 0).encode('utf-8', 'backslashreplace'))
-
-
-def _compressing(file: BinaryIO) -> gzip.GzipFile:
-    # Without a time in it, since the same log must give the same file.
-    return gzip.GzipFile('', 'wb', compresslevel=6, fileobj=file, mtime=0)
 
 
 def _text(log: Log, more: Mapping[str, Array], headed: bool) -> str:

@@ -58,6 +58,12 @@ _ZSTANDARD_MAGIC = b'\x28\xb5\x2f\xfd'
 ABOUT, _MOST_CHARACTERS = 'gyro_calibration', 200
 
 _TABLES = {'topics', 'messages', 'message_definitions'}
+#: Row, topic, time and data of the messages; data of 64 KiB and more are not loaded.
+_ROWS = """
+    SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
+           CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
+           CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
+    FROM messages"""
 #: The errors of SQLite in a damaged file: its own, whose words need not be text, and a length that
 #: asks for more memory than there may be.
 _DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, MemoryError)
@@ -138,7 +144,8 @@ def files_of(path: str | Path) -> list[Path]:
     if not found:
         raise LogError(f'{path}: a folder without an .mcap or .db3 file; '
                        'name the folder of a ROS 2 recording, or a log file')
-    return sorted(found, key=_natural)
+    return sorted(found, key=lambda file: [
+        int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)])
 
 
 def read_messages(path: str | Path, contents: Contents,
@@ -158,11 +165,15 @@ def read_messages(path: str | Path, contents: Contents,
 
     """
     done = 0
+
+    def shifted(place: int) -> None:
+        on_progress(done + place)
+
     for file in files_of(path):
         try:
             with _unpacked_file(file) as source:
                 read = _from_mcap if _kind_of(file) == '.mcap' else _from_database
-                yield from read(source, file, contents, partial(_shifted, on_progress, done))
+                yield from read(source, file, contents, shifted)
             done += file.stat().st_size
         except OSError as error:
             raise LogError(f'{file}: cannot be read ({reason(error)}); '
@@ -173,17 +184,9 @@ def read_messages(path: str | Path, contents: Contents,
         contents.notes.append(f'{contents.left_out} damaged or oversized {parts} left out')
 
 
-def _shifted(on_progress: OnProgress, done: int, place: int) -> None:
-    on_progress(done + place)
-
-
 def _kind_of(path: Path) -> str | None:
     name = path.name.removesuffix('.zstd')
     return next((kind for kind in ('.mcap', '.db3') if name.endswith(kind)), None)
-
-
-def _natural(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
 
 
 @contextmanager
@@ -526,9 +529,11 @@ def _from_database(source: Path, path: Path, contents: Contents,
                    on_progress: OnProgress) -> Iterator[Message]:
     with _database(source, path) as (database, tables):
         channels, budget = _topics(database, tables, path, contents), _Budget(path)
-        size, last, count = path.stat().st_size, _last_row(database), 0
+        size, last, count = path.stat().st_size, sys.maxsize, 0
+        with suppress(*_DATABASE_ERRORS):  # only to show how far the reading is
+            last = int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
         try:
-            for row, topic, received, data in _rows(database):
+            for row, topic, received, data in database.execute(_ROWS):
                 count += 1
                 if count % 4096 == 0:
                     on_progress(int(size * row / last))
@@ -655,20 +660,3 @@ def _topics(database: sqlite3.Connection, tables: set[str], path: Path,
         raise LogError(f'{path}: its list of topics cannot be read ({_why(error)}); '
                        'record again') from error
     return channels
-
-
-def _last_row(database: sqlite3.Connection) -> int:
-    """Return the number of the last message, only to show how far the reading is."""
-    try:
-        return int(database.execute('SELECT max(rowid) FROM messages').fetchone()[0] or 1)
-    except _DATABASE_ERRORS:
-        return sys.maxsize
-
-
-def _rows(database: sqlite3.Connection) -> Iterator[Any]:
-    """Give row, topic, time and data of the messages; data of 64 KiB and more are not loaded."""
-    return database.execute("""
-        SELECT rowid, CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END,
-               CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END,
-               CASE WHEN typeof(data) = 'blob' AND length(data) < 65536 THEN data END
-        FROM messages""")

@@ -107,14 +107,14 @@ def _from_content(content: Any) -> GyroModel:
 
     def part(name: str, schema: Any) -> Any:
         return checked(name, top.get(name, {}), schema)
-    gyro = part('gyro', None)
+
     return GyroModel(
         terms,
         None if top.get('covariance') is None else _matrix('covariance', top['covariance'], size),
         _range('valid.rate', valid.get('rate')), temperature_range,
         number('reference_temperature', top.get('reference_temperature', middle)),
         Noise(**part('noise', dict.fromkeys(_NOISES, _noise))),
-        {name: text(f'gyro.{name}', value) for name, value in gyro.items()},
+        {name: text(f'gyro.{name}', value) for name, value in part('gyro', None).items()},
         part('origin', None), _self_calibration(top.get('self_calibration')),
         Tolerance(**part('tolerance', dict.fromkeys(Tolerance.__dataclass_fields__, _size))),
         part('noise_bounds', dict.fromkeys(_NOISES, _range)))
@@ -209,17 +209,11 @@ def _effect_of_matrix(place: str, rows: Any) -> tuple[Effect, tuple[float, ...]]
         raise WrongValue(place, rows, str(error)) from None
 
 
-def _scale_factor_error(place: str, value: Any) -> float:
-    return number(place, value, low=-0.9)
-
-
-def _temperature(place: str, value: Any) -> float | None:
-    return None if value is None else number(place, value)
-
-
-_OF_A_RUN = {'scale_factor_error': _scale_factor_error, 'bias': number, 'covariance': _matrix,
+_OF_A_RUN = {'scale_factor_error': lambda place, value: number(place, value, low=-0.9),
+             'bias': number, 'covariance': _matrix,
              'standard_deviations': {'scale_factor_error': _size, 'bias': _size}, 'time': text,
-             'temperature': _temperature, 'method': text}
+             'temperature': lambda place, value: value if value is None else number(place, value),
+             'method': text}
 
 
 def _self_calibration(value: Any) -> SelfCalibration | None:
@@ -247,10 +241,6 @@ def write_model(path: str | Path, model: GyroModel) -> tuple[int, int]:
 
 def model_text(model: GyroModel) -> str:
     """Return what a model file holds."""
-    return settings_text(_to_content(model))
-
-
-def _to_content(model: GyroModel) -> dict[str, Any]:
     content: dict[str, Any] = {'format': FORMAT, 'version': VERSION}
     content['effects'] = {term.effect.name: _term_content(term) for term in model.terms}
     if model.covariance is not None:
@@ -265,20 +255,15 @@ def _to_content(model: GyroModel) -> dict[str, Any]:
     content['gyro'] = dict(model.gyro)
     content['origin'] = dict(model.origin)
     if model.self_calibration is not None:
-        content['self_calibration'] = _self_calibration_content(model.self_calibration)
+        content['self_calibration'] = run = dict(vars(model.self_calibration))
+        covariance = run.pop('covariance')
+        if covariance is not None:
+            run['covariance'] = [list(row) for row in covariance]
+            run['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'),
+                                                  model.self_calibration.standard_deviations))
     if model.tolerance != Tolerance():
         content['tolerance'] = dict(vars(model.tolerance))
-    return content
-
-
-def _self_calibration_content(calibration: SelfCalibration) -> dict[str, Any]:
-    content = dict(vars(calibration))
-    covariance = content.pop('covariance')
-    if covariance is not None:
-        content['covariance'] = [list(row) for row in covariance]
-        content['standard_deviations'] = dict(zip(('scale_factor_error', 'bias'),
-                                                  calibration.standard_deviations))
-    return content
+    return settings_text(content)
 
 
 def _term_content(term: Term) -> dict[str, Any]:

@@ -134,8 +134,8 @@ def read_motion(path: str | Path) -> Motion:
 
     """
     try:
-        rows = csv.reader(line for line in _lines(path)
-                          if line.strip() and not line.startswith('#'))
+        lines = io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
+        rows = csv.reader(line for line in lines if line.strip() and not line.startswith('#'))
         header = [name.strip() for name in next(rows, [])]
         name = _moving_column(path, header)
         columns = {each: header.index(each) for each in ('time_s', name)}
@@ -162,10 +162,6 @@ def _moving_column(path: str | Path, header: list[str]) -> str:
         raise MotionError(f'{path}: the columns are {given}; wanted time_s and one of '
                           'heading_deg, heading_rad, rate_dps, rate_rad_s')
     return found[0]
-
-
-def _lines(path: str | Path) -> io.StringIO:
-    return io.StringIO(read_bytes(path, BYTES).decode('utf-8-sig'), newline=None)
 
 
 def _numbers(path: str | Path, rows: Iterable[list[str]],

@@ -26,7 +26,7 @@ from xml.sax.saxutils import escape
 
 from gyro_calibration.logs.log import Array
 from gyro_calibration.model.effects import Channels
-from gyro_calibration.model.gyro_model import GyroModel, Term
+from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.noise import GaussMarkov, Noise
 import numpy as np
 from scipy.optimize import minimize
@@ -210,7 +210,9 @@ def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list
     """
     text, names = _FORMATS[simulator](held)
     run, noise = model.self_calibration, model.noise
-    found = {term.effect.name: _values(term) for term in model.terms}
+    found = {term.effect.name: ', '.join(
+        f'{parameter.name} = {value:.6g} {parameter.unit}'
+        for parameter, value in zip(term.effect.parameters, term.values)) for term in model.terms}
     if run and run.scale_factor_error:
         found['scale_factor_error'] = f'{run.scale_factor_error:.6g} by the self-calibration'
     if held.bias:
@@ -220,22 +222,11 @@ def exported(held: Figures, model: GyroModel, simulator: str) -> tuple[str, list
     left_out = [f'{name}: {value}' for name, value in found.items() if name not in names]
     if simulator == 'mujoco' and held.white_noise:
         left_out.append('angle_random_walk: stored as noise; MuJoCo 3.1.4 and later add none')
-    return _commented(text, left_out, simulator), left_out
-
-
-def _values(term: Term) -> str:
-    """Return the values of an effect with their units."""
-    return ', '.join(f'{parameter.name} = {value:.6g} {parameter.unit}'
-                     for parameter, value in zip(term.effect.parameters, term.values))
-
-
-def _commented(text: str, left_out: list[str], simulator: str) -> str:
-    """Return a text with what is not in it as a comment before it."""
     if not left_out:
-        return f'{text}\n'
+        return f'{text}\n', left_out
     lines = ['Not held by this simulator:', *(f'  {each}' for each in left_out)]
     if simulator == 'isaac':
-        return '\n'.join([*(f'# {line}' for line in lines), text, ''])
+        return '\n'.join([*(f'# {line}' for line in lines), text, '']), left_out
     # two hyphens would end a comment of XML
     inside = escape('\n'.join(lines)).replace('--', '- -')
-    return f'<!-- {inside} -->\n{text}\n'
+    return f'<!-- {inside} -->\n{text}\n', left_out
