@@ -249,24 +249,6 @@ class RepeatedSamples:
         return len(lengths) == 1 and lengths[0] - 1 <= _ALIKE * max(usual)
 
 
-@dataclass(frozen=True)
-class _Explained:
-    """
-    What codes and noise explain of each change, arrays of shape (n - 1,).
-
-    Attributes
-    ----------
-    chance : of it to be none
-    again : the most that this is within a run of repeats
-    width : of the code that it begins in, rad/s
-
-    """
-
-    chance: Array
-    again: Array
-    width: Array
-
-
 def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: Mask,
                      level: float) -> RepeatedSamples | None:
     """
@@ -287,38 +269,40 @@ def repeated_samples(seen: Compared, codes: Codes, band: DeadBand | None, good: 
                 else np.nan_to_num(np.diff(seen.expected)))
     if not same.any():
         return None
-    explained = _explained_repeats(change, expected, steps_about(codes, seen.output[:-1]), known)
+    width = steps_about(codes, seen.output[:-1])
+    chance, again = _explained_repeats(change, expected, width, known)
     if band is not None:  # a sample in it repeats while the next is due in it
         within, chances = band.holds(seen.output[:-1]), band.chances(seen)[1:]
         chance, again = (np.where(within, np.maximum(each, chances), each)
-                         for each in (explained.chance, explained.again))
-        explained = _Explained(chance, again, np.where(within, 2.0 * band.half, explained.width))
+                         for each in (chance, again))
+        width = np.where(within, 2.0 * band.half, width)
     repeats, p_value = np.zeros(len(good), dtype=bool), 1.0
-    rare = (explained.chance < _COARSE) & known
-    excess, believed = int(np.count_nonzero(same & rare)), float(explained.chance[rare].sum())
+    rare = (chance < _COARSE) & known
+    excess, believed = int(np.count_nonzero(same & rare)), float(chance[rare].sum())
     by_number = (float(stats.poisson.sf(excess - 1, believed))
                  if excess > believed * (1.0 + _EXCESS) else 1.0)
     if by_number < level:
-        repeats[1:], p_value = same & (explained.chance < _RARE), by_number
+        repeats[1:], p_value = same & (chance < _RARE), by_number
     product, due = (np.concatenate([[0.0], np.cumsum(each)])
-                    for each in (np.log(np.maximum(explained.again, 1e-12)), expected))
+                    for each in (np.log(np.maximum(again, 1e-12)), expected))
     for start, stop in ((run.start, run.stop) for run in runs(same) if run.stop - run.start > 1):
-        if explained.chance[start:stop].max() < _COARSE:
+        if chance[start:stop].max() < _COARSE:
             unlikely = math.exp(max(product[stop] - product[start], -700.0))
         else:
             # Repeats of a coarse code depend on each other: stuck only if it should have left.
-            left = abs(due[stop] - due[start]) - explained.width[start]
+            left = abs(due[stop] - due[start]) - width[start]
             unlikely = (float(2.0 * stats.norm.sf(left / (math.sqrt(2.0) * deviation_of(seen))))
                         if left > 0.0 else 1.0)
         if unlikely * len(good) < level:
             repeats[start + 1:stop + 1], p_value = True, min(p_value, unlikely * len(good))
-    return (RepeatedSamples(repeats, float(explained.chance[known].sum()), p_value)
+    return (RepeatedSamples(repeats, float(chance[known].sum()), p_value)
             if repeats.any() else None)
 
 
-def _explained_repeats(change: Array, expected: Array, step: Array, known: Mask) -> _Explained:
+def _explained_repeats(change: Array, expected: Array, step: Array,
+                       known: Mask) -> tuple[Array, Array]:
     """
-    Return what codes and noise explain of each change.
+    Return the chance of each change to be none, and the most that this is within a run, (n - 1,).
 
     The chance is the part of a code that the sample before leaves for this one, averaged over the
     noise, among changes that are expected alike. The longer a run is, the likelier its code is the
@@ -343,7 +327,7 @@ def _explained_repeats(change: Array, expected: Array, step: Array, known: Mask)
             scale = np.maximum(deviation / math.sqrt(2.0), 1e-9 * steps)
             again[members] = np.maximum(ndtr(0.5 * (steps - due) / scale)
                                         - ndtr(-0.5 * (steps + due) / scale), chances[members])
-    return _Explained(chances, again, step)
+    return chances, again
 
 
 def _deviation_of_changes(change: Array, same: Mask, step: float) -> float:
