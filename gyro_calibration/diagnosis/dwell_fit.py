@@ -133,7 +133,7 @@ def seen(model: GyroModel) -> list[Term]:
             if term.effect.looks_at <= _SEEN and term.effect.distortion is None]
 
 
-def beside(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
+def without_effects(dwells: Dwells, model: GyroModel, refitted: Sequence[Effect] = ()) -> Dwells:
     """Return dwells whose output is without the effects of a model that are not refitted."""
     channels, names = surroundings(model, dwells), {effect.name for effect in refitted}
     return replace(dwells, output=dwells.output - sum(
@@ -162,7 +162,8 @@ def name_causes(dwells: Dwells, model: GyroModel | None, rate: float,
 
     """
     tested = model or GyroModel()
-    change, _ = supported_effects(beside(dwells, tested), technology(tested), rate=_CAUSES * rate)
+    change, _ = supported_effects(without_effects(dwells, tested), technology(tested),
+                                  rate=_CAUSES * rate)
     change = _without(change, without)
     change, needless = _counted_well(change, model, level_of(rate))
     guilty = tuple(each for each in change.effects if each not in (*NUISANCES, *needless)
@@ -197,7 +198,7 @@ def _refitted(dwells: Dwells, model: GyroModel, change: Calibration) -> Calibrat
     effects = tuple(
         other if (other := _confounder(each)) is not None and other.name in own - {each.name}
         else each for each in change.effects)
-    fit, _ = decided(fit_effects(beside(dwells, model, effects), effects, change.scatter),
+    fit, _ = decided(fit_effects(without_effects(dwells, model, effects), effects, change.scatter),
                      technology(model))
     return counted_from(fit, model.reference_temperature)
 

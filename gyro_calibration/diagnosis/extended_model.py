@@ -36,7 +36,7 @@ import numpy as np
 #: What must be known of a scale factor error for it to be believed.
 LIMITS = Limits()
 #: Effects that count from somewhere -> what comes of it beside them to count from elsewhere.
-_BESIDE: Mapping[str, Effect] = {
+_MADE_UP_BY: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
     'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
 
@@ -216,18 +216,18 @@ def _with(terms: tuple[Term, ...], new: Term) -> tuple[Term, ...] | None:
     old = next((term for term in terms if term.effect.name == new.effect.name), None)
     if old is None:
         return (*terms, new)
-    alike, *beside = _counted_like(old, new)
+    alike, *others = _counted_like(old, new)
     one = _one(old, alike)
     return None if one is None else _all(
-        tuple(one if term is old else term for term in terms), beside)
+        tuple(one if term is old else term for term in terms), others)
 
 
 def _counted_like(old: Term, new: Term) -> list[Term]:
     """Return a term that counts from another's reference, and the terms that make up for it."""
-    if new.effect.name not in _BESIDE or new.values[0] == old.values[0]:
+    if new.effect.name not in _MADE_UP_BY or new.values[0] == old.values[0]:
         return [new]
     begin, value = old.values[0], new.values[1]
-    way, other, alike = (begin - new.values[0], _BESIDE[new.effect.name],
+    way, other, alike = (begin - new.values[0], _MADE_UP_BY[new.effect.name],
                          Term(new.effect, (begin, value)))
     if new.effect is BIAS_TEMPERATURE_QUADRATIC:
         return [alike, Term(other, (begin, 2.0 * way * value)), Term(BIAS, (way ** 2 * value,))]

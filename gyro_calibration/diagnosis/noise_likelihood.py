@@ -12,7 +12,7 @@
 How much a residual speaks for a cause, whatever its noise.
 
 The transformed residual z and the columns X of all causes are summed once, band by band. For any
-noise the likelihood is then a little linear algebra on these sums, so that every cause is judged
+noise the likelihood is then a little linear algebra on these sums, so that every cause is tested
 under every noise of a grid, and a slow cause cannot hide in a random walk that was fitted before
 it. The evidence of a cause is the likelihood with it over the likelihood without, each averaged
 over the noises, at the most likely value of the cause (a flat prior, scaled so that for a known
@@ -184,34 +184,34 @@ def noise_likelihood(residuals: Array, nuisances: Array, columns: Array, starts:
     return NoiseLikelihood(likelihood, squares, towards, pull)
 
 
-def evidence(judged: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
+def evidence(by_noise: NoiseLikelihood, by: Marginalized, groups: Sequence[Group]) -> Array:
     """Return the evidence of candidates, shape (d, groups), -inf if like nuisances."""
     if not groups:
-        return np.empty((len(judged.squares), 0))
-    return np.column_stack([_evidence(judged, by, place, list(group))
+        return np.empty((len(by_noise.squares), 0))
+    return np.column_stack([_evidence(by_noise, by, place, list(group))
                             for place, group in enumerate(groups)])
 
 
-def _evidence(judged: NoiseLikelihood, by: Marginalized, place: int, group: list[int]) -> Array:
+def _evidence(by_noise: NoiseLikelihood, by: Marginalized, place: int, group: list[int]) -> Array:
     if by.unidentifiable[place]:
-        return np.full(len(judged.squares), -np.inf)
-    own, pull = by.left[place], judged.pull[:, :, group]
+        return np.full(len(by_noise.squares), -np.inf)
+    own, pull = by.left[place], by_noise.pull[:, :, group]
     own = own + 1e-10 * np.eye(len(group)) * _diagonal(own)[:, None]
     if len(group) == 1:
-        return _summary(judged, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]),
+        return _summary(by_noise, pull[..., 0] ** 2 / own[:, 0, 0], np.log(own[:, 0, 0]),
                         by.freedom, 1)
     gained = ((pull[:, :, None, :] @ np.linalg.inv(own))[:, :, 0] * pull).sum(axis=-1)
-    return _summary(judged, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
+    return _summary(by_noise, gained, np.linalg.slogdet(own)[1], by.freedom, len(group))
 
 
-def _summary(judged: NoiseLikelihood, gained: Array, logarithm: Array, freedom: float,
+def _summary(by_noise: NoiseLikelihood, gained: Array, logarithm: Array, freedom: float,
              size: int) -> Array:
     """Average over the noises: see the module."""
-    ratio = np.log1p(-np.minimum(gained / judged.squares, 1.0 - 1e-9))
-    change = 0.5 * (size * np.log(judged.squares) - (freedom - size) * ratio - logarithm)
-    best = judged.likelihood.argmax(axis=1)
-    scale = 0.5 * (logarithm[best] - size * np.log(judged.squares[np.arange(len(best)), best]))
-    return log_sum(judged.likelihood + change) + scale - log_sum(judged.likelihood)
+    ratio = np.log1p(-np.minimum(gained / by_noise.squares, 1.0 - 1e-9))
+    change = 0.5 * (size * np.log(by_noise.squares) - (freedom - size) * ratio - logarithm)
+    best = by_noise.likelihood.argmax(axis=1)
+    scale = 0.5 * (logarithm[best] - size * np.log(by_noise.squares[np.arange(len(best)), best]))
+    return log_sum(by_noise.likelihood + change) + scale - log_sum(by_noise.likelihood)
 
 
 def log_sum(logarithms: Array) -> Array:

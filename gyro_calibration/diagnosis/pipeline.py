@@ -70,13 +70,13 @@ from gyro_calibration.diagnosis.regression import (
 )
 from gyro_calibration.diagnosis.replay import Replay, replay
 from gyro_calibration.diagnosis.residuals import (
-    beside_model,
     curves,
     heading_curve,
     NAMES,
     noise_curve,
     noise_parameters,
     NoiseParameters,
+    residuals_of_model,
     what_is_left,
 )
 from gyro_calibration.diagnosis.search import (
@@ -251,7 +251,7 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     after = (with_findings(model, inside, quality, findings, noise, deviation) if offered
              else before)
     # Bias and scale factor error that differ by no more than chance are drawn as they fit best.
-    left, shown = (beside_model(found.replays) if changed else what_is_left(plain),
+    left, shown = (residuals_of_model(found.replays) if changed else what_is_left(plain),
                    inside if offered else plain)
     of_heading = shares([found.heading_changes(run, plain if model is None else None)
                          for run in range(len(replays))],

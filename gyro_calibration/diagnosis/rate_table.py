@@ -360,10 +360,10 @@ def _of_model(dwells: Dwells, model: GyroModel, fit: Calibration) -> Iterator[st
         yield ('The table holds no temperature; the model is simulated at '
                f'{model.reference_temperature:g} degC.')
     if any('output' in term.effect.looks_at for term in known):
-        yield from _beside_polynomial(dwells, known)
+        yield from _against_polynomial(dwells, known)
 
 
-def _beside_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
+def _against_polynomial(dwells: Dwells, known: list[Term]) -> Iterator[str]:
     named, _ = supported_effects(dwells)
     try:
         polynomial = fit_effects(dwells, [term.effect for term in known

@@ -187,10 +187,10 @@ class Fitted:
         `evidence`.
 
         """
-        judged, best = self.by_noise, int(self.by_noise.likelihood[0].argmax())
+        by_noise, best = self.by_noise, int(self.by_noise.likelihood[0].argmax())
         _, logarithm = np.linalg.slogdet(self.marginalized.own[best])
-        return float(log_sum(judged.likelihood)[0] + 0.5 * (
-            logarithm - len(self.columns) * np.log(judged.squares[0, best])))
+        return float(log_sum(by_noise.likelihood)[0] + 0.5 * (
+            logarithm - len(self.columns) * np.log(by_noise.squares[0, best])))
 
     def white(self) -> list[Array]:
         """Return the residual of each log, whitened in time to variance 1: shape (points,)."""
@@ -201,14 +201,14 @@ class Fitted:
         best = int(self.by_noise.likelihood[0].argmax())
         factor = self.problem.divided(best) * np.sqrt(
             self.marginalized.freedom / self.by_noise.squares[0, best])
-        return [part * own for part, own in zip(self.left(), self._parted(factor))]
+        return [part * own for part, own in zip(self.left(), self._by_log(factor))]
 
     def left(self) -> list[Array]:
         """Return coefficients of each log's residual over the first noise: shape (points - 1,)."""
         values, _ = self.estimates
-        return self._parted(self.residual - values @ self.columns)
+        return self._by_log(self.residual - values @ self.columns)
 
-    def _parted(self, coefficients: Array) -> list[Array]:
+    def _by_log(self, coefficients: Array) -> list[Array]:
         return np.split(coefficients,
                         np.cumsum([each.points - 1 for each in self.problem.replays])[:-1])
 
@@ -279,7 +279,7 @@ def fitted(whole: RegressionProblem, named: Sequence[Named],
         own = columns_of(candidate, replays)
         columns.append(own)
         owner += [(-2, 0)] * len(own)
-    return _judged(replace(whole, replays=tuple(replays)), whole.replays, tuple(named),
+    return _summed(replace(whole, replays=tuple(replays)), whole.replays, tuple(named),
                    residual / whole.deviation, np.concatenate(columns) / whole.deviation,
                    tuple(owner), tuple(widths))
 
@@ -381,21 +381,21 @@ def with_one_more(before: Fitted, candidate: Candidate) -> Fitted:
     else:
         residual = residual - candidate.amplitude * own[0]
     widths = (*before.widths, len(own) if candidate.amplitude is None else 0)
-    return _judged(before.problem, before.plain, (*before.named, Named(candidate)), residual,
+    return _summed(before.problem, before.plain, (*before.named, Named(candidate)), residual,
                    columns, owner, widths)
 
 
 def with_columns(before: Fitted, columns: Array) -> Fitted:
     """Put whitened columns more into a field, which belong to no cause."""
     owner = (*before.owner, *[(-2, 0)] * len(columns))
-    return _judged(before.problem, before.plain, before.named, before.residual,
+    return _summed(before.problem, before.plain, before.named, before.residual,
                    np.concatenate([before.columns, columns]), owner, before.widths)
 
 
-def _judged(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Named, ...],
+def _summed(whole: RegressionProblem, plain: tuple[Replay, ...], named: tuple[Named, ...],
             residual: Array, columns: Array, owner: tuple[tuple[int, int], ...],
             widths: tuple[int, ...]) -> Fitted:
-    """Sum whitened residual and columns, those that are independent, and judge them."""
+    """Sum whitened residual and independent columns, and find the likelihood of each noise."""
     kept = _independent(columns)
     of, nothing = columns[kept], np.empty((0, len(residual)))
     by = marginalized(of, nothing, (), whole.starts, whole.noises)

@@ -212,7 +212,7 @@ def what_is_left(found: FittedValues) -> list[Array]:
     return [residual - bias for residual, bias in zip(found.residuals, found.biases)]
 
 
-def beside_model(replays: Sequence[Replay]) -> list[Array]:
+def residuals_of_model(replays: Sequence[Replay]) -> list[Array]:
     """Return what a model that was given leaves of each log as it is, rad/s, shape (n,)."""
     return [each.channels.output - each.reference for each in replays]
 
@@ -229,7 +229,7 @@ def curves(before: Sequence[Array], after: FittedValues) -> list[Curve]:
     """
     replays = after.replays
     simulated = [each.added + error - rest
-                 for each, error, rest in zip(replays, beside_model(replays), before)]
+                 for each, error, rest in zip(replays, residuals_of_model(replays), before)]
     values = [np.concatenate([part[each.kept] for part, each in zip(parts, replays)])
               for parts in (before, what_is_left(after), simulated)]
     found = [_curve(name, unit, [of(each)[each.kept] for each in replays], values, after)
@@ -297,8 +297,8 @@ def _variances(after: FittedValues, bins: Sequence[NDArray[np.intp]]) -> Array:
 
 def _spectra(done: Fitted) -> list[Array]:
     """Return each log's variances of coefficients, averaged over noises, shape (points - 1,)."""
-    whole, judged = done.problem, done.by_noise
-    relative = (judged.probability[0] * judged.squares[0] / done.marginalized.freedom) @ (
+    whole, by_noise = done.problem, done.by_noise
+    relative = (by_noise.probability[0] * by_noise.squares[0] / done.marginalized.freedom) @ (
         1.0 / whole.noises.weights)
     count = np.diff(np.append(whole.starts, len(whole.deviation)))
     variance = whole.deviation ** 2 * np.repeat(relative, count)
