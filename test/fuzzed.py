@@ -109,7 +109,7 @@ def _file(data: bytes, suffix: str) -> Path:
     return path
 
 
-def _said(error: Exception | str, path: object = '') -> None:
+def _check_message(error: Exception | str, path: object = '') -> None:
     """Check that an error is one line and names its file."""
     text = str(error)
     assert text.startswith(str(path)), text
@@ -158,11 +158,11 @@ def pieces(data: bytes) -> list[bytes]:
 
 def check_decoder(wire: _Wire, data: bytes) -> int:
     """Check that pieces of any bytes give the same finite samples, and two frames recover."""
-    whole, parted = (wire.protocol.decoder(wire.settings) for _ in range(2))
+    whole, in_pieces = (wire.protocol.decoder(wire.settings) for _ in range(2))
     samples = whole.feed(data)
-    assert [sample for piece in pieces(data) for sample in parted.feed(piece)] == samples
+    assert [sample for piece in pieces(data) for sample in in_pieces.feed(piece)] == samples
     counts = [(each.discarded_bytes, each.faults, each.refused_samples)
-              for each in (whole, parted)]
+              for each in (whole, in_pieces)]
     assert counts[0] == counts[1], counts
     for sample in samples:
         numbers = (sample.output, sample.temperature, sample.time, sample.specific_force,
@@ -221,7 +221,7 @@ def _parts(wire: _Wire) -> tuple[bytes, ...]:
 def check_listening(data: bytes) -> bool:
     found = recognize(data)
     assert 0.0 <= found.explained <= 1.0 and found.words
-    _said(found.words)
+    _check_message(found.words)
     return found.protocol is not None
 
 
@@ -284,12 +284,12 @@ def check_log(data: bytes, suffix: str = '.csv') -> bool:
     try:
         log = read_log(path)
     except LogError as error:
-        _said(error, path)
+        _check_message(error, path)
         log = None
     try:
         blocks = list(read_log_blocks(path, rows=2))
     except LogError as error:
-        _said(error, path)
+        _check_message(error, path)
         assert log is None, 'refused in blocks only'
         return False
     assert log is not None, 'refused as a whole only'
@@ -333,7 +333,7 @@ def check_model(data: bytes) -> bool:
     try:
         model = read_model(path)
     except ModelError as error:
-        _said(error, path)
+        _check_message(error, path)
         return False
     noise, values = (vars(model.noise).values(),
                      [value for term in model.terms for value in term.values])
@@ -366,7 +366,7 @@ def check_bias_table(data: bytes) -> bool:
     path = _file(data, '.yaml')
     table, said = read_bias_table(path, GyroModel())
     if said:
-        _said(said, '' if said.startswith('the bias') else path)
+        _check_message(said, '' if said.startswith('the bias') else path)
         return False
     with np.errstate(all='ignore'):
         bias, variance = table.predict(25.0, 1.7e9)
@@ -395,7 +395,7 @@ def check_profile(data: bytes) -> bool:
     try:
         motion = read_motion(path)
     except MotionError as error:
-        _said(error, path)
+        _check_message(error, path)
         return False
     times = np.linspace(-1.0, motion.duration + 1.0, 9)
     assert (np.isfinite(motion.heading_at(times)).all()
@@ -414,7 +414,7 @@ def check_limits(data: bytes) -> bool:
     try:
         ability = read_limits(str(path))
     except UsageError as error:
-        _said(error, path)
+        _check_message(error, path)
         return False
     assert all(not math.isnan(value) for value in vars(ability).values())
     return True
@@ -431,11 +431,11 @@ def check_recording(suffix: str, data: bytes) -> bool:
         with np.errstate(all='ignore'):
             log = read_recording(path, Topics(reference='table'))
     except LogError as error:
-        _said(error, path)
+        _check_message(error, path)
     try:
         log = read_recording(path)
     except LogError as error:
-        _said(error, path)
+        _check_message(error, path)
         return False
     assert log.time is not None and (np.diff(log.time) > 0.0).all() and np.isfinite(log.time).all()
     assert not np.isinf(log.output).any()
@@ -501,7 +501,7 @@ def _database_seeds() -> list[bytes]:
 
 # What people and launch files give
 
-def wild_value(data: bytes) -> object:
+def any_value(data: bytes) -> object:
     """Return a value of any of the types that a parameter may be given, made of bytes."""
     kind, rest = data[0] % 9 if data else 0, data[1:]
     text = rest.decode('utf-8', 'surrogateescape')
@@ -514,11 +514,11 @@ def check_parameters(data: bytes) -> bool:
     from gyro_calibration.ros.driver_node import PARAMETERS as OF_DRIVER
     from gyro_calibration.ros.pipeline import PARAMETERS
     table = [*PARAMETERS, *OF_DRIVER]
-    parameter, value = table[(data[0] if data else 0) % len(table)], wild_value(data[1:])
+    parameter, value = table[(data[0] if data else 0) % len(table)], any_value(data[1:])
     try:
         accepted = parameter.check(value)
     except ValueError as error:
-        _said(error, f'parameter {parameter.name}')
+        _check_message(error, f'parameter {parameter.name}')
         return False
     assert (isinstance(accepted, (bool, int, float, str, list))
             and not (isinstance(accepted, str) and '\0' in accepted))

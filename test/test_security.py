@@ -89,7 +89,7 @@ def test_what_is_imported_late_is_named_in_the_code():
 
 @pytest.mark.parametrize('kind', ['idlelib/idle/Imu', 'os', 'os/path', 'a.b/msg/Imu', '../msg/Imu',
                                   'sensor_msgs/srv/SetCameraInfo', ''])
-def test_nobody_in_the_graph_chooses_what_a_recorder_imports(kind):
+def test_a_kind_of_message_chooses_no_module_that_a_recorder_imports(kind):
     pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
     from gyro_calibration.ros.recorder_node import load
     with pytest.raises(ImportError, match='no kind of messages'):
@@ -247,10 +247,10 @@ def test_every_topic_that_a_node_can_make_is_in_the_policy():
 @pytest.mark.parametrize('enclave', ['operator', 'technician'])
 def test_a_client_may_what_every_node_has_and_what_it_is_for(enclave, ros, wait_until):
     offered = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'service'}
-    told = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'publisher'}
+    published = {name for node in SETTINGS for kind, name in allowed(node) if kind == 'publisher'}
     mine = allowed(enclave)
     assert {name for kind, name in mine if kind == 'client'} <= offered
-    assert {name for kind, name in mine if kind == 'subscriber'} <= told | {'/clock'}
+    assert {name for kind, name in mine if kind == 'subscriber'} <= published | {'/clock'}
     plain = {(kind, name.replace(enclave, 'test_client'))
              for kind, name in mine if kind in ('publisher', 'service')}
     wait_until(lambda: really(ros.node, 'test_client', '/') == plain, what=f'{plain}')

@@ -342,17 +342,17 @@ def test_the_step_of_an_encoder_is_seen_in_its_headings(generator):
 # Deviations
 
 def test_variances_that_differ_by_chance_become_one(generator):
-    told = [moderated(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)]
+    found = [moderated(generator.chisquare(11, 40) / 11.0, np.full(40, 11)) for _ in range(200)]
     # Alone, each would err by 43 %.
-    assert np.sqrt(np.mean((np.array(told) - 1.0) ** 2)) < 0.15
-    assert np.mean(told) == pytest.approx(1.0, abs=0.02)
+    assert np.sqrt(np.mean((np.array(found) - 1.0) ** 2)) < 0.15
+    assert np.mean(found) == pytest.approx(1.0, abs=0.02)
 
 
 def test_variances_that_really_differ_stay_so(generator):
     truth = np.repeat([1.0, 100.0], 20)
-    told = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
+    found = np.mean([moderated(truth * generator.chisquare(11, 40) / 11.0, np.full(40, 11))
                     for _ in range(200)], axis=0)
-    assert np.allclose(told / truth, 1.0, atol=0.25)
+    assert np.allclose(found / truth, 1.0, atol=0.25)
 
 
 # Recordings

@@ -272,7 +272,7 @@ def test_the_verb_writes_a_profile_and_says_what_it_is_worth(run, limits, tmp_pa
     assert answer['drive_s'] == 160.0 and answer['built_in_within_limits'] is False
 
 
-def test_the_verb_speaks_to_people(run, limits, tmp_path, monkeypatch):
+def test_the_verb_prints_a_summary(run, limits, tmp_path, monkeypatch):
     monkeypatch.setattr('gyro_calibration.cli.plan.LENGTHS', (12.0,))
     write_motion(tmp_path / 'drive.csv', from_rates(np.array([0.0, 10.0]), np.array([0.5, 0.5])))
     code, text, _ = run('plan', '--limits', limits(), '--seconds', 10,

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations
 # under the License.
 
-"""Calibration from dwells: on simulated rate tables of known truth, and beside least squares."""
+"""Calibration from dwells: on simulated rate tables of known truth, and against least squares."""
 
 from dataclasses import replace
 import math
@@ -252,10 +252,10 @@ def test_what_one_sweep_alone_shows_cannot_be_left_out():
 
 def test_an_outlying_dwell_is_not_fitted():
     table = measured(SINE)
-    wild = replace(table,
-                   output=table.output + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
+    off = replace(table, output=table.output
+                  + np.where(np.arange(len(table)) == 30, 0.5 * DEGREE, 0.0))
     effects, others = [term.effect for term in SINE], np.arange(len(table)) != 30
-    fit = fit_effects(wild, effects)
+    fit = fit_effects(off, effects)
     clean = fit_effects(take(table, others), effects,
                         replace(fit.scatter, kept=np.ones(167, bool)))
     assert np.flatnonzero(~fit.scatter.kept).tolist() == [30]
@@ -333,7 +333,7 @@ def test_fewer_dwells_than_values_are_refused():
 # a polynomial of the output
 
 def test_a_likelihood_of_the_scatter_does_not_reward_a_polynomial_that_takes_the_output_away(data):
-    """On this table 0.1.0 stated t0w1 = 0.097 +- 46 deg/s, beside a residual of 0.045."""
+    """On this table 0.1.0 stated t0w1 = 0.097 +- 46 deg/s, with a residual of 0.045."""
     fit = fit_effects(from_table(read_log(data / 'fog_rate_table' / 'table.csv')),
                       [rate_temperature_polynomial(3, 2)])
     assert np.sqrt(np.diag(fit.model.covariance)).max() < 2.0 * fit.residual_rms

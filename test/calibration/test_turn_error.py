@@ -303,9 +303,9 @@ def test_an_outlying_dwell_is_named_and_left_out(run, log, model, tmp_path):
     lines = log.read_text().splitlines()
     cells = lines[4].split(',')
     lines[4] = ','.join([str(float(cells[0]) + 1.0), *cells[1:]])
-    (tmp_path / 'wild.csv').write_text('\n'.join(lines))
+    (tmp_path / 'outlying.csv').write_text('\n'.join(lines))
     assert ('1 outlying dwells are left out: row 4'
-            in run(tmp_path / 'wild.csv', '--model', model)[1])
+            in run(tmp_path / 'outlying.csv', '--model', model)[1])
 
 
 def test_a_log_in_time_is_a_table_of_the_dwells_that_are_found_in_it(run, model, tmp_path):

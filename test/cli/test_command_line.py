@@ -78,7 +78,7 @@ def test_compensate_says_how_sure_it_is(run, log, tmp_path):
     assert deviation[-1] == pytest.approx(7.3e-4 * math.sqrt(20.0), rel=1e-6)
 
 
-def test_compensate_claims_no_deviation_where_the_model_knows_of_none(run, model, log, tmp_path):
+def test_compensate_claims_no_deviation_where_the_model_has_none(run, model, log, tmp_path):
     code, text, _ = run('compensate', log, '--model', model, '--out', tmp_path / 'out.csv')
     assert code == 0 and 'Heading at the end' in text and '+-' not in text
     answer = json.loads(

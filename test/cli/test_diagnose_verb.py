@@ -66,7 +66,7 @@ def diagnose(run, tmp_path):
     return diagnose
 
 
-def told(answer):
+def answer_of(answer):
     """Return what the program printed with --json, as data."""
     code, text, errors = answer
     assert code == 0, errors
@@ -94,14 +94,14 @@ def test_the_files_hold_what_they_say(diagnosed):
     folder, (code, text, errors) = diagnosed
     assert code == 0 and 'warm up' in text and not errors
     assert set(os.listdir(folder / 'found')) == FILES
-    told = json.loads((folder / 'found/diagnosis.json').read_text())
-    assert told['schema'] == 'gyro_calibration/diagnosis/2' and told[
-        'verdict'] == 'extended' and told['false_alarm_rate'] == 0.01
+    found = json.loads((folder / 'found/diagnosis.json').read_text())
+    assert found['schema'] == 'gyro_calibration/diagnosis/2'
+    assert found['verdict'] == 'extended' and found['false_alarm_rate'] == 0.01
     assert [finding['effect']
-            for finding in told['findings']] == ['warm_up'] and told['unexplained'] == []
-    check_finding(told['findings'][0])
-    assert set(told['noise']) == {'angle_random_walk', 'bias_instability', 'rate_random_walk'}
-    gain = told['gain']
+            for finding in found['findings']] == ['warm_up'] and found['unexplained'] == []
+    check_finding(found['findings'][0])
+    assert set(found['noise']) == {'angle_random_walk', 'bias_instability', 'rate_random_walk'}
+    gain = found['gain']
     assert gain['held_out'] and gain['heading_rms']['window_s'] == 60
     assert all(gain[name]['after'] < gain[name]['before'] and is_interval(gain[name]['ci95'])
                for name in ('rate_rms', 'heading_rms'))
@@ -125,8 +125,9 @@ def test_the_extended_model_is_adequate_for_the_log_that_it_came_from(diagnosed,
     folder, _ = diagnosed
     code, text, _ = run('diagnose', folder / 'drive.csv', '--model', folder / 'found/model.yaml',
                         '--json')
-    told = json.loads(text)
-    assert code == 0 and told['verdict'] == 'adequate' and told['gain'] is None, told['findings']
+    found = json.loads(text)
+    assert code == 0 and found['verdict'] == 'adequate', found['findings']
+    assert found['gain'] is None
 
 
 def test_the_extended_model_simulates_and_compensates(diagnosed, log, run, tmp_path):
@@ -145,7 +146,7 @@ def test_several_logs_of_a_gyro_are_one_diagnosis(run, tmp_path):
     for name, log in zip(names, hide(['warm_up'], 8.0, np.random.default_rng(3), noise='white',
                                      runs=2, **SHORT)):
         write_log(tmp_path / name, log_of(log))
-    answer = told(run('diagnose', *(tmp_path / name for name in names), '--json'))
+    answer = answer_of(run('diagnose', *(tmp_path / name for name in names), '--json'))
     assert [name.rpartition('/')[2] for name in answer['logs']] == names
     assert [finding['effect'] for finding in answer['findings']] == ['warm_up']
 
@@ -175,11 +176,11 @@ def test_a_model_of_other_units_is_the_finding_alone(log, diagnose, tmp_path):
     (tmp_path / 'wrong.yaml').write_text('effects: {scale_factor_error: {scale_factor_error: '
                                          '56.3}}\n')
     code, text, _ = diagnose(log, '--model', tmp_path / 'wrong.yaml', '--json')
-    told = json.loads(text)
-    (finding,) = told['findings']
-    assert code == 0 and told['verdict'] == 'mismatched' and finding['effect'] == 'model'
+    found = json.loads(text)
+    (finding,) = found['findings']
+    assert code == 0 and found['verdict'] == 'mismatched' and finding['effect'] == 'model'
     assert 'write it in rad/s' in finding['remedy']
-    assert {gate['name']: gate['passed'] for gate in told['gates']}['model'] is False
+    assert {gate['name']: gate['passed'] for gate in found['gates']}['model'] is False
 
 
 @pytest.mark.parametrize('words', [('--model', 'missing.yaml'), ('--seed', '-1'), ('--model',)],
@@ -211,7 +212,7 @@ def say(diagnose, run, tmp_path):
     """Return a function that diagnoses a log and gives the answer as data."""
     def say(log, *words):
         write_log(tmp_path / 'given.csv', log)
-        return told(run('diagnose', tmp_path / 'given.csv', *words, '--json'))
+        return answer_of(run('diagnose', tmp_path / 'given.csv', *words, '--json'))
     return say
 
 

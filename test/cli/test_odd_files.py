@@ -115,7 +115,7 @@ def test_what_is_no_file_is_neither_replaced_nor_removed_as_a_leftover(kind, fol
     assert {path.name: stat.S_IFMT(path.lstat().st_mode) for path in folder.iterdir()} == before
 
 
-def test_a_pipe_is_read_where_somebody_writes_to_it_late(tmp_path):
+def test_a_pipe_that_is_written_to_late_is_read(tmp_path):
     os.mkfifo(tmp_path / 'log.csv')
     writer = ('import sys, time; file = open(sys.argv[1], "w"); time.sleep(2); '
               'print("gyro_dps\\n1\\n2", file=file)')

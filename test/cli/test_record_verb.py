@@ -164,7 +164,7 @@ def test_where_a_hangup_is_ignored_a_recording_goes_on():
 
 
 def test_it_ends_by_itself_and_writes_over_nothing(run, tmp_path):
-    """Where columns have a unit, no sensitivity stands beside it."""
+    """Where columns have a unit, no sensitivity is noted."""
     with gyro(tmp_path / 'gyro'):
         code, out, error = run(*words_for(tmp_path / 'gyro', tmp_path / 'a.csv', '--seconds', '2'))
         assert code == 0 and f'0 lost, written to {tmp_path / "a.csv"}.' in out, (out, error)
@@ -213,7 +213,7 @@ def angles(link, rate=100.0):
     pytest.param(['--increments', 'never'], 2, 0.001, 1.0, marks=pytest.mark.evidence),
 ])
 def test_angles_at_another_rate_are_reported(run, tmp_path, options, seconds, rate, factor):
-    """Where nothing is to be told is tested in test_driver_report.py, without a port."""
+    """Where there is no remark is tested in test_driver_report.py, without a port."""
     with angles(tmp_path / 'gyro'):
         words = ['--port', tmp_path / 'gyro', '--protocol', 'kvh_1750', '--seconds', seconds]
         code, out, error = run('record', *words, '--out', tmp_path / 'a.csv', '--json', *options)
@@ -501,7 +501,7 @@ def test_a_topic_or_a_domain_that_cannot_be_is_one_sentence(
     assert not (tmp_path / 'a.csv').exists()
 
 
-def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_domain):
+def test_late_publishers_are_looked_for_by_a_steady_clock(ros_domain):
     from gyro_calibration.ros.recorder_node import RecorderNode
     import rclpy
     from rclpy.clock import ClockType
@@ -513,7 +513,7 @@ def test_late_publishers_are_looked_for_whatever_somebody_sets_the_clock_to(ros_
     rclpy.shutdown(context=context)
 
 
-def test_topics_that_nobody_publishes_are_reported(ros_domain, record, tmp_path):
+def test_topics_without_a_publisher_are_reported(ros_domain, record, tmp_path):
     code, out, error = record('record', '--out', tmp_path / 'a.csv', '--seconds', 2).end()
     assert (code, out) == (1, '')
     assert 'no sample was received in' in error and 'ROS_DOMAIN_ID' in error

@@ -55,7 +55,7 @@ def test_samples_come_with_stamps_that_increase():
         [0.5] * len(stamps))
 
 
-def test_the_port_is_closed_when_nobody_takes_samples_any_more():
+def test_the_port_is_closed_when_the_reading_stops():
     with Emulator(find('csv'), turning()) as gyro:
         for _ in range(2):
             for chunk in Connection(gyro.path, 'csv').chunks(threading.Event()):

@@ -88,7 +88,7 @@ def test_the_mean_of_ten_samples_has_a_tenth_of_the_variance():
     assert filled(Sample(0.5), 10).imu.angular_velocity_covariance[8] == pytest.approx(1e-5)
 
 
-def test_the_temperature_has_the_stamp_of_its_rate_and_no_variance_that_nobody_measured():
+def test_the_temperature_has_the_stamp_of_its_rate_and_an_unknown_variance():
     messages = filled(Sample(0.5, -12.25))
     assert messages.temperature.header == messages.imu.header
     assert (messages.temperature.temperature, messages.temperature.variance) == (-12.25, 0.0)
@@ -172,7 +172,7 @@ def test_losses_of_the_last_second_are_a_warning_with_their_counts():
             and reports[-1][2]['refused_samples'] == 4)
 
 
-def test_supply_and_source_current_are_reported_and_judged():
+def test_supply_and_source_current_are_reported_and_checked():
     world, given = World(10.0), Settings(sensitivity=1e-6)
     encode = find('fizoptika').encoder(given)
     health = {'supply_v': 5.0, 'source_current_a': 0.05, 'diagnostic_v': 1.0}

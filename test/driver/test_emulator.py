@@ -91,7 +91,7 @@ def test_samples_are_pulled_one_by_one():
         assert len(pulled) <= len(received) + 1
 
 
-def test_bytes_that_nobody_reads_are_lost_in_real_time(wait_until):
+def test_bytes_that_are_not_read_are_lost_in_real_time(wait_until):
     with Emulator(find('csv'), samples(rate=1000.0)) as emulator:
         wait_until(lambda: emulator.lost_bytes > 1000)
         assert emulator.sent_bytes == 0

@@ -19,25 +19,25 @@ INTERVAL = 0.01
 
 def driven(step, seen=0, lost=0, others=0.0):
     """Return times of samples and others; the clock is set midway, seen `seen` samples early."""
-    stamps, times, beside = HostClock(), [], []
+    stamps, times, others_times = HostClock(), [], []
     for number in range(200):
         now = INTERVAL * number
         if 100 <= number < 100 + lost:
             continue
         stamps.watch(now + 1e-4, 1e9 + now + (step if number >= 100 - seen else 0.0))
         stamp = 5.0 + now + (step if number >= 100 else 0.0)
-        beside.append(stamps.of_other(stamp + others, times[-1] if times else stamp))
+        others_times.append(stamps.of_other(stamp + others, times[-1] if times else stamp))
         times.append(stamps.of_sample(stamp, times[-1] if times else -np.inf, INTERVAL))
-    return np.array(times), np.array(beside), stamps
+    return np.array(times), np.array(others_times), stamps
 
 
 @pytest.mark.parametrize('step', [3600.0, -3600.0, 2e7, 0.5, -0.3])
 @pytest.mark.parametrize('seen', [0, 5])
 def test_times_go_on_where_the_clock_is_set(step, seen):
-    times, beside, stamps = driven(step, seen)
+    times, others_times, stamps = driven(step, seen)
     assert (np.diff(times) == pytest.approx(np.full(199, INTERVAL), abs=1e-6)
             and stamps.steps.count == 1)
-    assert (beside == pytest.approx(times, abs=1e-6)
+    assert (others_times == pytest.approx(times, abs=1e-6)
             and stamps.steps.last == pytest.approx(step, abs=1e-6))
 
 

@@ -218,8 +218,8 @@ def test_a_reference_that_comes_too_late_for_a_column_is_reported(topic, first, 
 
 
 def test_about_names_the_program_and_leaves_out_what_is_not_known():
-    told = about(port='/dev/ttyUSB0', protocol='', baud=None)
-    assert set(told) == {'recorded by', 'date', 'port'}
+    known = about(port='/dev/ttyUSB0', protocol='', baud=None)
+    assert set(known) == {'recorded by', 'date', 'port'}
 
 
 # Messages of topics into a log

@@ -215,7 +215,7 @@ def test_samples_at_a_rate_go_on_from_block_to_block(tmp_path):
     assert [block.output.tolist() for block in blocks] == [[0.5] * 3, [0.5] * 3, [0.5]]
 
 
-def test_of_strangers_with_one_name_none_is_lost(tmp_path):
+def test_of_other_columns_with_one_name_none_is_lost(tmp_path):
     log = read_log(written(tmp_path, 'gyro_dps,lap,lap,lap.1,,\n0,a,b,c,d,e\n1,f,g,h,i,j\n'))
     assert log.others == {'lap': ('a', 'f'), 'lap.2': ('b', 'g'), 'lap.1': ('c', 'h'),
                           '': ('d', 'i'), '.1': ('e', 'j')}
@@ -235,14 +235,14 @@ def test_at_a_rate_the_stamps_may_be_broken(tmp_path, stamps):
         read_log(path)
 
 
-def test_numbers_are_the_same_whether_other_columns_stand_beside_them_or_not(tmp_path):
+def test_numbers_are_the_same_with_and_without_other_columns(tmp_path):
     """Columns of text are read by another parser than columns of numbers alone."""
     texts = ['1', '-0.1', '1e-7', ' 2.5 ', '+3', 'nan', '0.1000000000000000055511151231257827',
              '12345678901234567890', '.5', '5.', '1_0']
     alone = read_log(written(tmp_path, 'gyro_rad_s\n' + ''.join(f'{text}\n' for text in texts)))
-    beside = read_log(written(tmp_path,
-                              'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
-    assert np.array_equal(alone.output, beside.output, equal_nan=True)
+    with_others = read_log(written(
+        tmp_path, 'gyro_rad_s,lap\n' + ''.join(f'{text},a\n' for text in texts)))
+    assert np.array_equal(alone.output, with_others.output, equal_nan=True)
     assert np.array_equal(alone.output, [float(text) for text in texts], equal_nan=True)
 
 

@@ -283,7 +283,7 @@ def test_a_torn_database_is_read_up_to_the_tear(make, tmp_path):
     assert any('read up to there' in note for note in log.notes)
 
 
-def test_what_a_killed_writer_left_beside_its_database_is_read(tmp_path):
+def test_what_a_killed_writer_left_with_its_database_is_read(tmp_path):
     with contextlib.closing(sqlite3.connect(tmp_path / 'live.db3')) as database:
         database.execute('PRAGMA journal_mode=WAL')
         database.execute('CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '

@@ -106,7 +106,7 @@ def test_blocks_of_a_log_say_what_the_whole_says(cuts):
     assert np.hstack(pieces) == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
-def test_a_lag_goes_on_in_blocks_in_which_nobody_asks_for_it():
+def test_a_lag_goes_on_in_blocks_that_do_not_use_it():
     history, (temperature, *_) = History(), surroundings(UNEVEN)
     history.follow(UNEVEN[:10], temperature[:10]).lagged('temperature', 20.0)
     history.follow(UNEVEN[10:2000], temperature[10:2000])

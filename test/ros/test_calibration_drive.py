@@ -105,10 +105,10 @@ def faults():
         'stamps stand': (lambda rig: setattr(rig.robot, 'stamps_stand', True), 'no sample came'),
         'soft stop': (lambda rig: setattr(rig, 'other', 0.0), 'another node sent a command'),
         'teleop': (lambda rig: setattr(rig, 'other', 0.3), 'another node sent a command'),
-        'nobody obeys': (lambda rig: setattr(rig, 'receivers', 0), 'no other node receives'),
+        'no receiver': (lambda rig: setattr(rig, 'receivers', 0), 'no other node receives'),
         'two publishers': (lambda rig: rig.publishers.append('/other'), '2 publishers send'),
         'forbidden': (lambda rig: rig.set(calibration_drive=False), 'calibration.drive was set'),
-        'caller gone': (lambda rig: setattr(rig, 'callers', 0), 'that called calibrate has ended'),
+        'no caller': (lambda rig: setattr(rig, 'callers', 0), 'that called calibrate has ended'),
         'cancelled': (lambda rig: rig.session.cancel(), 'cancelled'),
     }
 
@@ -127,7 +127,7 @@ def test_a_fault_in_mid_run_stops_the_robot_within_half_a_second(tmp_path, fault
     assert rig.stopped_after(begin) < 0.5
     rig.go(2.0)
     assert rig.commands[-1][1] == 0.0 and not rig.session.drives
-    if fault not in ('teleop', 'nobody obeys'):
+    if fault not in ('teleop', 'no receiver'):
         assert rig.robot.rate == pytest.approx(0.0, abs=1e-4)
         assert abs(rig.robot.heading - heading) < FULL * 0.5 + STOPPING
     assert not rig.calibration_file.exists()
@@ -305,7 +305,7 @@ def test_a_large_bias_keeps_a_drive_from_beginning_until_it_is_calibrated(tmp_pa
     assert success, message
 
 
-def test_a_drive_waits_for_somebody_who_receives_its_commands(tmp_path):
+def test_a_drive_waits_for_a_receiver_of_its_commands(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     rig.receivers = 0
     assert not rig.begin()
@@ -322,7 +322,7 @@ def test_a_drive_whose_callers_are_never_seen_is_not_abandoned(tmp_path):
     assert rig.calibrate()[0]
 
 
-def test_a_drive_that_nobody_receives_ends_after_5_s(tmp_path):
+def test_a_drive_without_a_receiver_ends_after_5_s(tmp_path):
     rig = rested(tmp_path, calibration_drive=True)
     rig.receivers = 0
     begin = rig.clock.now
@@ -421,7 +421,7 @@ def test_a_slip_without_load_is_named_as_one(tmp_path):
     assert not rig.calibration_file.exists()
 
 
-# Services beside each other
+# Several services at once
 
 
 def test_a_second_calibration_is_refused_and_leaves_the_first_alone(tmp_path):

@@ -73,7 +73,7 @@ def test_a_run_is_complete_after_its_motion_and_the_rest(kind, motion, duration,
     assert calibration.temperature == 25.0 and calibration.time == '2026-01-01'
 
 
-def test_turns_that_nobody_finishes_are_given_up():
+def test_turns_that_are_not_finished_are_given_up():
     run = Run(TURNS, math.inf, MARKED, 0.0)
     for time in (0.0, LONGEST, LONGEST + 1.0):
         run.add(time, 0.0, 0.0, None)
@@ -101,8 +101,8 @@ def test_odometry_without_a_yaw_is_taken_by_its_rates():
 
 
 @pytest.mark.parametrize('spoil, reason', [
-    (lambda told: [], '0 messages came on odom'), (lambda told: told[:20], '20 messages came'),
-    (lambda told: told[::-1], 'increasing stamps')], ids=['none', 'too few', 'out of order'])
+    (lambda given: [], '0 messages came on odom'), (lambda given: given[:20], '20 messages came'),
+    (lambda given: given[::-1], 'increasing stamps')], ids=['none', 'too few', 'out of order'])
 def test_odometry_that_cannot_be_used_is_refused(spoil, reason):
     run, _ = ran(ODOMETRY, CALIBRATION, rules(), 20.0)
     run.odometry = spoil(run.odometry)
@@ -117,7 +117,7 @@ def test_the_gyro_may_count_the_turns_and_a_wrong_count_is_refused():
         calibrated(run, rules(turned=3), Noise(), '')
 
 
-def test_a_drift_after_a_profile_refuses_it_unless_nobody_looks():
+def test_a_drift_after_a_profile_refuses_it_unless_the_check_is_off():
     run, _ = ran(PROFILE, CALIBRATION, rules(), drift=0.05 * DEGREE)
     with pytest.raises(DataRefused, match='after the run'):
         calibrated(run, rules(), Noise(), '')

@@ -211,14 +211,14 @@ def test_neither_ten_subscribers_nor_one_that_stalls_cost_the_others_anything(
         assert heard.missing(begin) == 0
 
 
-_STUCK = """
+_HANGING = """
 import threading, time
 from rclpy.node import Node
 from gyro_calibration.ros import runner as node
 
-class Stuck(Node):
+class Hanging(Node):
     def __init__(self):
-        super().__init__('stuck')
+        super().__init__('hanging')
     def destroy_node(self):
         time.sleep(30.0)
 
@@ -227,14 +227,14 @@ import rclpy
 rclpy.init()
 stop = threading.Event()
 stop.set()
-node.spin(Stuck(), stop)
+node.spin(Hanging(), stop)
 """
 
 
 def test_a_node_that_cannot_end_is_killed(ros_domain):
     """As one does that Fast DDS holds for ever."""
     began = time.monotonic()
-    ended = subprocess.run([sys.executable, '-c', _STUCK], stderr=subprocess.PIPE, text=True,
+    ended = subprocess.run([sys.executable, '-c', _HANGING], stderr=subprocess.PIPE, text=True,
                            timeout=25.0)
     assert (ended.returncode == 1 and 'destroy_node' in ended.stderr
             and time.monotonic() - began < 20.0)

@@ -125,7 +125,7 @@ def test_what_another_node_writes_to_the_same_file_is_reported_until_this_one_wr
     assert not first.shared_hint
 
 
-def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_gone_says_so(remember):
+def test_of_two_that_write_at_the_same_moment_the_one_whose_content_is_lost_reports_it(remember):
     """Two threads keep calibrations in step; the one that is not in the file must report it."""
     memories, step, rounds = (remember(), remember()), threading.Barrier(3, timeout=20.0), 200
 
