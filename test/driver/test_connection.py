@@ -55,14 +55,6 @@ def test_samples_come_with_stamps_that_increase():
         [0.5] * len(stamps))
 
 
-def test_the_port_is_closed_when_the_reading_stops():
-    with Emulator(find('csv'), turning()) as gyro:
-        for _ in range(2):
-            for chunk in Connection(gyro.path, 'csv').chunks(threading.Event()):
-                assert chunk.samples
-                break
-
-
 def held():
     """Return how many threads and file descriptors this process has."""
     return threading.active_count(), len(os.listdir('/proc/self/fd'))
@@ -323,7 +315,7 @@ def test_invalid_and_refused_samples_are_counted_and_leave_a_gap():
             == counts.lost_samples == 10)
 
 
-@pytest.mark.parametrize('share', [0.001, 0.01, 0.1])
+@pytest.mark.parametrize('share', [0.001, 0.1])
 @pytest.mark.parametrize('name', sorted(PROTOCOLS))
 def test_a_bad_line_is_survived_and_counted(name, share):
     """Few long frames survive a tenth of faulty bytes; a good line shows right decoding."""

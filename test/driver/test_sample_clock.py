@@ -91,7 +91,7 @@ def generator():
 
 
 @pytest.mark.parametrize('off', [-0.03, 0.002, 0.03])
-@pytest.mark.parametrize('rate', [10, 100, 500, 1000])
+@pytest.mark.parametrize('rate', [10, 100, 1000])
 def test_stamps_are_right_where_samples_come_in_bursts_on_a_busy_host(rate, off, generator):
     """Far below 16 ms and the period; beats with bursts may make a few of 30000 seem lost."""
     times = true_times(rate, off, 60.0)
@@ -116,13 +116,6 @@ def test_nothing_drifts_in_an_hour(generator):
     error = run.stamps - times
     assert abs(error[-600:].mean() - error[600:1200].mean()) < 0.001
     assert run.error() < 0.002
-
-
-def test_a_rate_far_from_the_nominal_one_is_found(generator):
-    times = true_times(800, 0.0, 10.0)
-    run = play(SampleClock(100.0), times, arrivals_of(times, generator))
-    assert run.error(2.0) < 0.0005
-    assert run.clock.lost == 0
 
 
 def lose(times, runs):
