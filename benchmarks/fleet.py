@@ -65,7 +65,7 @@ def drawn(generator: Generator, fleet: Fleet) -> tuple[Observed, Array]:
     value = (true[unit] + common * generator.standard_normal(drives)[drive]
              + power_on * generator.standard_normal(len(unit))
              + np.sqrt(own) * sigma * generator.standard_normal(len(unit))
-             + np.sqrt(1.0 - own) * sigma * generator.standard_normal(drives)[drive])
+             + np.sqrt(1.0 - own) * error * generator.standard_normal(drives)[drive])
     return Observed(value, sigma, unit, drive), true
 
 
@@ -114,25 +114,29 @@ def drives(folder: str, out: str = '') -> Iterator[str]:
     units, named = (sorted({each[key] for each in records}) for key in ('unit', 'drive'))
     unit, drive = (np.array([names.index(each[key]) for each in records])
                    for names, key in ((units, 'unit'), (named, 'drive')))
-    yield ('| value | one other log, rms | pooled, drive left out, rms | held | '
-           'pooled, log left out, rms | held | ratio |')
-    yield '|---|---:|---:|---:|---:|---:|---:|'
+    yield ('| value | 0, rms | other units, rms | one other log, rms | drive left out, rms | '
+           'held | log left out, rms | held | over 0, other units, one log |')
+    yield '|---|---:|---:|---:|---:|---:|---:|---:|---|'
     for name, factor, spoken in (('bias', 1.0 / DEGREE, 'deg/s'),
                                  ('scale_factor_error', 100.0, '%'), ('time_offset', 1.0, 's')):
         value, sigma = (np.array([each['values'][name][what] for each in records])
                         for what in ('value', 'deviation'))
-        single = np.array([value[place] - value[other] for place in range(len(value))
-                           for other in np.flatnonzero(unit == unit[place]) if other != place])
-        apart = [_predicted(value, sigma, unit, drive, drive == each, False)
-                 for each in range(len(named))]
-        alone = [_predicted(value, sigma, unit, drive, np.arange(len(value)) == each, True)
-                 for each in range(len(value))]
-        rms = [factor * np.sqrt(np.mean(np.concatenate(each) ** 2))
-               for each in ([single], [one for one, _ in apart], [one for one, _ in alone])]
-        hold = [100.0 * np.mean(np.concatenate([one for _, one in each]))
-                for each in (apart, alone)]
-        yield (f'| {name}, {spoken} | {rms[0]:.3g} | {rms[1]:.3g} | {hold[0]:.0f} % | '
-               f'{rms[2]:.3g} | {hold[1]:.0f} % | {rms[2] / rms[0]:.2f} |')
+        of_type = [one - value[(unit != unit[place]) & (drive != drive[place])].mean()
+                   for place, one in enumerate(value)]
+        single = [value[place] - value[other] for place in range(len(value))
+                  for other in np.flatnonzero(unit == unit[place]) if other != place]
+        apart, alone = ([_predicted(value, sigma, unit, drive, left, known) for left in every]
+                        for known, every in (
+            (False, [drive == each for each in range(len(named))]),
+            (True, np.eye(len(value), dtype=bool))))
+        rms = [factor * np.sqrt(np.mean(np.square(each))) for each in (
+            value, of_type, single, *(np.concatenate([one for one, _ in each])
+                                      for each in (apart, alone)))]
+        held = [np.concatenate([one for _, one in each]) for each in (apart, alone)]
+        counts = [f'{each.sum()} of {len(each)}' for each in held]
+        yield (f'| {name}, {spoken} | ' + ' | '.join(f'{each:.3g}' for each in rms[:4])
+               + f' | {counts[0]} | {rms[4]:.3g} | {counts[1]} | '
+               + ', '.join(f'{rms[4] / each:.2f}' for each in rms[:3]) + ' |')
 
 
 def first(folder: str, out: str = '') -> Iterator[str]:
@@ -188,41 +192,56 @@ def _predicted(value: Array, sigma: Array, unit: Any, drive: Any, left: Any, kno
     """Return errors of predicted values of the logs that are left out, and whether they hold."""
     pooled = Pooled(Observed(value[~left], sigma[~left], unit[~left], drive[~left] if known
                              else np.unique(drive[~left], return_inverse=True)[1]))
-    wanted = (pooled.wanted(unit=unit[left], drive=drive[left], error=sigma[left], measured=True,
-                            power_ons=1.0) if known
-              else pooled.wanted(unit=unit[left], error=sigma[left], measured=True,
-                                 power_ons=1.0, drives=1.0))
+    wanted = (pooled.wanted(unit=unit[left], drive=drive[left], error=sigma[left], power_ons=1.0)
+              if known else pooled.wanted(unit=unit[left], error=sigma[left], power_ons=1.0,
+                                          drives=1.0))
     found = pooled.estimate(wanted)
     return (value[left] - found.value,
             (found.low < value[left]) & (value[left] < found.high))
 
 
 def slopes(generator: Generator, fleets: int = 100) -> Iterator[str]:
-    """Give how often intervals of 95 % hold of drifts over age."""
-    yield '| units, drives | true: slope of the type, between units | type | units | spread |'
-    yield '|---|---|---:|---:|---:|'
-    for fleet, between in (((5, 4, 1.0, 0.3, 0.3, 0.2, 1.0), 0.5),
-                           ((10, 6, 1.0, 0.0, 0.3, 0.2, 1.0), 0.0),
-                           ((10, 6, 1.0, 0.5, 0.3, 0.2, 0.5), 0.5)):
-        held: list[list[Any]] = [[], [], []]
+    """Give how often intervals of 95 % hold of slopes over age and temperature, and of spreads."""
+    yield ('| units, drives | slope over | true: of the type, between units | type | units | '
+           'between units |')
+    yield '|---|---|---|---:|---:|---:|'
+    mean = np.array([0.3, -0.2])
+    for fleet, between in (((5, 4, 1.0, 0.3, 0.3, 0.2, 1.0), np.array([0.5, 0.3])),
+                           ((10, 6, 1.0, 0.5, 0.3, 0.2, 0.5), np.array([0.5, 0.3])),
+                           ((10, 6, 1.0, 0.0, 0.3, 0.2, 1.0), np.zeros(2))):
+        held: dict[str, list[Any]] = {}
+        spreads = {UNITS: 1.0, DRIVES: np.hypot(fleet[3], np.sqrt(1.0 - fleet[6]) * fleet[5]),
+                   POWER_ONS: fleet[4], **dict(zip(SLOPES, between))}
         for _ in range(fleets):
             observed, _ = drawn(generator, fleet)
-            units = np.arange(fleet[0])
-            age = observed.drive - 0.5 * (fleet[1] - 1.0)
-            true = 0.3 + between * generator.standard_normal(fleet[0])
-            pooled = Pooled(replace(observed, value=observed.value + true[observed.unit] * age,
-                                    columns=age[:, None], slopes=1))
-            row = np.array([[0.0, 1.0]])
-            spread = pooled.components[SLOPES[0]]
-            held[2].append(spread.low <= between <= spread.high)
-            for place, (wanted, value) in enumerate((
-                    (pooled.wanted(fixed=row), np.array([0.3])),
-                    (pooled.wanted(unit=units, fixed=np.tile(row, (len(units), 1)), part=1),
-                     true))):
-                found = pooled.estimate(wanted)
-                held[place].extend((found.low < value) & (value < found.high))
-        yield (f'| {fleet[0]}, {fleet[1]} | 0.3, {between} | '
-               + ' | '.join(f'{100.0 * np.mean(each):.1f} %' for each in held) + ' |')
+            # all units have the age of the drive, and temperatures of their own
+            columns = np.column_stack([observed.drive, generator.uniform(-2.0, 2.0,
+                                                                         len(observed))])
+            columns = columns - columns.mean(axis=0)
+            true = mean + between * generator.standard_normal((fleet[0], 2))
+            pooled = Pooled(replace(
+                observed, value=observed.value + np.sum(true[observed.unit] * columns, axis=1),
+                columns=columns, slopes=2))
+            for name, value in spreads.items():
+                of = pooled.components[name]
+                held.setdefault(name, []).append(of.low <= value <= of.high)
+            for place in range(2):
+                row = np.eye(3)[1 + place:2 + place]
+                of_type = pooled.estimate(pooled.wanted(fixed=row))
+                of_units = pooled.estimate(pooled.wanted(
+                    unit=np.arange(fleet[0]), fixed=np.tile(row, (fleet[0], 1)), part=1 + place))
+                for name, interval, value in (('type', of_type, mean[place:place + 1]),
+                                              ('units', of_units, true[:, place])):
+                    held.setdefault(f'{name}_{place}', []).extend(
+                        (interval.low < value) & (value < interval.high))
+        for place, over in enumerate(('age', 'temperature')):
+            yield (f'| {fleet[0]}, {fleet[1]} | {over} | {mean[place]}, {between[place]} | '
+                   + ' | '.join(f'{100.0 * np.mean(held[name]):.1f} %' for name in (
+                       f'type_{place}', f'units_{place}', SLOPES[place])) + ' |')
+        yield (f'| {fleet[0]}, {fleet[1]} | none: units, drives, power-ons | '
+               + ', '.join(f'{spreads[name]:.3g}' for name in (UNITS, DRIVES, POWER_ONS))
+               + ' | | | ' + ', '.join(f'{100.0 * np.mean(held[name]):.1f} %' for name in (
+                   UNITS, DRIVES, POWER_ONS)) + ' |')
 
 
 def _records(generator: Generator, units: int, drives: int, effect: float = 0.0

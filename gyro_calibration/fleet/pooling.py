@@ -19,9 +19,10 @@ Value ``y`` of the log ``i`` of unit ``u`` on drive ``d`` is taken as::
 * ``unit``, ``slope``, ``drive`` and ``power_on``: normal, with the standard deviations *between
   units*, of the slopes of units about that of the type, *between drives* and *between power-ons*
   that are sought;
-* ``error``: what the calibration of the log states, ``sigma_i``. Units that were moved together
-  were compared with one reference, so the share ``1 - lambda`` of the variance of their errors is
-  common to the drive: ``cov(error_i, error_j) = (1 - lambda) sigma_i sigma_j``.
+* ``error``: of the variance that the calibration of the log states, ``sigma_i²``, the share
+  ``lambda`` is the log's own. The rest is an error of the reference, which all units of a drive
+  have in common, so it is among what differs between drives; or it is more than there is, for a
+  single log cannot tell the error of its reference from that of its gyro.
 
 The restricted likelihood (REML) of the variances is integrated, not maximized, so that intervals
 hold with few units and few drives: estimates are averaged over points of a quasi-random sequence,
@@ -40,7 +41,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from types import MappingProxyType
 from typing import Any
 
 from gyro_calibration.logs.log import Array, DataRefused
@@ -65,8 +65,8 @@ _AT_A_TIME = 2_000_000
 #: Largest standard deviation that is possible, in those of the values about their median.
 _LARGEST = 30.0
 #: Twice the gain in log likelihood beyond which a variance of zero is rejected at 2.5 %, one-sided
-#: (Self and Liang 1987: half of the chance is at zero); and where two are zero, at most 2.5 %.
-_REJECTED, _BOTH_REJECTED = 3.841, 7.378
+#: (Self and Liang 1987: half of the chance is at zero).
+_REJECTED = 3.841
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,10 @@ class Wanted:
     ----------
     fixed : shape (k, 1 + columns)
     unit, drive : numbers, -1 for none, shape (k,)
+    error : standard deviation that a log will state; its own share is added, shape (k,)
     of_unit : what of the unit: weights of its value and of its slopes, shape (1 + slopes,)
-    error : standard deviation by which the common error of the drive counts, shape (k,)
     more : name of a variance -> how often it is added, for what is not estimated, such as the
         next power-on
-    measured : whether the log's own error is added too, for what a log will show
 
     """
 
@@ -128,7 +127,6 @@ class Wanted:
     error: Array
     of_unit: Array
     more: Mapping[str, float] = field(default_factory=dict)
-    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -145,11 +143,11 @@ class _Equations:
     """The mixed-model equations, at many points of the variances at a time."""
 
     def __init__(self, of: Observed, fixed: Array, shared: bool):
-        """Lay out the columns: fixed effects, drives, and the common errors of drives."""
+        """Lay out the columns: fixed effects, then drives."""
         self.of, self.fixed = of, fixed
         self.units = int(of.unit.max()) + 1
         self.drives = int(of.drive.max()) + 1 if shared else 0
-        self.columns = fixed.shape[1] + 2 * self.drives
+        self.columns = fixed.shape[1] + self.drives
         #: the columns of the value of a unit, and of its slopes
         self.of_unit = fixed[:, :1 + of.slopes]
         self.to_unit = _summing(of.unit)
@@ -189,7 +187,7 @@ class _Solved:
         tau = np.sqrt(np.column_stack([sizes.get(name, none)
                                        for name in (UNITS, *SLOPES[:of.slopes])]))
         self._tau = tau
-        self._scale = np.sqrt(sizes.get(DRIVES, none)), np.sqrt(np.maximum(1.0 - own, 0.0))
+        self._scale = np.sqrt(sizes.get(DRIVES, none))[:, None]
         variance = (sizes.get(POWER_ONS, none)[:, None] + own[:, None] * of.deviation ** 2)
         weight = 1.0 / variance
 
@@ -208,23 +206,16 @@ class _Solved:
             for place in range(kept):
                 across[:, :, part, place] = summed(at.to_unit, weight * column * fixed[:, place])
         if at.drives:
-            here, error = weight[:, at.on], of.deviation[at.on]
-            first = kept + np.arange(at.drives)
-            kinds = [(first + kind * at.drives, scale[:, None], error ** kind)
-                     for kind, scale in enumerate(self._scale)]
-            for index, scale, by in kinds:
-                weighted = here * by
-                right[:, index] = scale * summed(at.to_drive, weighted * of.value[at.on])
-                for part, column in enumerate(at.of_unit[at.on].T):
-                    across[:, at.pair_unit, part, index[at.pair_drive]] = scale * summed(
-                        at.to_pair, weighted * column)
-                for place in range(kept):
-                    normal[:, place, index] = scale * summed(
-                        at.to_drive, weighted * fixed[at.on, place])
-                    normal[:, index, place] = normal[:, place, index]
-                for other, other_scale, other_by in kinds:
-                    normal[:, index, other] = scale * other_scale * summed(
-                        at.to_drive, weighted * other_by)
+            here, index = weight[:, at.on], kept + np.arange(at.drives)
+            right[:, index] = self._scale * summed(at.to_drive, here * of.value[at.on])
+            for part, column in enumerate(at.of_unit[at.on].T):
+                across[:, at.pair_unit, part, index[at.pair_drive]] = self._scale * summed(
+                    at.to_pair, here * column)
+            for place in range(kept):
+                normal[:, place, index] = self._scale * summed(
+                    at.to_drive, here * fixed[at.on, place])
+                normal[:, index, place] = normal[:, place, index]
+            normal[:, index, index] = self._scale ** 2 * summed(at.to_drive, here)
             normal[:, range(kept, total), range(kept, total)] += 1.0
         # what is of a unit is among the fixed effects, and first
         precision = (np.eye(parts) + tau[:, None, :, None] * tau[:, None, None, :]
@@ -254,9 +245,7 @@ class _Solved:
         rows[:, :, :kept] = wanted.fixed
         if at.drives:
             on = np.flatnonzero(wanted.drive >= 0)
-            rows[:, on, kept + wanted.drive[on]] = self._scale[0][:, None]
-            rows[:, on, kept + at.drives + wanted.drive[on]] = (self._scale[1][:, None]
-                                                                * wanted.error[on])
+            rows[:, on, kept + wanted.drive[on]] = self._scale
         unit = np.maximum(wanted.unit, 0)
         size = self._tau[:, None] * (wanted.of_unit * (wanted.unit >= 0)[:, None])
         share = np.einsum('pkab,pkb->pka', self._within[:, unit], size)
@@ -336,11 +325,11 @@ class Pooled:
                     column for name, column in zip(self.names, points[part].T) if name != OWN)
         return np.concatenate(found)
 
-    def _search(self, held: Mapping[str, int] = MappingProxyType({})) -> Array:
-        """Return the point of the largest restricted likelihood, some held at an end (0 or 1)."""
+    def _search(self, without: str = '') -> Array:
+        """Return the point of the largest restricted likelihood, perhaps without a variance."""
         if not self.names:
             return np.empty(0)
-        bounds = [(self._bounds[name][held[name]],) * 2 if name in held else self._bounds[name]
+        bounds = [(self._bounds[name][0],) * 2 if name == without else self._bounds[name]
                   for name in self.names]
         point = np.array([low + 0.3 * (high - low) for low, high in bounds])
         for place, (low, high) in enumerate(bounds):
@@ -389,52 +378,20 @@ class Pooled:
 
     @cached_property
     def components(self) -> dict[str, Component]:
-        """
-        Return the standard deviations by name, and the share of the errors that is own.
-
-        That of drives is all that the logs of a drive have in common: what differs between
-        drives, and the common part of an error of the usual size.
-
-        """
-        found = {}
+        """Return the standard deviations by name, and the share of the errors that is own."""
+        found, likeliest, sample = {}, self._sizes(self._best[None]), self._sizes(self._sample)
         for name in self.names:
-            best, low, high = self._spread(*self._at(name))
-            if name != OWN and self._gain({name: 0, OWN: 1} if name == DRIVES else {name: 0}
-                                          ) <= (_BOTH_REJECTED if name == DRIVES else _REJECTED):
-                low = 0.0
-            elif name == DRIVES and self._gain({name: 0}) <= _REJECTED:
-                # the common part of the errors alone may be all
-                low = self._spread(*self._at(name, errors_alone=True))[1]
+            order = np.argsort(sample[name])
+            total = np.cumsum(self._weight[order]) - 0.5 * self._weight[order]
+            bounds = np.interp([0.025, 0.975], total, sample[name][order])
+            values = np.array([likeliest[name][0], *bounds])
+            if name != OWN:
+                without = self._log_likelihood(np.vstack([self._best, self._search(name)]))
+                values = np.sqrt(values) * [1.0, 2.0 * (without[0] - without[1]) > _REJECTED, 1.0]
             size = (1.0 if name == OWN else self._size / self._scales[1 + SLOPES.index(name)]
                     if name in SLOPES else self._size)
-            found[name] = Component(*(float(size * each) for each in (best, low, high)))
+            found[name] = Component(*(size * values).tolist())
         return found
-
-    def _gain(self, held: Mapping[str, int]) -> float:
-        """Return twice the gain in log likelihood over what is held."""
-        known = {name: end for name, end in held.items() if name in self.names}
-        best, without = self._log_likelihood(np.vstack([self._best, self._search(known)]))
-        return 2.0 * float(best - without)
-
-    def _at(self, name: str, errors_alone: bool = False) -> tuple[float, Array]:
-        """Return a standard deviation, or the share, at the likeliest point and at all points."""
-        usual = float(np.median(self._scaled.deviation))
-        found = []
-        for points in (self._best[None], self._sample):
-            sizes = self._sizes(points)
-            if name == OWN:
-                found.append(sizes[OWN])
-                continue
-            common = (1.0 - sizes[OWN]) * usual ** 2 if name == DRIVES else 0.0
-            found.append(np.sqrt(common + (0.0 if errors_alone else sizes[name])))
-        return float(found[0][0]), found[1]
-
-    def _spread(self, best: float, sample: Array) -> tuple[float, float, float]:
-        """Return an estimate with the bounds that hold 95 % of the weight."""
-        order = np.argsort(sample)
-        total = np.cumsum(self._weight[order]) - 0.5 * self._weight[order]
-        low, high = np.interp([0.025, 0.975], total, sample[order]).tolist()
-        return best, low, high
 
     # estimates
 
@@ -448,10 +405,8 @@ class Pooled:
             mean, variance = solved.moments(scaled)
             for name, often in wanted.more.items():
                 variance = variance + often * sizes.get(name, np.zeros(1))[:, None]
-            if wanted.measured:
-                own = np.where(wanted.drive >= 0, sizes.get(OWN, np.ones(1))[:, None], 1.0)
-                variance = variance + own * scaled.error ** 2
-            found.append((mean, variance))
+            own = sizes.get(OWN, np.ones(1))[:, None]
+            found.append((mean, variance + own * scaled.error ** 2))
         mean, variance = (np.concatenate(each) for each in zip(*found))
         constant = self._middle * wanted.fixed[:, 0]
         return constant + self._size * mean, self._size ** 2 * np.maximum(variance, 1e-30)
@@ -484,13 +439,13 @@ class Pooled:
 
     def wanted(self, unit: Numbers | None = None, drive: Numbers | None = None,
                fixed: Array | None = None, error: Array | float = 0.0,
-               measured: bool = False, part: int = 0, **more: float) -> Wanted:
+               part: int = 0, **more: float) -> Wanted:
         """
         Return what is wanted; by default the mean of the type, or of units and drives.
 
         Parameters
         ----------
-        unit, drive, fixed, error, measured, more : as of `Wanted`
+        unit, drive, fixed, error, more : as of `Wanted`
         part : of a unit: 0 for its value, from 1 on for a slope
 
         """
@@ -501,7 +456,7 @@ class Pooled:
         return Wanted(row if fixed is None else fixed, none if unit is None else unit,
                       none if drive is None else drive,
                       np.broadcast_to(np.asarray(error, float), (count,)),
-                      np.eye(1 + self.observed.slopes)[part], more, measured)
+                      np.eye(1 + self.observed.slopes)[part], more)
 
     def score(self, column: Array) -> float:
         """Return how many standard deviations one more fixed effect is from 0, roughly."""
@@ -577,9 +532,7 @@ def _log_prior(at: _Equations, sizes: Mapping[str, Array]) -> Array:
             found = found + jeffreys(name, 1.0 / np.maximum(second - first ** 2 / known,
                                                             1e-12 * known))
     if DRIVES in sizes:
-        usual = float(np.mean(of.deviation[at.on] ** 2))
-        found = found + jeffreys(DRIVES, (1.0 - own) * usual
-                                 + 1.0 / (at.to_drive @ (1.0 / variance[:, at.on]).T).T)
+        found = found + jeffreys(DRIVES, 1.0 / (at.to_drive @ (1.0 / variance[:, at.on]).T).T)
     return found
 
 

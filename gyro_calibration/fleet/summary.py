@@ -182,14 +182,13 @@ def _of_value(name: str, slow: bool, records: Sequence[Record], units: Sequence[
             unit_slopes[covariate] = pooled.estimate(pooled.wanted(
                 unit=each, fixed=np.tile(row, (len(units), 1)), part=place))
     numbers = np.array([dates.index(one['date']) if one['date'] else -1 for one in held])
-    error = float(np.median(observed.deviation))
     return Found(
         name, held[0][key][name]['unit'], slow, held, pooled, pooled.estimate(mean),
         pooled.estimate(pooled.wanted(unit=each, fixed=rows)),
         pooled.estimate(pooled.wanted(unit=each, fixed=0.0 * rows)),
         pooled.estimate(pooled.wanted(unit=each, fixed=rows, power_ons=1.0)),
         pooled.estimate(pooled.wanted(fixed=fixed, units=1.0, power_ons=1.0)),
-        pooled.estimate(pooled.wanted(drive=np.arange(len(drives)), fixed=none, error=error)),
+        pooled.estimate(pooled.wanted(drive=np.arange(len(drives)), fixed=none)),
         slopes, unit_slopes, float(pooled.chance(mean)[0]),
         outliers(observed, UNITS, level, pooled),
         outliers(observed, DRIVES, level, pooled), changes(observed, numbers, level, pooled))
