@@ -202,10 +202,9 @@ def _fit_heading(given: argparse.Namespace, logs: dict[str, Log]) -> Answer:
 def _of_motion(log: Log) -> Iterator[str]:
     """Give the remark on a reference without headings."""
     if log.reference_heading is None:
-        yield ('the log has a reference rate, and fewer than '
-               f'{FEWEST_DWELLS} stretches of constant rate; so the rate is integrated, and '
-               'headings are compared. For other effects than bias and scale factor error, hold '
-               'each rate for some seconds')
+        yield (f'the log has a reference rate, and fewer than {FEWEST_DWELLS} stretches of '
+               'constant rate; so the rate is integrated, and headings are compared. For other '
+               'effects than bias and scale factor error, hold each rate for some seconds')
 
 
 def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, str]:
