@@ -211,6 +211,6 @@ def headings(log: Log, found: EncoderCalibration) -> tuple[Any, Any, Any, Any, s
     """Return what `plots.draw_reference` takes."""
     name = ('course over ground' if found.method == 'course' else
             'reference' if log.reference_heading is None else 'encoder')
-    heading = found.reference.heading
-    return (found.reference.time, heading - heading[0], found.before.heading, found.after.heading,
-            name)
+    motion = found.reference
+    return (motion.time, motion.heading - motion.heading[0], found.before.heading,
+            found.after.heading, name)

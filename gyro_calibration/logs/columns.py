@@ -170,7 +170,9 @@ def suggestion(header: Sequence[str]) -> str:
                 wanted.append(f'{quantity}={name}{unit}')
                 break
     if any(each.startswith('gyro=') for each in wanted):
-        return f'; perhaps --columns {",".join(wanted)} is meant'
+        units = ('' if all(':' in each for each in wanted) else
+                 '; units follow a colon, as in time=t:ms,gyro=wz:deg/s, and are SI without it')
+        return f'; perhaps --columns {",".join(wanted)} is meant{units}'
     for name in header:
         if name not in COLUMNS and (
                 close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):

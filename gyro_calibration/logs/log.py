@@ -79,6 +79,8 @@ _WHOLE, _TEXT = 1 << 29, 10
 #: Of a temperature, degC; a value of any other quantity is at most `LARGEST`, in its unit.
 _HOTTEST = 1e5
 _MAY_BE_LOST = ('output', 'counts', 'reference_rate', 'reference_heading')
+#: Quantities of which an empty cell is a lost value, as motion capture writes lost markers.
+_REFERENCES = ('reference_rate', 'reference_heading')
 
 
 #: Line numbers of the rows and of what comes after them, quantity -> values in SI, and columns
@@ -389,6 +391,8 @@ def _carefully(path: str | Path, lines: list[str], rest: Iterator[str], first_li
 
 def _numbers(path: str | Path, places: Sequence[int], name: str, texts: tuple[str, ...],
              quantity: str) -> Array:
+    if quantity in _REFERENCES:
+        texts = tuple(text.strip() or 'nan' for text in texts)
     try:
         values = np.array(texts, dtype=np.float64)
     except ValueError:

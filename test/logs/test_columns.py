@@ -77,7 +77,7 @@ def test_the_axis_of_three_is_taken(tmp_path, axis, rate, force):
     ('timestamp_ms,gyro_z_degs,yaw_deg,temp', {},
      '--columns time=timestamp_ms:ms,gyro=gyro_z_degs:deg/s,temperature=temp,heading=yaw_deg:deg'),
     ('time_s,gyro_dsp', {}, 'gyro_dps is meant by gyro_dsp'),
-    ('time_s,wz', {}, '--columns gyro=wz is meant'),
+    ('time_s,wz', {}, '--columns gyro=wz is meant; units follow a colon'),
     ('time_s,wz', {'gyro': 'wzz'}, 'there is no column wzz among time_s,wz; perhaps wz is meant'),
     ('time_s,wz', {'gyro': 'wz:deg/min'}, 'deg/min is no unit of it; wanted one of rad/s, deg/s'),
     ('time_s,wz', {'giro': 'wz'}, 'giro is no quantity of a log; wanted one of time, gyro'),
@@ -170,3 +170,9 @@ def test_a_part_holds_all_columns():
     log = Log(output=np.arange(4.0), time=np.arange(4.0), others={'a': ('w', 'x', 'y', 'z')})
     found = part(log, log.time > 1.0)
     assert found.output.tolist() == [2.0, 3.0] and found.others == {'a': ('y', 'z')}
+
+
+def test_an_empty_cell_of_a_reference_is_a_lost_value(tmp_path):
+    log = read_log(written(tmp_path, 't;gz;yaw\n0;1;5\n1;1; \n2;1;\n3;1;8\n'),
+                   columns={'time': 't', 'gyro': 'gz', 'heading': 'yaw'})
+    assert np.isfinite(log.reference_heading).tolist() == [True, False, False, True]
