@@ -82,8 +82,8 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
     """
     figure, ((above,), (middle,), (below,)) = _panels(3, 1, (9, 9), (1.3, 1, 1))
     above.plot(time, reference / DEGREE, color='tab:blue', linewidth=3, alpha=0.5, label=name)
-    above.plot(time, (reference + before) / DEGREE, color='black', linewidth=1, linestyle='--',
-               label='gyro, not calibrated')
+    above.plot(time, (reference + before - before[0]) / DEGREE, color='black', linewidth=1,
+               linestyle='--', label='gyro, not calibrated')
     above.set(ylabel='heading [deg]', title=f'Heading by {name} and gyro')
     above.legend(loc='best')
     for axes, error, when in ((middle, before, 'not calibrated'), (below, after, 'calibrated')):
@@ -91,9 +91,9 @@ def draw_reference(path: str | Path | None, time: Array, reference: Array, befor
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set(ylabel=f'gyro less {name} [deg]', title=f'Gyro {when}: rms {_rms(error):.3g} deg')
     below.set_xlabel('time [s]')
-    return _save(figure, path, 'The lower panels have their own scales. A slope is bias; what '
-                 'follows the turns is scale factor error; an even band is the '
-                 'resolution of the reference.')
+    return _save(figure, path, 'The lower panels show the difference about its mean, each on its '
+                 'own scale. A slope is bias; what follows the turns is scale factor error; an '
+                 'even band is the resolution of the reference.')
 
 
 def draw_run(path: str | Path | None, time: Array, rate: Array, corrected: Array,
@@ -141,14 +141,12 @@ def draw_motion(path: str | Path | None, motion: Motion, limit: float) -> Any:
     time = np.union1d(np.linspace(0.0, motion.duration, 1000), motion.time)
     above.plot(time, motion.rate_at(time) / DEGREE, color='black')
     for sign in (-1.0, 1.0):
-        above.axhline(sign * limit / DEGREE, color='black', linestyle=':', linewidth=1,
-                      label='limit of the robot' if sign > 0 else None)
+        above.axhline(sign * limit / DEGREE, color='black', linestyle=':', linewidth=1)
     above.set(ylabel='rate [deg/s]', title=f'Motion of {motion.duration:.3g} s to calibrate by')
-    above.legend(loc='best')
     below.plot(time, motion.heading_at(time) / DEGREE, color='black')
     below.set(xlabel='time [s]', ylabel='heading [deg]')
-    return _save(figure, path, 'Turns both ways separate the scale factor error from the bias; '
-                 'rests show the bias alone.')
+    return _save(figure, path, 'Dotted: limits of the robot. Turns both ways separate the scale '
+                 'factor error from the bias; rests show the bias alone.')
 
 
 def draw_allan(path: str | Path | None, chart: AllanChart, fit: NoiseFit,
