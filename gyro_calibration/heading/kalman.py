@@ -143,14 +143,7 @@ class Drift:
 
     def heading_variance(self, turn: RateIntegral) -> float:
         """Return the variance of the heading after a turn, rad²."""
-        return float(self.heading_variances([turn])[0])
-
-    def heading_variances(self, turns: list[RateIntegral]) -> Array:
-        """Return the same after each of several turns, shape (k,)."""
-        seen, variances = zip(*map(self._seen, turns))
-        rows = -np.array(seen)
-        rows[:, HEADING] += 1.0
-        return np.asarray((rows @ self.covariance * rows).sum(axis=1) + variances)
+        return float(heading_variances([self], [turn])[0])
 
     def rested(self, turn: RateIntegral) -> Drift:
         """Return the state after a time in which the true rate was zero."""
@@ -263,13 +256,28 @@ def begin(noise: Noise, covariance: Array, heading: float = 0.0, variance: float
     return Drift(noise, mean, whole)
 
 
-def surprises(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
-    """Return how far each turn is off that of a rest after its state, in standard deviations."""
-    seen, variances = zip(*(drift._seen(turn) for drift, turn in zip(drifts, turns)))
-    rows, means = np.array(seen), np.array([drift.mean for drift in drifts])
-    along = np.matmul(np.array([drift.covariance for drift in drifts]), rows[:, :, None])[:, :, 0]
-    return np.asarray(([turn.turned for turn in turns] - (rows * means).sum(axis=1))
-                      / np.sqrt((rows * along).sum(axis=1) + variances))
+def heading_variances(drifts: list[Drift], turns: list[RateIntegral]) -> Array:
+    """Return the variance of the heading after each turn from its state, rad², shape (k,)."""
+    figures = np.array([(turn.duration, turn.lost + turn.noise
+                         + drift.noise.angle_random_walk ** 2 * turn.duration)
+                        for drift, turn in zip(drifts, turns)])
+    # flicker and walk are the same in all states
+    seen, variances = _integrated(drifts[0].noise, np.round(figures[:, 0], 6))
+    rows = np.concatenate([-seen, [turn.sensitivity for turn in turns]], axis=1)
+    rows[:, HEADING] += 1.0
+    spread = np.matmul([drift.covariance for drift in drifts], rows[:, :, None])[:, :, 0]
+    return np.asarray((spread * rows).sum(axis=1) + variances + figures[:, 1])
+
+
+def _integrated(noise: Noise, durations: Array) -> tuple[Array, Array]:
+    """Return what heading, walk and flicker add to integrals, (k, parts), and their variance."""
+    constants, variance = noise.flicker()
+    ratio = durations[:, None] / constants
+    left = np.exp(-ratio)
+    seen = np.zeros((len(durations), _FLICKER + len(constants)))
+    seen[:, WALK], seen[:, _FLICKER:] = durations, constants * (1.0 - left)
+    return seen, (noise.rate_random_walk ** 2 * durations ** 3 / 3.0 + variance * (
+        constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)).sum(axis=1))
 
 
 @lru_cache(maxsize=4096)
@@ -291,17 +299,14 @@ def _wander(noise: Noise, duration: float) -> tuple[Array, Array, Array]:
 
     """
     constants, variance = noise.flicker()
-    left = np.exp(-duration / constants)
-    kept, seen = (np.concatenate([[1.0, 1.0], left]),
-                  np.concatenate([[0.0, duration], constants * (1.0 - left)]))
-    walk = noise.rate_random_walk ** 2
+    left, walk = np.exp(-duration / constants), noise.rate_random_walk ** 2
+    kept = np.concatenate([[1.0, 1.0], left])
+    (seen,), (integral,) = _integrated(noise, np.array([duration]))
     grown = np.diag(np.concatenate([[0.0, walk * duration], variance * (1.0 - left ** 2)]))
     grown[HEADING, WALK] = -0.5 * walk * duration ** 2
     grown[HEADING, _FLICKER:] = -variance * constants * (1.0 - left) ** 2
     grown[:, HEADING] = grown[HEADING]
-    ratio = duration / constants
-    grown[HEADING, HEADING] = walk * duration ** 3 / 3.0 + variance * float(np.sum(
-        constants ** 2 * np.maximum(2.0 * ratio - 3.0 + 4.0 * left - left ** 2, 0.0)))
+    grown[HEADING, HEADING] = integral
     return seen, kept, grown
 
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gyro_calibration.heading.gaps import block_ends
-from gyro_calibration.heading.kalman import Drift, HEADING, RateIntegral
+from gyro_calibration.heading.kalman import Drift, HEADING, heading_variances, RateIntegral
 from gyro_calibration.heading.stationary import BLOCK, WINDOW
 from gyro_calibration.logs.log import Array, SHORTEST
 import numpy as np
@@ -154,50 +154,56 @@ class EvenSamples:
         return highest[number - first], lowest[number - first]
 
     def close(self, end: int) -> None:
-        """Fill in heading and variance up to a sample where the last epoch ends."""
-        if not self.epochs:
-            return
-        epoch = self.epochs[-1]
-        begin, epoch.end = max(epoch.place, 0), end
-        if end <= begin:
-            return
-        self.seen[epoch.place + 2:end + 2] = (
-            self.resting if epoch.resting else self.moving)[epoch.place + 1:end + 1]
-        rows = self.found[begin:end]
-        rows[:, 4] = epoch.resting
-        if epoch.resting:
-            rows[:, 0] = epoch.heading
-            rows[:, 1] = float(epoch.drift.covariance[HEADING, HEADING]) + epoch.pending ** 2
-            return
-        inside, offset, values = slice(epoch.place + 1, end), epoch.drift.offset[0], (
-            epoch.drift.values[0])
-        pending, turned = (np.empty(end - epoch.place) for _ in range(2))
-        intervals = self.intervals[inside]
-        pending[0], pending[1:] = epoch.pending, self._kept[inside]
-        np.cumprod(pending, out=pending)
-        turned[0] = epoch.heading + epoch.pending
-        turned[1:] = self.turned[inside] - intervals * offset + self.halves[inside] * (
-            (self.seen[1:][inside] + self.seen[:-1][inside]) @ values)
-        np.cumsum(turned, out=turned)
-        known = epoch.drift.heading_variances([turn for _, turn in epoch.opens])
-        places = [place for place, _ in epoch.opens]
-        since = np.append(0.0, np.cumsum(intervals))
-        block = np.searchsorted(places, np.arange(epoch.place, end), side='right') - 1
-        since -= since[np.array(places) - epoch.place][block]
-        variance = known[block] + epoch.drift.noise.angle_random_walk ** 2 * since + pending ** 2
-        rows[:, 0] = (turned - pending)[begin - epoch.place:]
-        rows[:, 1] = variance[begin - epoch.place:]
+        """End the last epoch before a sample."""
+        if self.epochs:
+            epoch = self.epochs[-1]
+            epoch.end = end
+            if end > max(epoch.place, 0):
+                self.seen[epoch.place + 2:end + 2] = (
+                    self.resting if epoch.resting else self.moving)[epoch.place + 1:end + 1]
 
-    def rates(self, usual: Array) -> None:
-        """Fill in the rates and their variances; `usual` are the intervals behind each sample."""
+    def fill(self, usual: Array) -> None:
+        """Fill in what was found in the epochs; `usual` are the intervals behind each sample."""
         found, interval = self.found, np.clip(np.minimum(self.intervals, usual), SHORTEST, None)
+        moving = list[Epoch]()
         for epoch in self.epochs:
             here = slice(max(epoch.place, 0), epoch.end)
-            (offset, variance), (values, covariance, shared) = (
-                epoch.drift.offset, epoch.drift.values)
-            rows = self.seen[1:][here]
-            found[here, 2] = (0.0 if epoch.resting
-                              else self.rate[here] + rows @ values - offset)
+            if here.stop <= here.start:
+                continue
+            drift, rows = epoch.drift, self.seen[1:][here]
+            (offset, variance), (values, covariance, shared) = drift.offset, drift.values
             found[here, 3] = (variance + ((rows @ covariance - 2.0 * shared) * rows).sum(axis=1)
-                              + epoch.drift.noise.angle_random_walk ** 2
+                              + drift.noise.angle_random_walk ** 2
                               / (WINDOW if epoch.resting else interval[here]))
+            found[here, 4] = epoch.resting
+            if epoch.resting:
+                found[here, :3] = epoch.heading, (
+                    float(drift.covariance[HEADING, HEADING]) + epoch.pending ** 2), 0.0
+                continue
+            moving.append(epoch)
+            found[here, 2] = self.rate[here] + rows @ values - offset
+            pending, turned = np.empty(epoch.end - epoch.place), np.empty(epoch.end - epoch.place)
+            inside = slice(epoch.place + 1, epoch.end)
+            pending[0], pending[1:] = epoch.pending, self._kept[inside]
+            np.cumprod(pending, out=pending)
+            turned[0], turned[1:] = epoch.heading + epoch.pending, self.turned[inside]
+            turned[1:] += self.halves[inside] * (
+                (self.seen[1:][inside] + self.seen[:-1][inside]) @ values - 2.0 * offset)
+            np.cumsum(turned, out=turned)
+            first = here.start - epoch.place
+            found[here, 0] = (turned - pending)[first:]
+            found[here, 1] = pending[first:] ** 2
+        if moving:
+            self._add_variances(moving)
+
+    def _add_variances(self, epochs: list[Epoch]) -> None:
+        """Add the variance of the heading in epochs of motion."""
+        opens = [(epoch.drift, turn) for epoch in epochs for _, turn in epoch.opens]
+        known = heading_variances(*map(list, zip(*opens)))
+        white = [drift.noise.angle_random_walk ** 2 for drift, _ in opens]
+        places = np.array([place for epoch in epochs for place, _ in epoch.opens])
+        until = np.append(np.cumsum(self.intervals), 0.0)  # the last is that of the place -1
+        rows = np.concatenate([np.arange(max(epoch.place, 0), epoch.end) for epoch in epochs])
+        block = np.searchsorted(places, rows, side='right') - 1
+        self.found[rows, 1] += known[block] + np.array(white)[block] * (
+            until[rows] - until[places[block]])

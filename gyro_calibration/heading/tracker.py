@@ -26,7 +26,7 @@ import math
 
 from gyro_calibration.heading.gaps import CLOSE, FASTEST, Gaps, LONGEST
 from gyro_calibration.heading.integration import Threshold, ThresholdFilter
-from gyro_calibration.heading.kalman import begin, Drift, HEADING, RateIntegral, surprises, WALK
+from gyro_calibration.heading.kalman import begin, Drift, HEADING, RateIntegral, WALK
 from gyro_calibration.heading.sample_blocks import Epoch, EvenSamples, Samples, SETTLING
 from gyro_calibration.heading.stationary import (
     BEGINS,
@@ -397,7 +397,7 @@ class HeadingTracker:
                     piece.epochs.append(self._epoch(until - 1))
             if not self._block.duration:
                 piece.close(count)
-            piece.rates(usual[:count])
+            piece.fill(usual[:count])
             self.rate = float(piece.found[-1, 2])
         if lost:
             self._add(*given.sample(begin + count, self.resting), lost=lost)
@@ -577,13 +577,12 @@ class HeadingTracker:
 
     def _compare(self, wheels: bool | None) -> None:
         """Compare the means over the longer times with the bias that was known before them."""
-        known = [before for before in map(self._before, LAGS) if before is not None]
-        if not known:
-            return
-        turns = [self._rested - before.turn for before in known]
-        found = surprises([before.drift for before in known], turns).tolist()
-        for lag, before, turn, surprise in zip(LAGS, known, turns, found):
-            if abs(surprise) > self._sigmas[lag]:
+        for lag in LAGS:
+            before = self._before(lag)
+            if before is None:
+                return
+            turn = self._rested - before.turn
+            if abs(self._surprise(before.drift, turn)) > self._sigmas[lag]:
                 if wheels is False:
                     expected, _ = before.drift.expected(turn)
                     self._drift = self._drift.uncertain(
@@ -593,7 +592,7 @@ class HeadingTracker:
                 else:
                     self._notice(lag)
                 return
-        if wheels is not False and len(known) == len(LAGS):
+        if wheels is not False:
             self._compare_scatter()
 
     def _compare_scatter(self) -> None:
@@ -753,7 +752,7 @@ class HeadingTracker:
         estimate = float(self._drift.mean[HEADING]) + (
             0.0 if self.resting else self._corrected(self._open + self._part))
         self._pending = estimate - self.heading
-        self._good = self.heading, self.variance
+        self._good = self.heading, float(self._drift.covariance[HEADING, HEADING])
 
     def _rebuild(self) -> None:
         """Begin anew from the last finite heading, which may be off by a full turn since."""
