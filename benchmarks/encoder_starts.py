@@ -13,9 +13,9 @@ Calibrate on the first 20, 30 or 60 s of a swing against an encoder.
 
 And follow it for five minutes.
 
-    python benchmarks/encoder_starts.py FOLDER [STEP]
+    python benchmarks/encoder_starts.py FOLDER [STEP [FIRST]]
 
-FOLDER holds `mems_encoder_turntable`; there is a beginning every STEP s.
+FOLDER holds `mems_encoder_turntable`; there is a beginning every STEP s from FIRST s on.
 
 Prints the heading error over five minutes, rms in deg about its mean, the delay being the one that
 fits best: with nothing, with plain least squares on increments over 0.5 s (delay on a grid), and
@@ -70,7 +70,7 @@ def error(time: Array, output: Array, heading: Array, bias: float, scale: float)
         for lag in LAGS[::2]) / DEGREE
 
 
-def main(folder: Path, step: float) -> None:
+def main(folder: Path, step: float = 120.0, first: float = 0.0) -> None:
     """Print the table."""
     print('| recording | on | nothing | increments | calibrated | the same, refusals as nothing | '
           'refused | worse than nothing |')
@@ -79,7 +79,7 @@ def main(folder: Path, step: float) -> None:
         log = read_log(folder / 'mems_encoder_turntable' / f'{name}.csv.gz')
         for seconds in (20.0, 30.0, 60.0):
             rows = []
-            for begin in np.arange(0.0, log.time[-1] - FOLLOWED, step):
+            for begin in np.arange(first, log.time[-1] - FOLLOWED, step):
                 inside = (log.time >= begin) & (log.time < begin + FOLLOWED)
                 time, output, heading = log.time[
                     inside] - begin, sense * log.output[inside], log.reference_heading[inside]
@@ -102,4 +102,4 @@ def main(folder: Path, step: float) -> None:
 
 
 if __name__ == '__main__':
-    main(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else 120.0)
+    main(Path(sys.argv[1]), *(float(word) for word in sys.argv[2:4]))

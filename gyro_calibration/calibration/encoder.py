@@ -29,26 +29,34 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
-from gyro_calibration.calibration.course_over_ground import fit_course, is_course, PRIORS
+from gyro_calibration.calibration.course_over_ground import (
+    COSINES,
+    fit_course,
+    is_course,
+    PRIORS,
+    WHITE,
+)
 from gyro_calibration.calibration.dwells import Dwells
 from gyro_calibration.calibration.fit_quality import DRIVE
 from gyro_calibration.calibration.likelihood import Fit, fit_likelihood
+from gyro_calibration.calibration.noise_grid import BandedNoise, noise_grid, PriorSize, wander
 from gyro_calibration.calibration.self_calibration import fit_rate, Limits, refuse_scale
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE, Log, refuse_wrapped
-from gyro_calibration.logs.quality import refuse_dead
+from gyro_calibration.logs.quality import quantization_step, refuse_dead
 from gyro_calibration.logs.stamps import lost_samples
 from gyro_calibration.model.effects import BIAS, SCALE_FACTOR_ERROR
 from gyro_calibration.model.gyro_model import GyroModel, Term
 from gyro_calibration.model.motion import from_headings, Motion
-from gyro_calibration.model.noise import ALLAN_FLOOR, Noise
+from gyro_calibration.model.noise import Noise
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.fft import dct
 
 #: Of a log, s: three years, or stamps in another unit.
 LONGEST = 1e8
+#: Least step of a reference, rad: headings of a file are not known better.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,7 @@ class Drift:
     time, rate : middles of the intervals between pieces of the log, s, and the drift of the
         heading there, rad/s, shape (m,)
     angle_random_walk : rad/√s, over times longer than a piece
-    mean : standard deviation of the mean bias over the log, rad/s
+    bias, deviation : mean bias over the log and its standard deviation, rad/s
     wander : standard deviation of the mean bias less the bias at the beginning, rad/s
 
     """
@@ -93,7 +101,8 @@ class Drift:
     time: Array
     rate: Array
     angle_random_walk: float
-    mean: float
+    bias: float
+    deviation: float
     wander: float
 
 
@@ -158,9 +167,10 @@ def calibrate_encoder(log: Log, method: str | None = None, noise: Noise | None =
     refuse_dead(output)
     fit = METHODS[method](time, output, motion, limits)
     refuse_scale(fit.scale_factor_error, 'reference', 'give --invert, or turn the gyro over')
-    drift = _drift(motion.time, _after(time, output, motion, fit).heading, noise or Noise())
-    _refuse_useless(fit.bias, drift.mean, limits.heading)
-    fit = _drawn(replace(fit, covariance=_covariance(fit, drift)), drift.mean, technology)
+    drift = _drift(motion, _after(time, output, motion, fit).heading, fit.bias, noise or Noise(),
+                   technology)
+    _refuse_useless(drift.bias, drift.deviation, limits.heading)
+    fit = _with_drift(fit, drift)
     _refuse_uncertain(fit, limits)
     before, after = (_residual(time - np.nan_to_num(fit.time_offset), output, motion),
                      _after(time, output, motion, fit))
@@ -178,7 +188,7 @@ def _on_course(log: Log, time: Array, output: Array, motion: Motion, noise: Nois
     fit = fit_course(time, output, motion, technology)
     before, after = (_residual(time - fit.time_offset, output, motion),
                      _after(time, output, motion, fit))
-    drift = _drift(motion.time, after.heading, noise or Noise())
+    drift = _drift(motion, after.heading, fit.bias, noise or Noise(), technology)
     model = _model(output, log.temperature, fit, noise or Noise(fit.angle_random_walk))
     remark = ('what the drive leaves open of scale factor error and bias is drawn towards zero, '
               f'as of a gyro of the technology {technology} (--technology); '
@@ -257,10 +267,11 @@ def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
     """
     Refuse a log whose bias is within chance and could make a heading worse.
 
-    It is refused where its standard deviation, rad/s, in `DRIVE` s exceeds the limit, rad.
+    It is refused where its standard deviation, rad/s, in `DRIVE` s exceeds the limit, rad, and its
+    95 % interval holds zero.
 
     """
-    if deviation * DRIVE > limit and bias ** 2 < 2.0 * deviation ** 2:
+    if deviation * DRIVE > limit and abs(bias) < stats.norm.ppf(0.975) * deviation:
         raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
                           f'{deviation / DEGREE:.3f} deg/s, which says nothing: without it '
                           'a heading is as good. Turn more slowly, with rests, or for longer')
@@ -294,117 +305,54 @@ def _pieces(time: Array) -> NDArray[np.intp]:
     return np.minimum(since * count, count - 1).astype(np.intp)
 
 
-def _drift(time: Array, error: Array, noise: Noise) -> Drift:
+def _drift(motion: Motion, error: Array, bias: float, noise: Noise, technology: str) -> Drift:
     """
-    Find how the bias wanders, by restricted likelihood of the mean drifts between pieces of a log.
+    Find the mean bias over a log, and how it wanders, by the drifts between pieces of the log.
 
-    What repeats itself with a motion within a piece does not show. The sizes of the noises are not
-    known, so all of a grid count, weighted by their likelihood.
+    What repeats itself with a motion within a piece is noise of the mean heading of that piece. It
+    is at least what the step of the reference leaves, and at most all that the headings are apart.
+    The bias has a normal prior about zero, of a tenth of the size that the technology has up to
+    all of it: a bias of many standard deviations stays; one that the log hardly shows would only
+    harm a heading.
+
+    Parameters
+    ----------
+    motion : by the reference
+    error : of the heading after a fit, rad, shape (n,)
+    bias : of that fit, rad/s
+    noise : of the gyro, as far as it is known
+    technology : of the gyro, one of `PRIORS`
 
     """
-    piece = _pieces(time)
+    piece = _pieces(motion.time)
     known = np.flatnonzero(np.bincount(piece))
     if len(known) < 6:
         raise DataRefused(f'the reference is known in {len(known)} of {piece[-1] + 1} parts of '
                           'the log; at least 6 are needed: mend its line and record again')
     middle, heading = ((np.bincount(piece, values) / np.maximum(np.bincount(piece), 1))[known]
-                       for values in (time, error))
-    rate = np.diff(heading) / np.diff(middle)
-    duration = float(time[-1] - time[0])
-    walk, mean, wander = _likely_noise(rate, duration / len(rate))
-    figured = (2.0 / math.pi * noise.bias_instability ** 2
-               + noise.rate_random_walk ** 2 * duration / 3.0)
-    return Drift(0.5 * (middle[1:] + middle[:-1]), rate, math.sqrt(walk), math.sqrt(mean),
-                 math.sqrt(max(wander, figured)))
+                       for values in (motion.time, error))
+    apart, ones = np.diff(middle), np.ones(len(middle) - 1)
+    largest = max(PRIORS[technology][1], 3.0 * abs(bias))
+    rounding = max(quantization_step(motion.heading), ROUNDING) / math.sqrt(12.0 * len(piece)
+                                                                            / len(known))
+    repeated = (rounding, max(float(np.ptp(heading)), 2.0 * rounding))
+    columns, shared = wander(middle, cosines=COSINES)
+    found = noise_grid(
+        np.diff(heading), apart[:, None],
+        # means over pieces: of a random walk, and of what repeats itself within them
+        [BandedNoise('angle_random_walk', 2.0 / 3.0 * apart, 0.5 / 3.0 * apart, WHITE),
+         BandedNoise('reference', 2.0 * ones, -ones, repeated)],
+        columns, shared, prior_mean=np.array([-bias]), prior_deviation=np.array([largest]),
+        prior_sizes=(PriorSize('bias', 0, (0.1 * largest, largest)),))
+    known_wander = sum(getattr(noise, part.name) ** 2 * part.unseen for part in shared)
+    return Drift(0.5 * (middle[1:] + middle[:-1]), np.diff(heading) / apart,
+                 found.size('angle_random_walk'), bias + float(found.values[0]),
+                 float(found.deviations[0]), math.sqrt(max(found.unseen, known_wander)))
 
 
-def _likely_noise(rate: Array, length: float) -> tuple[float, float, float]:
+def _with_drift(fit: Fit, drift: Drift) -> Fit:
     """
-    Return N², rad²/s, and the variances of the mean by noise and by wander, (rad/s)².
-
-    The input is the mean rates between pieces of some length, s. Their cosine transform has
-    independent values, each with a variance that is known but for one factor, given three ratios:
-    those of rate noise, of noise of the headings, and of flicker or rate random walk.
-
-    """
-    power = dct(rate, norm='ortho')[1:] ** 2
-    shapes, means, wanders, odds = _shapes(len(rate), length)
-    variances = np.mean(power / shapes, axis=1)
-    likelihoods = -0.5 * (len(power) * np.log(variances) + np.log(shapes).sum(axis=1))
-    weights = odds * np.exp(likelihoods - likelihoods.max())
-    variances = variances * weights / weights.sum()
-    student = len(power) / (len(power) - 2.0)
-    return (float(variances.sum() * length), float(student * variances @ means),
-            float(student * variances @ wanders))
-
-
-#: Odds of a random walk against flicker, where the drifts do not determine it: with 1, intervals
-#: are too narrow for a random walk.
-_ODDS = 3.0
-
-
-def _shapes(count: int, length: float) -> tuple[Array, Array, Array, Array]:
-    """
-    Return possible variances of the transformed rates and of their mean, in units of N² / length.
-
-    The rates are those between `count` pieces, after the cosine transform. Flicker B² and rate
-    random walk K² are given by the averaging time at which the Allan deviation shows them above N.
-    They begin with the log: the mean over it has the variance 2 / pi B² or K² duration / 3.
-
-    Returns
-    -------
-    of the values but the first, shape (n, count - 1); of the mean by noise, and by wander, shape
-    (n,) each; and odds, shape (n,)
-
-    """
-    frequency, duration = math.pi * np.arange(1, count) / count, count * length
-    cosine, crossing = (np.cos(frequency),
-                        np.geomspace(0.01 * length, 1000.0 * duration, 30)[:, None])
-    flicker, walk = length / (ALLAN_FLOOR ** 2 * crossing), 3.0 * length / crossing ** 2
-    wander = np.vstack([flicker / frequency, walk * length / frequency ** 2])
-    wander_of_mean = np.vstack([2.0 / math.pi * flicker, walk * duration / 3.0])
-    ratio = np.geomspace(1e-3, 1e3, 13)[:, None, None]
-    shapes = (2.0 + cosine) / 3.0 + ratio * 2.0 * (1.0 - cosine) + wander
-    means = 1.0 / count + 2.0 * ratio / count ** 2 + 0.0 * wander_of_mean
-    odds = np.tile(np.repeat([1.0, _ODDS], len(crossing)), len(ratio))
-    return (shapes.reshape(-1, count - 1), means.ravel(), (wander_of_mean + 0.0 * ratio).ravel(),
-            odds)
-
-
-def _drawn(fit: Fit, deviation: float, technology: str) -> Fit:
-    """
-    Return the fit with a bias that is drawn towards zero as far as the log leaves it open.
-
-    The prior is normal about zero; its standard deviation is not known, of any size up to that of
-    the technology. A bias of many standard deviations stays; one that the log hardly shows would
-    only harm a heading. The wander of the bias is not an uncertainty of its mean: it does not draw
-    the bias, and stays in the covariance.
-
-    Parameters
-    ----------
-    fit : with its covariance
-    deviation : of the mean bias over the log, rad/s
-    technology : of the gyro, one of `PRIORS`
-
-    """
-    variance, largest = deviation ** 2, max(PRIORS[technology][1], 3.0 * abs(fit.bias))
-    sizes = (np.geomspace(0.01, 1.0, 40) * largest) ** 2
-    logarithms = 0.5 * np.log(sizes) - 0.5 * (np.log(sizes + variance)
-                                              + fit.bias ** 2 / (sizes + variance))
-    weights = np.exp(logarithms - logarithms.max())
-    weights /= weights.sum()
-    kept = sizes / (sizes + variance)
-    share = float(weights @ kept)
-    left = share * variance + fit.bias ** 2 * float(weights @ (kept - share) ** 2)
-    gain = fit.covariance[:, 1] / fit.covariance[1, 1]
-    s, b = (fit.scale_factor_error, fit.bias) + gain * (share - 1.0) * fit.bias
-    return replace(fit, scale_factor_error=float(s), bias=float(b),
-                   covariance=fit.covariance + (left - variance) * np.outer(gain, gain))
-
-
-def _covariance(fit: Fit, drift: Drift) -> Array:
-    """
-    Return the covariance of (s, b) by the scatter between pieces, with the drift's bias variance.
+    Return the fit with the mean bias of the drift, and covariances by the scatter between pieces.
 
     What repeats itself with the motion is not noise of the fit, and what is slower than a piece
     shows in part only.
@@ -415,9 +363,12 @@ def _covariance(fit: Fit, drift: Drift) -> Array:
     student = (stats.t.ppf(0.975, np.count_nonzero(np.bincount(piece)) - 1)
                / stats.norm.ppf(0.975)) ** 2
     scatter = student * sums @ sums.T
+    slope = scatter[0, 1] / scatter[1, 1]
+    known = np.array([math.sqrt(scatter[0, 0]), math.hypot(drift.deviation, drift.wander)])
     deviations = np.sqrt(np.diag(scatter))
-    known = np.array([deviations[0], math.hypot(drift.mean, drift.wander)])
-    return scatter * np.outer(known / deviations, known / deviations)
+    return replace(fit, bias=drift.bias, scale_factor_error=fit.scale_factor_error
+                   + float(slope) * (drift.bias - fit.bias), covariance=scatter * np.outer(
+                       known / deviations, known / deviations))
 
 
 def _model(output: Array, temperature: Array | None, fit: Fit, noise: Noise) -> GyroModel:

@@ -163,6 +163,7 @@ class GridFit:
     influence : what the error of each observation adds to the values at the likeliest point, shape
         (n, m); sums over stretches of a log give a covariance that does not rely on the noise
         model
+    unseen : variance that the shared noise has in common with one of the values, as it is `unseen`
 
     """
 
@@ -176,6 +177,7 @@ class GridFit:
     shared: Array
     shared_covariance: Array
     influence: Array
+    unseen: float
     _noise: Tridiagonal
 
     @property
@@ -432,12 +434,12 @@ def noise_grid(
             axes = [
                 _refined(axis, grid.sizes[:, place], weights) for place, axis in enumerate(axes)
             ]
+    unseen = grid.sizes[:, len(banded): len(banded) + len(shared)] ** 2 @ np.array(
+        [part.unseen for part in shared]
+    )
     if wandering is not None:
-        of_shared = grid.sizes[:, len(banded): len(banded) + len(shared)]
-        grid.covariance[:, wandering, wandering] += of_shared**2 @ np.array(
-            [part.unseen for part in shared]
-        )
-    return _averaged(regression, grid, weights, mean, noisy_column)
+        grid.covariance[:, wandering, wandering] += unseen
+    return _averaged(regression, grid, weights, mean, noisy_column, float(weights @ unseen))
 
 
 @dataclass(frozen=True)
@@ -488,7 +490,8 @@ def _on_grid(regression: _Regression, axes: Sequence[Array]) -> _Grid:
 
 
 def _averaged(
-    regression: _Regression, grid: _Grid, weights: Array, mean: Array, noisy_column: int | None
+    regression: _Regression, grid: _Grid, weights: Array, mean: Array, noisy_column: int | None,
+    unseen: float
 ) -> GridFit:
     values = weights @ grid.values
     apart = grid.values - values
@@ -523,6 +526,7 @@ def _averaged(
         all_values[count:],
         inverse[count:, count:],
         influence,
+        unseen,
         noise,
     )
 
