@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import math
 
 from gyro_calibration.calibration.likelihood import ASYMMETRY, Fit
+from gyro_calibration.calibration.noise_grid import BandedNoise, GridFit, noise_grid
 from gyro_calibration.heading.integration import integrate
 from gyro_calibration.logs.log import Array, DataRefused, DEGREE
 from gyro_calibration.model.motion import Motion
@@ -33,9 +34,6 @@ from scipy.special import chdtr
 _WINDOWS = 16
 #: How often a fit to noise that adds up is looked at again in vain.
 _CHANCE = 1e-3
-#: Ratios of the variance of errors of window means to what noise of the rate adds from window to
-#: window that are tried.
-_RATIOS = np.geomspace(1e-3, 1e4, 29)
 
 #: A calibration is for a drive of this length, s, that ends so far from where it began, rad.
 DRIVE, TURN = 300.0, 2.0 * math.pi
@@ -69,8 +67,8 @@ def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
     The scale factor error and the time offset of the fit are taken; what the gyro turned beyond is
     averaged over 16 windows. Where these differ by less than the noise that the fit has found
     would make them, that noise does not add up: bias and deviation then are those of the windows,
-    by restricted likelihood. The variance counts twice, for what wanders more slowly than the run
-    lasts does not show in it, and may be as large.
+    by restricted likelihood with less of it (`noise_grid`). The variance counts twice, for what
+    wanders more slowly than the run lasts does not show in it, and may be as large.
 
     Parameters
     ----------
@@ -81,14 +79,21 @@ def look_slower(fit: Fit, time: Array, rate: Array, motion: Motion) -> Fit:
 
     """
     windows = None if motion.rate is not None else _windows(fit, time, rate, motion)
-    if windows is None or not _adds_up_to_less(windows, fit.angle_random_walk):
+    if windows is None:
         return fit
-    bias, variance, slope = _slow_bias(windows)
+    walk, point = fit.angle_random_walk, max(windows.repeating, 1e-12)
+    adding_up = _line(windows, (walk, walk), (1e-15, 1e-15))
+    if not chdtr(_WINDOWS - 2, np.sum(adding_up.whiten(adding_up.residual) ** 2)) < _CHANCE:
+        return fit
+    found = _line(windows, (1e-3 * walk, walk), (1e-3 * point, point))
+    weights = found.solve(np.diff(windows.time))
+    slope = float(weights @ np.diff(windows.heading)) / float(weights @ np.diff(windows.time))
     scale_variance = fit.covariance[0, 0]
     covariance = np.array([[scale_variance, -slope * scale_variance],
                            [-slope * scale_variance,
-                            2.0 * variance + slope ** 2 * scale_variance]])
-    return replace(fit, bias=bias, covariance=covariance, repeating=windows.repeating)
+                            2.0 * found.covariance[0, 0] + slope ** 2 * scale_variance]])
+    return replace(fit, bias=float(found.values[0]), covariance=covariance,
+                   repeating=windows.repeating)
 
 
 def _windows(fit: Fit, time: Array, rate: Array, motion: Motion) -> _Windows | None:
@@ -109,56 +114,14 @@ def _windows(fit: Fit, time: Array, rate: Array, motion: Motion) -> _Windows | N
     return _Windows(length, middle, known, turned, float(np.std(beyond - turned[place])))
 
 
-def _walk(windows: _Windows, ratio: float) -> Array:
-    """
-    Return the covariance of increments between windows, s.
-
-    They come of a random walk of unit variance per second, and of errors of the window means.
-
-    """
-    neighbours = np.eye(len(windows.time) - 1, k=1) + np.eye(len(windows.time) - 1, k=-1)
-    return windows.length * ((2.0 / 3.0 + 2.0 * ratio) * np.eye(len(neighbours))
-                             + (1.0 / 6.0 - ratio) * neighbours)
-
-
-def _line(windows: _Windows, covariance: Array) -> tuple[float, float, float, Array]:
-    """Return slopes of turn and heading over time, slope variance, and weighted squares left."""
-    steps = np.diff(windows.time)
-    weights = np.linalg.solve(covariance, steps)
-    information = float(steps @ weights)
-    turned = np.diff(windows.turned)
-    bias, slope = (float(weights @ turned) / information,
-                   float(weights @ np.diff(windows.heading)) / information)
-    left = turned - bias * steps
-    return bias, slope, 1.0 / information, left @ np.linalg.solve(covariance, left)
-
-
-def _adds_up_to_less(windows: _Windows, angle_random_walk: float) -> bool:
-    """Tell whether windows differ by less than a random walk would make them, beyond chance."""
-    squares = _line(windows, angle_random_walk ** 2 * _walk(windows, 0.0))[3]
-    return bool(chdtr(len(windows.time) - 2, squares) < _CHANCE)
-
-
-def _slow_bias(windows: _Windows) -> tuple[float, float, float]:
-    """
-    Return the bias, its variance, and the slope of the heading over time.
-
-    Every ratio of the noises counts by its likelihood.
-
-    """
-    freedom = len(windows.time) - 3  # the bias, and the ratio
-    found, likelihoods = [], []
-    for ratio in _RATIOS:
-        covariance = _walk(windows, ratio)
-        bias, slope, unit, squares = _line(windows, covariance)
-        variance = float(squares) / freedom
-        likelihoods.append(-0.5 * (freedom * math.log(max(variance, 1e-30))
-                                   + np.linalg.slogdet(covariance)[1] - math.log(unit)))
-        found.append((bias, freedom / (freedom - 2.0) * variance * unit, slope))
-    weights = np.exp(np.array(likelihoods) - max(likelihoods))
-    bias, variance, slope = np.average(found, axis=0, weights=weights).tolist()
-    return (bias, variance + float(np.average((np.array(found)[:, 0] - bias) ** 2,
-                                              weights=weights)), slope)
+def _line(windows: _Windows, walk: tuple[float, float], point: tuple[float, float]) -> GridFit:
+    """Fit a bias, with ranges of N, rad/√s, and of the errors of the means of windows, rad."""
+    ones = np.ones(len(windows.time) - 1)
+    return noise_grid(
+        np.diff(windows.turned), np.diff(windows.time)[:, None],
+        [BandedNoise('angle_random_walk', 2.0 / 3.0 * windows.length * ones,
+                     windows.length / 6.0 * ones, walk),
+         BandedNoise('reference', 2.0 * ones, -ones, point)])
 
 
 def allow_asymmetry(fit: Fit, rate: Array) -> Fit:

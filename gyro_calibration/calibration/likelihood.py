@@ -95,6 +95,7 @@ class Fit:
     goodness : whether that is what the noise explains; None where the noise is not known
     repeating : error of the heading that repeats with the motion, rad, where it spoiled the bias
         of the blocks
+    slip : standard deviation between the turns of a profile of the part that each lost, 1
 
     """
 
@@ -114,6 +115,7 @@ class Fit:
     freedom: float = 0.0
     goodness: Goodness | None = None
     repeating: float = 0.0
+    slip: float = 0.0
 
 
 #: Standard deviations that no stretch reaches by chance: 10 000 stretches, all runs of a
@@ -676,6 +678,9 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
                       + part * (1.0 - part) * np.outer(apart, apart))
         values = values + part * apart
     scale, bias = values.tolist()
+    # with a slip, the columns of turns, less what they share, and then those of ends of turns
+    slips = mixture.values[data.prior == slip]
+    slips = slips[:len(slips) // 2]
     begin, end = data.time[edges[[found.first, found.last]]].tolist()
     return Fit(scale - 1.0, bias, covariance, offset, math.sqrt(estimate.rate_variance),
                math.sqrt(estimate.rate_variance * estimate.noise.ratio)
@@ -684,7 +689,8 @@ def fit_likelihood(time: Array, rate: Array, motion: Motion, largest_time_offset
                np.column_stack([estimate.influence, data.time[1:]]),
                (begin, end),
                *(_start_heading(data, estimate) if pairing.sampled else (math.nan, math.nan)),
-               *_squares(data, estimate, pairing.sampled))
+               *_squares(data, estimate, pairing.sampled),
+               slip=math.sqrt(float(np.mean(slips ** 2))) if slip and len(slips) else 0.0)
 
 
 #: The noise is found again where the offset moved by more than this, s.

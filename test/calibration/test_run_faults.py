@@ -211,6 +211,37 @@ def test_a_steady_turn_throughout_the_motion_is_no_bias(yaw):
         check_rest(time[rest], rate[rest], fit, XV3500.noise)
 
 
+@pytest.mark.parametrize('off', [0.0, 3.0, -10.0])
+def test_the_rest_after_a_run_draws_the_bias_of_a_run_that_is_off(off):
+    """The run states 0.01 deg/s and is off by a multiple of it; the rest knows a fifth of it."""
+    time, generator = np.arange(201) / 100.0, np.random.default_rng(7)
+    run, errors = (0.01 * DEGREE) ** 2, []
+    for _ in range(50):
+        fit = Fit(0.0, off * math.sqrt(run), np.diag([1e-6, run]))
+        rest = check_rest(time, 0.2 * math.sqrt(run * len(time)) * generator.standard_normal(201),
+                          fit, limits=Limits(drift=1.0)).fit
+        errors.append(rest.bias / math.sqrt(rest.covariance[1, 1]))
+        assert rest.covariance[1, 1] < 0.3 * run and rest.covariance[0, 0] == pytest.approx(1e-6)
+    assert np.mean(np.abs(errors) < 1.96) > 0.8
+
+
+def test_the_rest_of_a_robot_that_swings_out_begins_when_it_rests():
+    time = np.arange(2600) / 100.0
+    swing = 0.02 * np.exp(-2.0 * (time - 21.0)) * (time > 20.5)
+    rate = calibrated(0).bias + 1e-5 * np.random.default_rng(3).standard_normal(2600) + swing
+    rest = rest_after(time, rate, calibrated(0), CALIBRATION)
+    assert 22.5 < time[rest][0] <= 23.01
+
+
+def test_a_slip_at_speed_alone_is_in_the_interval_of_the_scale():
+    """At 45 deg/s all turns lose 1.5 %, and those at 30 deg/s nothing."""
+    rate = CALIBRATION.rate_at(TIME)
+    slipped = output(0) - (1.0 + S) * 0.015 * np.where(np.abs(rate) > 0.6, rate, 0.0)
+    fit = self_calibrate(TIME, slipped, CALIBRATION, noise=XV3500.noise)
+    deviation = math.sqrt(fit.covariance[0, 0])
+    assert deviation > 0.008 and abs(fit.scale_factor_error - S) < 1.96 * deviation
+
+
 def odometry(seed, deviation, drift):
     """Return the heading of wheels at 50 Hz with errors of scale and drift, and with slip."""
     generator = np.random.default_rng([seed, 2])
