@@ -566,8 +566,10 @@ def suspected(search: Search, named: Sequence[Named]) -> Step | None:
     """Return the named causes with one more that chance shows at `SUSPECTED` times the rate."""
     _, steps = strongest(search, named)
     score = fitted(search.problem, named).score if steps else 0.0
+    causes = {each.candidate.cause for each in named}
     candidates = ((step, step.named[-1].candidate) for step in steps)
-    return next((step for step, candidate in candidates if _times(candidate) > 1.0
+    return next((step for step, candidate in candidates
+                 if _times(candidate) > 1.0 and candidate.cause not in causes
                  and search.excess(candidate.cause, step.score - score, SUSPECTED) > 0.0), None)
 
 
