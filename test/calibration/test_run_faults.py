@@ -88,7 +88,7 @@ def test_noise_beyond_the_models_is_reported_and_more_of_it_refused():
     goodness = self_calibrate(TIME, output(level=3.0), CALIBRATION, noise=XV3500.noise).goodness
     assert goodness.probability < UNLIKELY and goodness.noise_ratio == pytest.approx(3.0, rel=0.4)
     assert 'more than the noise explains' in str(goodness)
-    with pytest.raises(DataRefused, match='times as noisy as the model says'):
+    with pytest.raises(DataRefused, match='times as noisy as the model says|a slip or a bump'):
         self_calibrate(TIME, output(level=15.0), CALIBRATION, noise=XV3500.noise,
                        limits=Limits(scale_standard_deviation=1.0))
 
@@ -254,25 +254,27 @@ def odometry(seed, deviation, drift):
     return from_headings(fine[::20], heading[::20])
 
 
-@pytest.mark.parametrize('runs, least', [
-    (10, 6), pytest.param(25, 19, marks=pytest.mark.evidence)])
-def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations(runs, least):
-    """Of 60 runs, 93 to 98 % were within 1.96 standard deviations; fewer by 4 standard errors."""
+@pytest.mark.parametrize('runs', [10, pytest.param(25, marks=pytest.mark.evidence)])
+def test_odometry_calibrates_and_its_own_scale_and_drift_are_in_the_deviations(runs):
+    """Of 60 runs, 93 to 98 % were within 1.96 standard deviations; 1 of 50 was refused."""
     reference, sizes = Reference(0.0075, 0.01 * DEGREE), []
     for seed in range(runs):
         late = np.random.default_rng([seed, 3]).uniform(-0.3, 0.3)
-        fit = self_calibrate(TIME, output(seed, time=TIME - late),
-                             odometry(seed, 0.0075, 0.01 * DEGREE), reference=reference)
+        try:
+            fit = self_calibrate(TIME, output(seed, time=TIME - late),
+                                 odometry(seed, 0.0075, 0.01 * DEGREE), reference=reference)
+        except DataRefused as refusal:
+            assert 'a slip or a bump' in str(refusal)
+            continue
         sizes.append(np.abs([fit.scale_factor_error - S, fit.bias - B, fit.time_offset - late])
                      / [math.sqrt(fit.covariance[0, 0]), math.sqrt(fit.covariance[1, 1]),
                         fit.time_offset_deviation])
-    assert ((np.array(sizes) < 1.96).sum(axis=0) >= least).all(), (
-        np.mean(np.array(sizes) < 1.96, axis=0))
+    assert runs - len(sizes) <= most(runs, 0.02)
+    assert ((np.array(sizes) < 1.96).sum(axis=0) >= fewest(len(sizes), 0.93)).all(), sizes
 
 
-@pytest.mark.parametrize('runs, least', [
-    (10, 6), pytest.param(25, 19, marks=pytest.mark.evidence)])
-def test_the_start_heading_is_found_with_its_deviation(runs, least):
+@pytest.mark.parametrize('runs', [10, pytest.param(25, marks=pytest.mark.evidence)])
+def test_the_start_heading_is_found_with_its_deviation(runs):
     """A reference of 20 Hz whose readings are 0.5 deg off, the first one too."""
     sizes, readings = [], np.arange(401) / 20.0
     for seed in range(runs):
@@ -281,7 +283,7 @@ def test_the_start_heading_is_found_with_its_deviation(runs, least):
                              from_headings(readings, CALIBRATION.heading_at(readings) + errors))
         sizes.append(abs(fit.start_heading + errors[0]) / fit.start_heading_deviation)
         assert fit.start_heading_deviation < 0.25 * DEGREE
-    assert np.sum(np.array(sizes) < 1.96) >= least, np.sort(sizes)
+    assert np.sum(np.array(sizes) < 1.96) >= fewest(runs, 0.93), np.sort(sizes)
 
 
 def turned(number, seed=0, s=S, before=3.0, after=3.0, speed=45.0):
