@@ -21,7 +21,7 @@ pytest.importorskip('rclpy', reason='ROS 2 (rclpy) is not installed')
 
 from gyro_calibration.driver.connection import Connection
 from gyro_calibration.driver.decimation import Mean
-from gyro_calibration.driver.protocols import find, PROTOCOLS, Sample, Settings
+from gyro_calibration.driver.protocols import find, Sample, Settings
 from gyro_calibration.ros.diagnostics import ERROR, OK, WARN
 from gyro_calibration.ros.driver_node import Messages, PARAMETERS, settings
 from gyro_calibration.ros.driver_report import DriverReport
@@ -216,8 +216,3 @@ def test_listening_is_a_warning_and_what_was_recognized_is_reported():
     assert reports[0][:2] == (WARN, 'listening for a protocol')
     assert (reports[-1][2]['protocol'] == 'minimu9'
             and 'minimu9 explains' in reports[-1][2]['detected'])
-
-
-def test_all_protocols_are_choices_of_the_parameter():
-    choices = next(each.choices for each in PARAMETERS if each.name == 'protocol')
-    assert choices == (*PROTOCOLS, 'auto')

@@ -443,20 +443,6 @@ def _folder(path, name):
     return path / name
 
 
-@pytest.mark.parametrize('speed', [0.25, 1.0, 4.0, 20.0])
-def test_the_heading_follows_a_simulation_at_any_speed(tmp_path, speed):
-    rig = Rig(tmp_path, model='', ros=1000.0, stationary_threshold=0.0)
-    rig.ros_speed = speed
-    rates = 0.2
-    for _ in range(300):
-        rig.clock.now += INTERVAL
-        rig.clock.ros += INTERVAL * speed
-        rig.sample(round(1e9 * rig.clock.ros), rates)
-        rig.guards()
-    turned = rig.outputs[-1].heading - rig.outputs[0].heading
-    assert turned == pytest.approx(rates * 299 * INTERVAL * speed, abs=1e-6)
-
-
 def test_a_simulation_that_is_set_back_begins_the_integration_anew(tmp_path):
     rig = rested(tmp_path, ros=1000.0)
     rig.clock.ros -= 500.0
