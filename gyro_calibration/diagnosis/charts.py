@@ -65,6 +65,8 @@ def _escaped(text: str) -> str:
 #: Of the drawing and of the plot in it: small, so that letters stay readable on a phone.
 _WIDTH, _HEIGHT = 360.0, 236.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 344.0, 24.0, 196.0
+#: That fit side by side below an axis.
+_LETTERS = 30
 #: Of a normal distribution, for bands of 95 %.
 _BAND = 1.96
 
@@ -103,6 +105,7 @@ class Chart:
     across, across_unit, at : what goes to the right, shape (n,)
     up, up_unit, lines : what goes up
     logarithmic : both axes
+    names : of what goes to the right, where that is numbered from 1 on
 
     """
 
@@ -116,6 +119,7 @@ class Chart:
     up_unit: str
     lines: Sequence[Line]
     logarithmic: bool = False
+    names: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,7 @@ def draw(chart: Chart) -> Markup:
     picture = element(
         'svg', element('title', chart.title, id=f'{chart.name}-title'),
         element('desc', chart.description, id=f'{chart.name}-description'),
-        *_grid(names, across, up), *marks,
+        *_grid(chart, names, across, up), *marks,
         element('g', element('line', y1=_TOP, y2=_BOTTOM), *dots, class_='cursor'),
         viewBox=f'0 0 {_WIDTH:g} {_HEIGHT:g}', role='img', tabindex='0',
         aria_labelledby=f'{chart.name}-title {chart.name}-description', data_at=_places(at))
@@ -198,7 +202,8 @@ def _axes(chart: Chart, shown: Sequence[Mask]) -> tuple[_Axis, _Axis]:
                      else _BAND * np.nan_to_num(line.deviation))
         at.append(chart.at[known])
         ends += [(line.values - deviation)[known], (line.values + deviation)[known]]
-    return (_Axis(*_room(np.concatenate(at), chart.logarithmic, 0.0), _LEFT, _RIGHT,
+    across = np.array([0.5, len(chart.names) + 0.5]) if chart.names else np.concatenate(at)
+    return (_Axis(*_room(across, chart.logarithmic, 0.0), _LEFT, _RIGHT,
                   chart.logarithmic, chart.across_unit),
             _Axis(*_room(np.concatenate(ends), chart.logarithmic, 0.06), _BOTTOM, _TOP,
                   chart.logarithmic, chart.up_unit))
@@ -218,8 +223,11 @@ def _places(values: Array) -> str:
     return ' '.join(f'{value:.1f}' if math.isfinite(value) else '-' for value in values)
 
 
-def _grid(names: tuple[str, str], across: _Axis, up: _Axis) -> Iterator[Markup]:
-    for value, label in across.ticks(6):
+def _grid(chart: Chart, names: tuple[str, str], across: _Axis,
+          up: _Axis) -> Iterator[Markup]:
+    apart = math.ceil(sum(map(len, chart.names)) / _LETTERS) or 1
+    named = [(float(place), text) for place, text in enumerate(chart.names, 1)][::apart]
+    for value, label in named or across.ticks(6):
         x = float(across.place(np.array(value)))
         yield element('line', x1=x, x2=x, y1=_TOP, y2=_BOTTOM, class_='grid')
         yield element('text', label, x=x, y=_BOTTOM + 15.0, text_anchor='middle')
@@ -287,8 +295,10 @@ def _table(chart: Chart) -> Markup:
         element('thead', element('tr', *(element(
             'th', _labelled(name, unit), scope='col', data_name=name, data_unit=unit)
             for name, unit in heads))),
-        element('tbody', *(element('tr', element('td', number(float(at), 4)), *(
-            element('td', value(line, row)) for line in chart.lines))
+        element('tbody', *(element(
+            'tr', element('td', chart.names[round(float(at)) - 1] if chart.names
+                          else number(float(at), 4)),
+            *(element('td', value(line, row)) for line in chart.lines))
             for row, at in enumerate(chart.at))))
     return element('details', element('summary', 'Values'),
                    element('div', table, class_='scroll', tabindex='0'))

@@ -26,6 +26,8 @@ import numpy as np
 
 _SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
             (DRIVES, 'common to a drive'))
+#: Rows from which on a table is scrolled inside the page and has a field to search.
+_LONG = 12
 #: Of a normal distribution, as charts draw it.
 _BAND = 1.96
 #: Sorts a table by the column that is clicked, and shows the rows that hold a text.
@@ -36,7 +38,7 @@ for (const table of document.querySelectorAll('table.sortable')) {
   search.type = 'search';
   search.placeholder = 'Search';
   search.setAttribute('aria-label', 'Search in the table below');
-  table.parentNode.before(search);
+  if (table.parentNode.classList.contains('tall')) table.parentNode.before(search);
   search.addEventListener('input', () => {
     const text = search.value.toLowerCase();
     for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(text);
@@ -61,6 +63,7 @@ input[type=search] { font: inherit; padding: .2rem .6rem; margin: .4rem 0; max-w
 .scroll.tall { max-height: 40rem; }
 .sortable th, .sortable td { overflow-wrap: normal; word-break: normal; }
 .sortable td:nth-child(n + 2):not(:empty) { min-width: 4.5rem; }
+@media (max-width: 40rem) { .sortable td { white-space: nowrap; } }
 </style>""")
 
 
@@ -172,7 +175,8 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Markup]]) -> Markup:
     head = element('tr', *(element('th', each, scope='col') for each in heads))
     table = element('table', element('thead', head),
                     element('tbody', *(element('tr', *row) for row in rows)), class_='sortable')
-    return element('div', table, class_='scroll tall', tabindex='0')
+    return element('div', table, class_='scroll tall' if len(rows) > _LONG else 'scroll',
+                   tabindex='0')
 
 
 def _cell(text: str, key: float | None = None) -> Markup:
@@ -209,12 +213,10 @@ def _drives_chart(found: TypeFound, each: Found, name: str) -> Chart:
 def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,
            style: str) -> Chart:
     unit, factor = for_people(each.unit, each.name)
-    order = ', '.join(text if text == str(place) else f'{place} {text}'
-                      for place, text in enumerate(names, 1))
     middle, half = 0.5 * (of.high + of.low), 0.5 * (of.high - of.low) / _BAND
-    return Chart(name, f'{spoken(each.name)} by {kind}', f'{kind}s: {order}', kind, '',
+    return Chart(name, f'{spoken(each.name)} by {kind}', f'{kind}s: {", ".join(names)}', kind, '',
                  np.arange(1.0, len(names) + 1.0), spoken(each.name), unit,
-                 [Line(kind, style, factor * middle, factor * half, dots=True)])
+                 [Line(kind, style, factor * middle, factor * half, dots=True)], names=names)
 
 
 def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
@@ -225,7 +227,6 @@ def _dates_chart(found: TypeFound, each: Found, name: str) -> Chart:
     value: Array = np.array([
         record['slow' if each.slow else 'values'][each.name]['value']
         - float(each.units.value[found.units.index(record['unit'])]) for record in dated])
-    order = ', '.join(f'{count} {text}' for count, text in enumerate(found.dates, 1))
-    return Chart(name, f'{spoken(each.name)} less that of the unit', f'dates: {order}', 'date',
-                 '', place, spoken(each.name), unit,
-                 [Line('log', 'measured', factor * value, dots=True)])
+    return Chart(name, f'{spoken(each.name)} less that of the unit',
+                 f'dates: {", ".join(found.dates)}', 'date', '', place, spoken(each.name), unit,
+                 [Line('log', 'measured', factor * value, dots=True)], names=found.dates)
