@@ -70,9 +70,9 @@ def even_record(time: Array, output: Array, moving: Array | None = None) -> Reco
     stamps = number_stamps(time)
     rate = np.full(int(stamps.number[-1]) + 1, np.nan)
     rate[stamps.number[known]] = output[known]
-    remarks = [*stamps.said_of_bursts,
+    remarks = [*stamps.burst_remarks,
                *(f'{remark} Windows with more than {100 * LOST_SHARE:g} % lost are not used.'
-                 for remark in stamps.said_of_lost)]
+                 for remark in stamps.loss_remarks)]
     left_out = int(np.count_nonzero(~known))
     if left_out:
         remarks.append(f'{left_out} samples without output, or moving, are left out.')

@@ -55,8 +55,6 @@ import numpy as np
 _WIDTH = 120
 _SPOKEN = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
            (DRIVES, 'between drives'))
-#: Bytes of a GB.
-_GIGABYTE = 1e9
 
 
 def add(verbs: Any) -> argparse.ArgumentParser:
@@ -210,7 +208,7 @@ def _executors(given: argparse.Namespace) -> Iterator[Any]:
     workers = given.workers or usual_workers()
     if given.scheduler is None:
         machine = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
-        memory = given.memory * _GIGABYTE if given.memory else 0.8 * machine / workers
+        memory = 1e9 * given.memory if given.memory else 0.8 * machine / workers
         with processes(workers, memory, ['gyro_calibration.fleet.work']) as create:
             yield workers, create
         return

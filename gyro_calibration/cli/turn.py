@@ -51,7 +51,6 @@ from gyro_calibration.model.gyro_model import GyroModel
 from gyro_calibration.model.model_file import read_model
 import numpy as np
 
-TURN = 2.0 * math.pi
 #: Temperatures go into this many bins at most.
 _TEMPERATURE_BINS = 8
 #: Limits of each bin, and which errors lie in it.
@@ -202,7 +201,7 @@ def _text(given: argparse.Namespace, errors: TurnErrors, remarks: list[str]) -> 
 
 
 def _degrees(error: float) -> str:
-    return f'{error / DEGREE:.3g} deg ({100.0 * error / TURN:.2g} %)'
+    return f'{error / DEGREE:.3g} deg ({100.0 * error / math.tau:.2g} %)'
 
 
 def _ratio(before: float, after: float) -> str:
@@ -219,7 +218,7 @@ def _table(title: str, errors: TurnErrors, bins: Bins) -> Iterator[str]:
     for low, high, mask in bins:
         label = f'{low:.4g} to {high:.4g}'
         yield f'{label:20} {np.count_nonzero(mask):5d}' + ''.join(
-            f'  {value / DEGREE:7.3f} {100.0 * value / TURN:7.3f}'
+            f'  {value / DEGREE:7.3f} {100.0 * value / math.tau:7.3f}'
             for each in (errors.static, errors.modelled)
             for value in (size(each[mask]).rms, size(each[mask]).largest))
 

@@ -172,7 +172,7 @@ def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     except DataRefused as refused:
         return replace(found, remarks=(*found.remarks, *remarks,
                                        f'Lost samples cannot be counted: {refused}.'))
-    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.said_of_bursts,
+    found = replace(found, remarks=(*found.remarks, *remarks, *stamps.burst_remarks,
                                     *_remarks_of_pace(stamps)))
     lost, steps = stamps.lost, np.diff(stamps.time)
     if not lost.any():
@@ -181,7 +181,7 @@ def _of_stamps(found: DataQuality, log: Log, known: Mask) -> DataQuality:
     late = (lost.max() - 0.5) * stamps.interval / jitter
     chance = min(1.0, len(steps) * float(stats.norm.sf(late)))
     return found if chance >= LEVEL else replace(found, findings=(*found.findings, _sized(
-        'dropped_samples', int(lost.sum()), 0.0, chance, stamps.said_of_lost[0].rstrip('.'))))
+        'dropped_samples', int(lost.sum()), 0.0, chance, stamps.loss_remarks[0].rstrip('.'))))
 
 
 def _remarks_of_pace(stamps: Stamps) -> Iterator[str]:

@@ -116,8 +116,8 @@ def _alignment(place: Array, counts: Array, step: float) -> tuple[float, float]:
     """
     Return the length of the mean phase of places on a lattice, and the shift of the lattice.
 
-    The place that occurs most is left out: beside a value that comes at every rest, all others
-    would count for nothing.
+    The place that occurs most is left out: a value that comes at every rest would outweigh all
+    others.
 
     """
     counts = (np.where(np.arange(len(counts)) == np.argmax(counts), 0, counts)

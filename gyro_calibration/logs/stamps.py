@@ -78,16 +78,16 @@ class Stamps:
         return _longest_gap(self.time)
 
     @property
-    def said_of_bursts(self) -> list[str]:
-        """Say how far stamps are off their grid, if they come in bursts."""
+    def burst_remarks(self) -> list[str]:
+        """Return how far stamps are off their grid, if they come in bursts."""
         if not (self.bursts and self.wander):
             return []
         return [f'The stamps come in bursts or with jitter, up to {self.wander:.3g} s off an even '
                 f'interval of {1000 * self.interval:.5g} ms, which is used.']
 
     @property
-    def said_of_lost(self) -> list[str]:
-        """Say how many samples are lost, if any are."""
+    def loss_remarks(self) -> list[str]:
+        """Return how many samples are lost, if any are."""
         if not self.lost.any():
             return []
         longest, gaps = int(np.argmax(self.lost)), int(np.count_nonzero(self.lost))

@@ -25,10 +25,10 @@ leave), `course` (of the time since power-on), `surroundings` (magnetic, mechani
 
 from collections.abc import Iterable
 
-from gyro_calibration.logs.log import Number
+from gyro_calibration.logs.log import Number  # noqa: F401
 from gyro_calibration.model.effects.course import BIAS_STEP, INTERFERENCE_TONE, RATE_RAMP, WARM_UP
-from gyro_calibration.model.effects.effect import Channels, Effect, Parameter
-from gyro_calibration.model.effects.polynomial import (
+from gyro_calibration.model.effects.effect import Channels, Effect, Parameter  # noqa: F401
+from gyro_calibration.model.effects.polynomial import (  # noqa: F401
     polynomial_from_matrix,
     polynomial_to_matrix,
     rate_temperature_polynomial,
@@ -69,7 +69,7 @@ import numpy as np
 STEADY = {effect.name: effect for effect in (
     BIAS, SCALE_FACTOR_ERROR, SCALE_FACTOR_ASYMMETRY, QUADRATIC_NONLINEARITY, CUBIC_NONLINEARITY,
     SINE_RESPONSE, BIAS_TEMPERATURE, BIAS_TEMPERATURE_QUADRATIC, SCALE_FACTOR_TEMPERATURE)}
-#: All that a model may hold, beside the polynomial.
+#: All that a model may hold, except the polynomial.
 CATALOGUE = STEADY | {effect.name: effect for effect in (
     BIAS_TEMPERATURE_RATE, THERMAL_LAG, THERMAL_HYSTERESIS, WARM_UP, RATE_RAMP, BIAS_STEP,
     HEADING_SENSITIVITY, ACCELERATION_SENSITIVITY, VIBRATION_RECTIFICATION, SUPPLY_SENSITIVITY,
@@ -107,15 +107,3 @@ def add_effects(effects: Iterable[Effect]) -> None:
             raise ValueError(f'{effect.name} has {len(effect.coefficients)} coefficients and '
                              f'{len(columns)} columns; give an array like channels.rate for each')
         ADDED[effect.name] = CATALOGUE[effect.name] = effect
-
-
-__all__ = [
-    'ACCELERATION_SENSITIVITY', 'ADDED', 'BANDWIDTH', 'BIAS', 'BIAS_STEP', 'BIAS_TEMPERATURE',
-    'BIAS_TEMPERATURE_QUADRATIC', 'BIAS_TEMPERATURE_RATE', 'CATALOGUE', 'CLOCK_RATE',
-    'CUBIC_NONLINEARITY', 'DEAD_ZONE', 'HEADING_SENSITIVITY', 'INTERFERENCE_TONE',
-    'QUADRATIC_NONLINEARITY', 'QUANTIZATION', 'RATE_RAMP', 'SATURATION', 'SCALE_FACTOR_ASYMMETRY',
-    'SCALE_FACTOR_ERROR', 'SCALE_FACTOR_TEMPERATURE', 'SINE_RESPONSE', 'STEADY',
-    'SUPPLY_SENSITIVITY', 'THERMAL_HYSTERESIS', 'THERMAL_LAG', 'TIME_OFFSET',
-    'VIBRATION_RECTIFICATION', 'WARM_UP', 'Channels', 'Effect', 'Number', 'Parameter',
-    'add_effects',
-    'polynomial_from_matrix', 'polynomial_to_matrix', 'rate_temperature_polynomial']

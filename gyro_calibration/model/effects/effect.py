@@ -18,8 +18,8 @@ are no function of one instant and add no column; they are simulated where they 
 
 A parameter with a default is a convention (a temperature to count from, a centre, a scale) and is
 not fitted. One without a default is a property of the gyro, is fitted, and has a place in the
-covariance. `nested` gives the sum of an effect beside its columns, which takes less time than to
-make all columns first; a test compares both.
+covariance. `nested` gives the sum of the columns in less time than the columns take; a test
+compares both.
 
 """
 

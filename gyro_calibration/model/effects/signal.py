@@ -79,7 +79,7 @@ BANDWIDTH = Effect(
     'bandwidth', 'The output follows the rate through a first-order lag.',
     frozenset(), (), nothing_added, (Parameter('bandwidth', 's', bounds=(1e-7, 10.0)),),
     _FAST_REVERSALS, distortion=_lagged, stage='rate',
-    undone='Quick motion stays damped, for to sharpen it again is to raise the noise.')
+    undone='Quick motion stays damped: sharpening it would raise the noise.')
 
 
 def _dead_zone(channels: Channels, dead_zone: float) -> Sequence[Number]:
