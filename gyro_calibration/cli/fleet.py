@@ -26,9 +26,8 @@ from typing import Any
 from gyro_calibration.calibration.course_over_ground import PRIORS
 from gyro_calibration.cli.progress import bar
 from gyro_calibration.cli.verb import Answer, origin_of, positive, UsageError, verb, whole
-from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.gates import is_confused
-from gyro_calibration.diagnosis.words import amount, quantity
+from gyro_calibration.diagnosis.words import amount
 from gyro_calibration.files import plain, write_atomically
 from gyro_calibration.fleet.pooling import Component, DRIVES, POWER_ONS, UNITS
 from gyro_calibration.fleet.prior import models
@@ -40,11 +39,12 @@ from gyro_calibration.fleet.summary import (
 from gyro_calibration.fleet.summary import (
     FALSE_ALARMS,
     Found,
+    in_words,
     sentences,
     summarized,
     TypeFound,
 )
-from gyro_calibration.fleet.table import entries, Entry, pattern
+from gyro_calibration.fleet.table import entries, pattern
 from gyro_calibration.fleet.tabular import tables
 from gyro_calibration.fleet.work import DONE, done, NO_EVIDENCE, refused, Task
 from gyro_calibration.logs.log import DataRefused
@@ -106,7 +106,10 @@ def _fleet(given: argparse.Namespace) -> Answer:
     folder = os.path.abspath(given.out)
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise UsageError(f'{given.out}: is a file, but must be a folder; give another name')
-    records = _records(given, [_task(given, entry, folder) for entry in listed])
+    drawn = None if given.no_diagnosis else np.random.default_rng(given.seed)
+    records = _records(given, [
+        Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '',
+             given.rate) for entry in listed])
     used = [each for each in records if each['status'] == DONE]
     if not used:
         first = records[0]
@@ -155,13 +158,12 @@ def _lines(found: TypeFound) -> Iterator[str]:
     for each in found.values.values():
         parts = [f'{spoken} {_spread(each, each.components[name])}' for name, spoken in _SPOKEN
                  if name in each.components]
-        mean = quantity(Estimate(float(each.mean.value[0]), (
-            float(each.mean.low[0]), float(each.mean.high[0])), each.unit), each.name)
+        mean = in_words(each.mean, 0, each.unit, each.name)
         yield f'  {each.name}: {mean}; {", ".join(parts)}'
         if not each.slow:
             yield '    ' + '; '.join(
-                f'unit {plain(name)} {_of_unit(each, place)}' for place, name in enumerate(
-                    found.units) if np.isfinite(each.units.value[place]))
+                f'unit {plain(name)} {in_words(each.units, place, each.unit, each.name)}'
+                for place, name in enumerate(found.units) if np.isfinite(each.units.value[place]))
     yield from (f'  {text}.' for text in sentences(found))
 
 
@@ -172,20 +174,9 @@ def _spread(each: Found, of: Component) -> str:
     return f'less than {amount(of.high, each.unit, each.name)}'
 
 
-def _of_unit(each: Found, place: int) -> str:
-    return str(quantity(Estimate(float(each.units.value[place]), (
-        float(each.units.low[place]), float(each.units.high[place])), each.unit), each.name))
-
-
 def _wrapped(line: str) -> str:
     indent = ' ' * (len(line) - len(line.lstrip()))
     return textwrap.fill(line, _WIDTH, subsequent_indent=f'{indent}  ')
-
-
-def _task(given: argparse.Namespace, entry: Entry, folder: str) -> Task:
-    drawn = None if given.no_diagnosis else np.random.default_rng(given.seed)
-    return Task(entry, folder, given.technology, given.pattern, drawn, given.gyro_type or '',
-                given.rate)
 
 
 def _records(given: argparse.Namespace, tasks: Sequence[Task]) -> list[dict[str, Any]]:

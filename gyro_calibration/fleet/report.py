@@ -20,12 +20,13 @@ from gyro_calibration.diagnosis.findings import Estimate
 from gyro_calibration.diagnosis.report import page
 from gyro_calibration.diagnosis.words import amount, for_people, quantity, sentence, spoken
 from gyro_calibration.fleet.pooling import Component, DRIVES, Interval, POWER_ONS, UNITS
-from gyro_calibration.fleet.summary import Found, sentences, TypeFound
+from gyro_calibration.fleet.summary import Found, in_words, sentences, TypeFound
 from gyro_calibration.logs.log import Array
 import numpy as np
 
 _SPREADS = ((UNITS, 'between units'), (POWER_ONS, 'between power-ons'),
             (DRIVES, 'common to a drive'))
+_PER = {'age': 'year', 'temperature': 'K'}
 #: Rows from which on a table is scrolled inside the page and has a field to search.
 _LONG = 12
 #: Of a normal distribution, as charts draw it.
@@ -99,15 +100,17 @@ def _type(found: TypeFound, place: int) -> Iterator[Markup]:
         'section', element('h2', f'{name}: units'),
         element('p', 'Bars hold the value of a unit, as the mean over its power-ons, with 95 %.',
                 class_='quiet'),
-        element('div', *(draw(_units_chart(found, each, f't{place}-{each.name}-units'))
-                         for each in values), class_='pairs'), _units(found, values))
+        element('div', *(draw(_chart(each, f't{place}-{each.name}-units', 'unit', found.units,
+                                     each.units, 'after')) for each in values), class_='pairs'),
+        _units(found, values))
     shared = [each for each in found.values.values() if DRIVES in each.components]
     if shared:
         yield element(
             'section', element('h2', f'{name}: drives'),
             element('p', 'What all units of a drive have in common is of its reference or of '
                     'the vehicle.', class_='quiet'),
-            element('div', *(draw(_drives_chart(found, each, f't{place}-{each.name}-drives'))
+            element('div', *(draw(_chart(each, f't{place}-{each.name}-drives', 'drive',
+                                         found.drives, each.drives, 'before'))
                              for each in shared), class_='pairs'))
     if len(found.dates) > 1:
         yield element('section', element('h2', f'{name}: over time'), element('div', *(
@@ -122,14 +125,11 @@ def _variances(found: TypeFound) -> Markup:
     rows = [[_cell(spoken(each.name)), _estimate(each, each.mean, 0),
              _estimate(each, each.new_unit, 0),
              *(_spread(each, each.components.get(name)) for name, _ in _SPREADS),
-             *([_cell('; '.join(_text(slope, 0, f'{each.unit}/{_per(name)}', each.name)
-                                for name, slope in each.slopes.items()))] if drifts else [])]
+             *([_cell('; '.join(
+                 in_words(slope, 0, f'{each.unit}/{_PER[name]}', each.name)
+                 for name, slope in each.slopes.items()))] if drifts else [])]
             for each in found.values.values()]
     return _table(heads, rows)
-
-
-def _per(covariate: str) -> str:
-    return 'year' if covariate == 'age' else 'K'
 
 
 def _units(found: TypeFound, values: Sequence[Found]) -> Markup:
@@ -185,12 +185,7 @@ def _cell(text: str, key: float | None = None) -> Markup:
 
 
 def _estimate(each: Found, of: Interval, place: int) -> Markup:
-    return _cell(_text(of, place, each.unit, each.name), float(of.value[place]))
-
-
-def _text(of: Interval, place: int, unit: str, name: str) -> str:
-    return str(quantity(Estimate(float(of.value[place]), (
-        float(of.low[place]), float(of.high[place])), unit), name))
+    return _cell(in_words(of, place, each.unit, each.name), float(of.value[place]))
 
 
 def _spread(each: Found, of: Component | None) -> Markup:
@@ -200,14 +195,6 @@ def _spread(each: Found, of: Component | None) -> Markup:
     text = (f'{amount(of.estimate, each.unit, each.name)} ({low} to {high})' if of.low > 0.0
             else f'less than {high}')
     return _cell(text, of.estimate)
-
-
-def _units_chart(found: TypeFound, each: Found, name: str) -> Chart:
-    return _chart(each, name, 'unit', found.units, each.units, 'after')
-
-
-def _drives_chart(found: TypeFound, each: Found, name: str) -> Chart:
-    return _chart(each, name, 'drive', found.drives, each.drives, 'before')
 
 
 def _chart(each: Found, name: str, kind: str, names: Sequence[str], of: Interval,

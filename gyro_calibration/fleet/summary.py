@@ -233,6 +233,12 @@ def _varies(column: Array, unit: Numbers) -> bool:
 
 # who is to blame
 
+def in_words(of: Interval, place: int, unit: str, name: str) -> str:
+    """Return a value with its interval, for people."""
+    return str(quantity(Estimate(float(of.value[place]), (
+        float(of.low[place]), float(of.high[place])), unit), name))
+
+
 def sentences(found: TypeFound) -> Iterator[str]:
     """Say whose each value is, and what stands out."""
     for each in found.values.values():
@@ -280,9 +286,7 @@ def _lacking(found: TypeFound) -> Iterator[str]:
         first, *others = repeating
         also = (f'; {listed([spoken(each.name) for each in others], "or")} would look alike'
                 if others else '')
-        size = quantity(Estimate(float(first.mean.value[0]),
-                                 (float(first.mean.low[0]), float(first.mean.high[0])),
-                                 first.unit), first.name)
+        size = in_words(first.mean, 0, first.unit, first.name)
         yield (f'{spoken(first.name)}: it repeats in all units, so the model of the type lacks '
                f'it: {size}{also}')
     elif slow:

@@ -157,9 +157,8 @@ def _calibrated(task: Task) -> dict[str, Any]:
     log = (read_recording(path, rate=task.rate) if is_recording(path)
            else read_log(path, rate=task.rate))
     method, model, more = calibrate(log, task.technology)
-    temperature = None if log.temperature is None else float(np.nanmean(log.temperature))
-    if temperature is not None and not math.isfinite(temperature):
-        temperature = None
+    temperature = (None if log.temperature is None or not np.isfinite(log.temperature).any()
+                   else float(np.nanmean(log.temperature)))
     content = hashlib.sha256()
     for values in (getattr(log, quantity) for quantity in QUANTITIES):
         content.update(b'' if values is None else values.tobytes())
