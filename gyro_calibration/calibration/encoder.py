@@ -273,8 +273,8 @@ def _refuse_useless(bias: float, deviation: float, limit: float) -> None:
     """
     if deviation * DRIVE > limit and abs(bias) < stats.norm.ppf(0.975) * deviation:
         raise DataRefused(f'the log shows a bias of {bias / DEGREE:.3f} +- '
-                          f'{deviation / DEGREE:.3f} deg/s, which says nothing: without it '
-                          'a heading is as good. Turn more slowly, with rests, or for longer')
+                          f'{deviation / DEGREE:.3f} deg/s, too uncertain to improve a heading: '
+                          'turn more slowly, with rests, or for longer')
 
 
 def _by_likelihood(time: Array, output: Array, motion: Motion, limits: Limits) -> Fit:
@@ -404,10 +404,10 @@ def _remarks(fit: Fit, method: str) -> tuple[str, ...]:
     wrong = -s / (1.0 + s)
     scale = (f'a reference that shows {abs(100 * wrong):.2f} % too '
              f'{"much" if wrong > 0.0 else "little"}, {360.0 * (1.0 + wrong):.2f} for 360 deg, '
-             f'would look just like this scale factor error of {100 * s:+.2f} %: '
+             f'would have the same effect as this scale factor error of {100 * s:+.2f} %: '
              'check it over whole turns closed on a mark')
     if method == 'likelihood':
         return (scale,)
-    return scale, ('the regression of rates knows no time offset, and takes noise of the gyro for '
-                   'scale: its scale factor error is too large by more than is stated; '
-                   'compare it with the method likelihood')
+    return scale, ('the regression of rates fits no time offset, and noise of the gyro biases its '
+                   'scale factor error by more than its interval; compare it with the method '
+                   'likelihood')

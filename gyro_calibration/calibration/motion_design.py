@@ -404,10 +404,10 @@ def believed(plan: Plan, limits: Limits | None = None) -> Plan:
                          float(np.std(motion.rate_at(np.arange(0.0, motion.duration, 0.05)))))
     if deviation > limits.scale_standard_deviation or spread < limits.rate_spread:
         raise DataRefused(
-            f'the best motion of {motion.duration:g} s tells the scale to '
-            f'{100.0 * deviation:.2g} % and its rate varies by {spread / DEGREE:.2g} deg/s, where '
-            f'{100.0 * limits.scale_standard_deviation:g} % and '
-            f'{limits.rate_spread / DEGREE:g} deg/s are wanted: give more seconds, more place or '
+            f'the best motion of {motion.duration:g} s determines the scale factor to '
+            f'{100.0 * deviation:.2g} %, and its rate varies by {spread / DEGREE:.2g} deg/s; '
+            f'needed are {100.0 * limits.scale_standard_deviation:g} % and '
+            f'{limits.rate_spread / DEGREE:g} deg/s: allow more seconds, a larger angle or '
             'faster turns')
     return plan
 

@@ -328,7 +328,7 @@ def _choice(fit: Calibration, effect: Effect, tried: int,
     smaller, larger = (other, fit) if taken else (fit, other)
     limit = FALSE_ALARM_RATE / tried
     reason = (_reason(taken, _supported(smaller, larger, limit)) if larger.freedom
-              else 'as many values as dwells tell nothing from chance')
+              else 'as many values as dwells: no significance can be stated; add dwells')
     return Choice(effect.name, taken, smaller.left_out_rms, larger.left_out_rms,
                   larger.chance_of(effect), reason)
 

@@ -94,7 +94,7 @@ _METHOD = (
     'taken where it predicts left-out sweeps better, and chance alone, averaged over what the '
     'scatter may be, hardly shows as much: of tables without any cause, {share:.2g} % give an '
     'alarm. Then curves over rate, temperature and the order of the dwells were tried on what is '
-    'left. What is won was measured on sweeps that took no part in choice or fit; intervals are '
+    'left. The reduction of the error was measured on sweeps that took no part in choice or fit; intervals are '
     'of 95 %.')
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8
@@ -129,8 +129,8 @@ def diagnose_table(table: Log | Dwells, model: GyroModel | None, rate: float = 0
     log = Log(output=dwells.output, reference_rate=dwells.rate, temperature=dwells.temperature)
     refuse(log, model)
     if not np.ptp(dwells.rate) > 0.0:
-        raise DataRefused('all dwells have one rate, so that nothing tells the scale factor from '
-                          'the bias; record several rates, both ways')
+        raise DataRefused('all dwells have one rate, which does not separate scale factor and '
+                          'bias; record several rates, both ways')
     record = decided(inspect(log, model))
     dwells = replace(dwells, output=dwells.output * record.factor)
     named, left, withdrawn = _concluded(dwells, model, rate)
@@ -402,7 +402,7 @@ _REASONS = {
     'supply_sensitivity':
         'of a table, rates and temperatures alone are looked at; record supply_v in time',
     'reference_scale':
-        'only a second reference tells the scale of the first from that of the gyro'}
+        'only a second reference separates the scale of the first from that of the gyro'}
 
 
 def _cannot_show(dwells: Dwells) -> dict[str, str]:

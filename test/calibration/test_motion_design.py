@@ -235,7 +235,7 @@ IMPOSSIBLE = {
                  'the place leaves a turn of 0 deg'),
     'no place at the slowest rate': (Ability(1.0, 1.0, slowest=0.9, lowest=-0.5, highest=0.5),
                                      20.0, 'more place or more acceleration'),
-    'nothing worth it': (Ability(0.01, 0.02), 20.0, 'tells the scale to'),
+    'nothing worth it': (Ability(0.01, 0.02), 20.0, 'determines the scale factor to'),
     'next to no time': (Ability(1.0, 2.0, 0.5, rest=1.0), 2.02, ''),
 }
 
