@@ -94,8 +94,8 @@ _METHOD = (
     'taken where it predicts left-out sweeps better, and chance alone, averaged over what the '
     'scatter may be, hardly shows as much: of tables without any cause, {share:.2g} % give an '
     'alarm. Then curves over rate, temperature and the order of the dwells were tried on what is '
-    'left. The reduction of the error was measured on sweeps that took no part in choice or fit; intervals are '
-    'of 95 %.')
+    'left. The reduction of the error was measured on sweeps that took no part in choice or fit; '
+    'intervals are of 95 %.')
 #: The most groups of parts of a table that are left out in turn: each choice of causes takes time.
 _MOST_GROUPS = 8
 #: Bins of a curve at most, and dwells in each at least.
