@@ -32,6 +32,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
+from gyro_calibration.calibration.encoder import LARGEST_TIME_OFFSET
 from gyro_calibration.calibration.noise_grid import (
     GridFit,
     heading_noise,
@@ -108,6 +109,8 @@ COURSE = Treatment(1.0, 400, (0.01, DEGREE, 1.0), (0.1, 1.0), 5e-4, 12, (1e-6, 2
 #: A reference with errors of an instrument; the wander of a gyro is in units of its white noise.
 HEADING = Treatment(0.2, 2000, (0.1, 10.0 * DEGREE, 1.0), (0.3, 1.5), math.inf, 24, (3e-3, 0.5),
                     (1e-4, 0.1), True, 5.0, True, True)
+#: An encoder on the host of the gyro: a swing looks alike a period later.
+ENCODER = replace(HEADING, prior=(*HEADING.prior[:2], LARGEST_TIME_OFFSET / 1.5))
 RATE = replace(HEADING, of_heading=False, averaged=False, cosines=60)
 
 
@@ -298,7 +301,7 @@ def spans_of(log: Log, kind: str = 'course', prior: Array | None = None) -> Span
 
     """
     assert log.time is not None and log.output is not None
-    treatment = {'rate_command': RATE, 'encoder': HEADING, 'motion_capture': HEADING,
+    treatment = {'rate_command': RATE, 'encoder': ENCODER, 'motion_capture': HEADING,
                  'gyro': HEADING}.get(kind, COURSE)
     if prior is not None:
         scale, bias, delay = treatment.prior
@@ -377,7 +380,8 @@ def fit_spans(spans: Spans, causes: Sequence[Column] = ()) -> SpanFit:
         left = _robustly(moved.plain()[:, :2], moved.observed, prior[:2])[1]
         return float(np.mean(np.minimum(np.abs(left[:len(spans.time) - 1]), 10.0 * DEGREE)))
 
-    moved = replace(spans, delay=spans.delay or min(_DELAYS.tolist(), key=disagreement))
+    moved = replace(spans, delay=spans.delay or min(
+        _DELAYS[np.abs(_DELAYS) <= 1.5 * prior[2]].tolist(), key=disagreement))
     outlying: Array = np.ones(len(spans.time))
     for _ in range(_PASSES):
         values = _robustly(all_columns(moved, causes), moved.observed, free)[0]
