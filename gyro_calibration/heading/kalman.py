@@ -143,7 +143,9 @@ class Drift:
 
     def heading_variance(self, turn: RateIntegral) -> float:
         """Return the variance of the heading after a turn, rad²."""
-        return float(heading_variances([self], [turn])[0])
+        row, variance = self._seen(turn)
+        row[HEADING] -= 1.0
+        return float(row @ self.covariance @ row) + variance
 
     def rested(self, turn: RateIntegral) -> Drift:
         """Return the state after a time in which the true rate was zero."""
