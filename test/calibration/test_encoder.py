@@ -269,7 +269,7 @@ def test_a_bias_that_a_log_hardly_shows_is_drawn_towards_zero_or_refused():
         try:
             errors.append(calibrate_encoder(shaken(bias, generator), 'likelihood').fit.bias - bias)
         except DataRefused as refusal:
-            assert 'says nothing' in str(refusal)
+            assert 'too uncertain' in str(refusal)
             errors.append(bias)
             refused += 1
     assert refused >= 10 and np.sqrt(np.mean(np.square(errors))) < 0.1 * DEGREE
