@@ -527,10 +527,13 @@ _STEADY = getattr(time, 'CLOCK_BOOTTIME', time.CLOCK_MONOTONIC)
 def read_together(
     even: Callable[[], float], other: Callable[[], float],
 ) -> tuple[float, float] | None:
-    """Return two clocks at one time, s; None where the program was held up in between."""
-    before, value = even(), other()
-    after = even()
-    return (0.5 * (before + after), value) if after - before <= _TOGETHER else None
+    """Return two clocks at one time, s; None where each reading of both was held up."""
+    for _ in range(5):
+        before, value = even(), other()
+        after = even()
+        if after - before <= _TOGETHER:
+            return 0.5 * (before + after), value
+    return None
 
 
 class ClockSteps:

@@ -129,7 +129,7 @@ def found_in(header: Sequence[str], given: Mapping[str, str] = {},
                              'keep one of them')
         found[quantity], names[quantity] = Column(index, factor), name
     if not {'output', 'counts'} & set(found):
-        raise InputError(f'no gyro column among {plain(",".join(header)[:100])}; '
+        raise InputError(f'no gyro column among {_short(",".join(header))}; '
                          f'wanted gyro_dps, gyro_rad_s or gyro_counts{suggestion(header)}')
     return found
 
@@ -144,7 +144,7 @@ def _column(header: Sequence[str], name: str, text: str, units: Mapping[str, flo
                          f'{", ".join(units)}')
     if column not in header:
         raise InputError(f'{name}={text}: there is no column {column} among '
-                         f'{plain(",".join(header)[:100])}{_nearest(column, header)}')
+                         f'{_short(",".join(header))}{_nearest(column, header)}')
     return Column(header.index(column), units[unit], _OFFSETS.get(unit, 0.0))
 
 
@@ -163,8 +163,9 @@ def is_header(header: Sequence[str], given: Mapping[str, str], axis: str) -> boo
 def suggestion(header: Sequence[str]) -> str:
     """Return how a user would name the columns of a header, or rename one; '' for no idea."""
     wanted = []
+    names = [name for name in header if name == _short(name) and not set(name) & set(',=:')]
     for quantity, pattern in _USUAL.items():
-        for name in header:
+        for name in names:
             letters, unit = _letters_and_unit(name, _QUANTITIES[quantity][1])
             if re.fullmatch(pattern, letters):
                 wanted.append(f'{quantity}={name}{unit}')
@@ -176,7 +177,7 @@ def suggestion(header: Sequence[str]) -> str:
     for name in header:
         if name not in COLUMNS and (
                 close := difflib.get_close_matches(name, COLUMNS, 1, 0.8)):
-            return f'; perhaps {close[0]} is meant by {plain(name[:100])}'
+            return f'; perhaps {close[0]} is meant by {_short(name)}'
     return ''
 
 
@@ -189,6 +190,11 @@ def _letters_and_unit(name: str, units: Mapping[str, float]) -> tuple[str, str]:
     return letters, ''
 
 
+def _short(text: str) -> str:
+    """Return at most 100 characters of a text, as a terminal may show it."""
+    return plain(text[:100])[:100]
+
+
 def _nearest(name: str, names: Sequence[str] | Mapping[str, object]) -> str:
     close = difflib.get_close_matches(name, names, 1)
-    return f'; perhaps {plain(close[0])} is meant' if close else ''
+    return f'; perhaps {_short(close[0])} is meant' if close else ''

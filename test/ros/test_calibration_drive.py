@@ -367,8 +367,8 @@ def test_a_run_that_commands_late_is_refused_by_naming_the_load(tmp_path):
     sample, watch, waiting = rig.sample, rig.pipeline.watch, []
 
     def is_busy():
-        """Hold this process up for 0.2 s of each 0.8 s; what came meanwhile comes then."""
-        return rig.clock.now % 0.8 < 0.2
+        """Hold this process up for 0.3 s of each 0.8 s; what came meanwhile comes then."""
+        return rig.clock.now % 0.8 < 0.3
 
     def late_sample(*reading):
         waiting.append(reading)
