@@ -193,7 +193,7 @@ class Headings(_Answer):
         write_log(path, self.log, self.columns)
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Return a figure of the heading, beside the reference where the log has one."""
+        """Return a figure of the heading, with the reference where the log has one."""
         time, output = _in_time(self.log)
         assert self.heading is not None
         known = np.isfinite(output) & np.isfinite(self.heading)
@@ -331,14 +331,14 @@ class Fitted(_Answer):
     _log: Log | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
-        said = list(fit_answer.value_lines(self.model))
+        lines = list(fit_answer.value_lines(self.model))
         if self.selection is not None:
             found = self.selection.calibration
-            said = [*fit_answer.dwell_lines(found), '', *said, '',
-                    *fit_answer.quality_lines(found), *fit_answer.choice_lines(self.selection)]
+            lines = [*fit_answer.dwell_lines(found), '', *lines, '',
+                     *fit_answer.quality_lines(found), *fit_answer.choice_lines(self.selection)]
         if self.encoder is not None:
-            said += ['', *fit_answer.heading_lines(self.encoder)]
-        return '\n'.join(said)
+            lines += ['', *fit_answer.heading_lines(self.encoder)]
+        return '\n'.join(lines)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Return a figure of the errors before and after the fit."""

@@ -241,7 +241,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def _created(path: Path, mode: int) -> tuple[int, str]:
-    """Return a new temporary file beside another, open and locked, and its path."""
+    """Return a new temporary file in the folder of another, open and locked, and its path."""
     while True:
         temporary = str(path.parent / f'{_stem(path)}{secrets.token_hex(4)}')
         handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
@@ -286,10 +286,10 @@ def _stem(path: Path) -> str:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Remove what killed writers of a file left beside it, but nothing that is being written."""
+    """Remove what killed writers of a file left there, but nothing that is being written."""
     path = Path(path)
     leftover = re.compile(re.escape(_stem(path)) + '[a-z0-9_]{8}')
-    # Nobody waits for it, and a folder that cannot be read or written to is told when it matters.
+    # Nobody waits for it; a folder that cannot be read or written to is reported when it matters.
     with suppress(OSError):
         for name in filter(leftover.fullmatch, os.listdir(path.parent)):
             with suppress(OSError):

@@ -135,7 +135,7 @@ def _written(given: argparse.Namespace, types: Sequence[TypeFound],
     """Write the results, and return the names of their files."""
     content = {'fleet.json': (json.dumps(data, indent=1, allow_nan=False) + '\n').encode(),
                'report.html': report(types, records).encode(), **tables(types, records)}
-    told = list(content)
+    names = list(content)
     for found in types:
         for unit, model in models(found):
             words = [found.name or 'type', *(['unit', unit] if unit else [])]
@@ -144,10 +144,10 @@ def _written(given: argparse.Namespace, types: Sequence[TypeFound],
                 name += '_'
             text = model_text(replace(model, origin={**model.origin, **origin_of([])}))
             content[f'{name}.yaml'] = text.encode()
-            told += [] if unit else [f'{name}.yaml']
+            names += [] if unit else [f'{name}.yaml']
     for name, each in content.items():
         write_atomically(Path(given.out) / name, each)
-    return told
+    return names
 
 
 def _lines(found: TypeFound) -> Iterator[str]:

@@ -30,7 +30,7 @@ WINDOW = 60.0
 WITHIN = 0.75
 #: Of so many blocks one is held out.
 EVERY = 3
-#: A log with fewer samples than this beside what is held out is not fitted.
+#: A log with fewer samples than this without what is held out is not fitted.
 _FEWEST = 20
 #: Chance at which a cause is chosen again without what is held out; the whole logs have shown it.
 _RATE = 0.01

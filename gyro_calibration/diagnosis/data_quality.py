@@ -118,7 +118,7 @@ def inspect(log: Log, model: GyroModel | None = None) -> DataQuality:
     line = None if rate is None else line_between(log.time, rate, output)
     factor, units = 1.0, []
     if rate is not None and line is not None:
-        # a factor beside the scale that a model has
+        # a factor in addition to the scale that a model has
         own = 1.0 if model is None else scale_of(model, rate)
         ratio, deviation = line.factor / own, line.deviation / abs(own)
         name = unit_of_scale(ratio, deviation)
@@ -253,7 +253,7 @@ def _of_samples(found: DataQuality, output: Array, rate: Array | None, line: Lin
         limit, at_limit, good = None, np.zeros_like(at_limit), known
         repeated = repeated_samples(seen, codes, band, good, LEVEL)
     good = good if repeated is None else good & ~repeated.repeats
-    # Samples beside those that a dead band holds are the tail of the noise that gets out of it.
+    # Samples next to those that a dead band holds are the tail of the noise that gets out of it.
     outlying = outlying_samples(seen, good if band is None else good & ~binary_dilation(
         band.holds(seen.output), iterations=SIDE), 0.5 * codes.step, LEVEL)
     good = good if outlying is None else good & ~outlying.samples
@@ -331,7 +331,7 @@ _SPAN, _LARGER, _LARGER_OF_FIXES = 1.0, 8.0, 2.0
 #: than this part of what the gyro walks in a second: less adds an eighth to the variance of that.
 _NOISY, _BLURRED = 0.01, 0.25
 #: The steps of an encoder finer than this, rad, are noise of a known size; the search for exact
-#: references finds more beside them (measured at 0.0055 and 0.09 deg).
+#: references finds more in addition to them (measured at 0.0055 and 0.09 deg).
 _FINE = 0.05 * DEGREE
 #: Third differences have a correlation of -0.75 from one to the next for white noise, of -0.67 for
 #: a random walk, and of -0.5 for its integral; a motion is as smooth as that.

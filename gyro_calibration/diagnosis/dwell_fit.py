@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What dwells say beside a model: bias and scale factor fitted anew, and the causes they support.
+What dwells say given a model: bias and scale factor fitted anew, and the causes they support.
 
 Effects of a model that are not fitted anew are subtracted from the output first, so that what is
 left is that of a gyro without them. A polynomial of the output stays as it is: fitted together
@@ -71,10 +71,11 @@ from scipy.stats import f as fisher
 NUISANCES = (BIAS, SCALE_FACTOR_ERROR)
 #: What dwells without time can show of a model.
 _SEEN = {'rate', 'output', 'temperature'}
-#: Parts of the false-alarm rate: of causes beside bias and scale factor, and of a bias and a scale
-#: factor that differ from the model's.
+#: Parts of the false-alarm rate: of causes other than bias and scale factor, and of a bias and a
+#: scale factor that differ from the model's.
 _CAUSES, _OF_NUISANCES = 0.65, 0.1
-#: Temperatures from which a curve may count without a slope, degC, beside the mean and the first.
+#: Temperatures from which a curve may count without a slope, degC, but for the mean and
+#: the first.
 _USUAL = (25.0, 20.0)
 
 
@@ -86,8 +87,8 @@ class Named:
     Attributes
     ----------
     fit : of these and of bias and scale factor, to dwells less what stays of the model
-    change : the same as changes of the model, each beside all of it; their evidence, but for bias
-        and scale factor
+    change : the same as changes of the model, each in addition to all of it; their evidence, but
+        for bias and scale factor
     causes : those that are named, of the effects of the fit
     model : that is put to the test
     rate : of false alarms that the whole diagnosis may have
@@ -112,7 +113,7 @@ class Named:
                    * (len(STEADY) - len(NUISANCES)))
 
 
-# a model beside dwells
+# a model against dwells
 
 def surroundings(model: GyroModel, dwells: Dwells) -> Channels:
     """Return what a model looks at, at its reference temperature where the table holds none."""
@@ -227,7 +228,7 @@ def _chance(fit: Calibration, model: GyroModel, effect: Effect,
 
     Parameters
     ----------
-    fit : of dwells beside the model
+    fit : of dwells given the model
     model : whose own covariance counts too, where it has one
     added : the effect in each dwell that is fitted, rad/s; None for all that the effect adds
 
@@ -325,7 +326,7 @@ def model_before(dwells: Dwells, model: GyroModel | None, named: Named) -> GyroM
 
 
 def assembled(dwells: Dwells, model: GyroModel | None, fit: Calibration) -> GyroModel:
-    """Return a model with the values of a fit in place of its own, or beside them."""
+    """Return a model with the values of a fit in place of its own, or in addition to them."""
     if model is None:
         return fit.model
     new = {term.effect.name: term for term in fit.terms}
@@ -366,7 +367,7 @@ def _places(terms: Sequence[Term], first: int) -> dict[str, list[int]]:
 
 
 def tried(fit: Calibration, effects: Sequence[Effect]) -> Calibration | None:
-    """Fit other effects to the dwells of a fit, or return None where they cannot be parted."""
+    """Fit other effects to the dwells of a fit, or return None where they cannot be separated."""
     try:
         return fit_effects(fit.dwells, effects, fit.scatter)
     except DataRefused:
@@ -423,7 +424,7 @@ def what_is_left(fit: Calibration, level: float,
 
 def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Array,
             by_model: Array) -> tuple[Unexplained, float]:
-    """Return what a curve explains beside what is known, its chance, and the misfit it saves."""
+    """Return what a curve explains given what is known, its chance, and the misfit it saves."""
     used = take(fit.dwells, fit.scatter.kept)
     whitener = Whitener(used, fit.scatter)
     white = whitener.whiten(known)
@@ -443,7 +444,7 @@ def _tested(name: str, fit: Calibration, known: Array, columns: Array, error: Ar
     share = 1.0 - (total - gain) / freedom / (total / (freedom + count))
     # Columns in their own unit, for the covariance of the dwells may be another one.
     plain = [np.apply_along_axis(whitener.restore, 0, each) for each in (base, new)]
-    # an F test over what the scatter may be, beside the errors of the model
+    # an F test over what the scatter may be, given the errors of the model
     uncertain = Uncertainty.of(used, fit.scatter, np.column_stack(plain), error)
     by_model = new.T @ whitener.whiten(by_model)
     values = uncertain.offsets[:, -count:]

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-The output beside what a straight line over the reference expects of it, sample by sample.
+The output compared with what a straight line over the reference expects of it, sample by sample.
 
 Also factors and delays that a unit taken for another explains.
 
@@ -145,7 +145,7 @@ class Compared:
 
 
 def compare(output: Array, rate: Array | None, line: Line | None) -> Compared:
-    """Put an output beside what a line expects of it by the rate."""
+    """Compare an output with what a line expects of it by the rate."""
     whole = bridged(output)
     if rate is None or line is None:
         return Compared(whole, None, white_noise(output))

@@ -35,7 +35,7 @@ import numpy as np
 
 #: What must be known of a scale factor error for it to be believed.
 LIMITS = Limits()
-#: Effects that count from somewhere -> what comes of it beside them to count from elsewhere.
+#: Effects that count from somewhere -> what comes of it with them to count from elsewhere.
 _MADE_UP_BY: Mapping[str, Effect] = {
     'bias_temperature': BIAS, 'supply_sensitivity': BIAS,
     'scale_factor_temperature': SCALE_FACTOR_ERROR, 'bias_temperature_quadratic': BIAS_TEMPERATURE}
@@ -175,7 +175,7 @@ def _values(found: FittedValues, bias_deviation: float) -> tuple[list[Term], Arr
     """Return what was found as terms, and the covariance of all values in a row, 0 if exact."""
     implausible = implausible_scale(found)
     scale = 0.0 if implausible else found.scale_factor_error.value
-    # the mean bias of the logs beside that scale factor error
+    # the mean bias of the logs given that scale factor error
     rates = [seen(each, found.named).channels.rate[each.kept].mean() for each in found.replays]
     bias = np.mean(found.biases) + (found.scale_factor_error.value - scale) * np.mean(rates)
     terms = [Term(BIAS, (float(bias),)), Term(SCALE_FACTOR_ERROR, (scale,))]
@@ -203,7 +203,7 @@ def _term(found: FittedValues, place: int) -> Term:
     return Term(effect, (*candidate.shapes, *coefficients))
 
 
-# terms beside others
+# terms among others
 
 def _all(terms: tuple[Term, ...], new: Sequence[Term]) -> tuple[Term, ...]:
     for each in new:

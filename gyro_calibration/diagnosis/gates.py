@@ -50,7 +50,7 @@ MOST_ROWS = 5000
 LONGEST = 1e8
 #: Without a reference, a gyro is at rest while its means over 1 s stay this close together, rad/s.
 REST = 3.0 * DEGREE
-#: A reference that turns by less than this, rad, beside what its noise adds up to in so many
+#: A reference that turns by less than this, rad, on top of what its noise adds up to in so many
 #: standard deviations, may stand still; it does where the output follows it by no more than so
 #: many standard deviations.
 _STILL, _ADDED, _FOLLOWED = 1.0 * DEGREE, 4.0, 4.0
@@ -158,7 +158,7 @@ def _stands(log: Log, rate: Array) -> bool:
     noise = white_noise(whole) * math.sqrt(float(np.median(steps) * steps.sum()))
     if np.ptp(np.cumsum(whole[1:] * steps)) > _STILL + _ADDED * noise:
         return False
-    # In units of its own, for a rate of next to nothing would be lost beside the line's constant.
+    # In units of its own, for a rate of next to nothing would be lost against the line's constant.
     line = line_between(log.time, rate / np.nanmax(np.abs(rate)), log.output)
     return line is None or abs(line.factor) < _FOLLOWED * line.deviation
 
@@ -293,7 +293,7 @@ _FEWEST, _TURNED, _APART = 12, 30.0 * DEGREE, 10.0 * DEGREE
 #: Shares of the variance in common: above the first the factor between both is known; below the
 #: second they are different motions.
 _KNOWN, _DIFFERENT = 0.8, 0.4
-#: What an axis that tilts leaves over longer spans, rad, and beside shorter ones.
+#: What an axis that tilts leaves over longer spans, rad, and next to shorter ones.
 _WANDERED, _GROWN = 5.0 * DEGREE, 3.0
 #: A power of ten between both is taken for a unit of time where the interval of the samples is
 #: one that gyros have, s.

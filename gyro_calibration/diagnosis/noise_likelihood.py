@@ -83,7 +83,7 @@ class Marginalized:
     ----------
     own : information of the nuisances, shape (g, q, q)
     towards : the nuisances that each column looks like, shape (g, q, p)
-    left : of each candidate, the information of its columns beside the nuisances, shape (g, k, k)
+    left : of each candidate, the information of its columns given the nuisances, shape (g, k, k)
     log_determinant : of `own` and of the noise, shape (g,)
     unidentifiable : candidates that the nuisances leave nothing of
     freedom : coefficients less nuisances
@@ -146,14 +146,14 @@ def _diagonal(matrices: Array) -> Array:
 @dataclass(frozen=True)
 class NoiseLikelihood:
     """
-    Residuals beside the nuisances, under each noise: d of them, one measured, or many drawn.
+    Residuals given the nuisances, under each noise: d of them, one measured, or many drawn.
 
     Attributes
     ----------
     likelihood : restricted log likelihood without any candidate, shape (d, g)
     squares : sum of whitened squares that are left, shape (d, g)
     towards : of the nuisances, N'z, shape (d, g, q)
-    pull : of the candidates, X'z beside the nuisances, shape (d, g, p)
+    pull : of the candidates, X'z given the nuisances, shape (d, g, p)
 
     """
 

@@ -87,7 +87,7 @@ SEEN, _RULED_OUT = 4.8, 3.0
 _OF_A_LAG = 0.1
 #: Bins of a curve.
 _BINS = 20
-#: Shares of the false-alarm rate: of the causes that are searched for, and beside a model of bias
+#: Shares of the false-alarm rate: of the causes that are searched for, and given a model of bias
 #: and of scale factor error. A delay between two clocks is no surprise: it has a level of its own.
 _OF_SEARCH, _OF_VALUE = 0.6, {'bias': 0.05, 'scale_factor_error': 0.05}
 _SPOKEN = {'rate_command': 'a reference rate with noise', 'course': 'a course over ground',
@@ -190,7 +190,7 @@ def diagnose_by_noisy_reference(log: Log, reference: Reference, model: GyroModel
 
 def _of_values(done: SpanFit, model: GyroModel | None, rate: float,
                reference: Reference) -> Iterator[Finding]:
-    """Give delay, and beside a model bias and scale factor error, where they are established."""
+    """Give delay, and given a model bias and scale factor error, where they are established."""
     lag = next((each for each in done.causes if each.cause == 'bandwidth'), None)
     own_clock = reference.kind not in _SAME_CLOCK
     for place, name in enumerate(PLAIN):
@@ -337,7 +337,7 @@ def _gain(plain: SpanFit, extended: SpanFit) -> Gain | None:
     parts = int(np.clip(duration / _PART, _FEWEST_PARTS, _MOST_PARTS))
     number = np.minimum(((time[1:] - time[0]) * parts / duration).astype(int), parts - 1)
     window = min(WINDOW, WITHIN * duration / parts)
-    # under the noise of the plain fit, and beside the bias that wanders
+    # under the noise of the plain fit, and given the bias that wanders
     noisy = whitened(plain, ())
     prior = len(noisy.observed) - len(spans.observed)
     models = {'given': (spans.plain()[:, 2:], noisy.plain[:, 2:]),
@@ -476,13 +476,13 @@ def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[
     """Add one cause after the other, each confirmed, and fit again with those established."""
     found: list[Confirmed] = []
     offered = list(candidates(done))
-    # beside one column of each cause, so that the noise does not swallow what a cause leaves
+    # given one column of each cause, so that the noise does not swallow what a cause leaves
     columns = {each.cause: each for each in offered if not each.once}
     rich = fit_spans(done.spans, list(columns.values()))
     while len(found) < MOST:
         taken = [each.column for each in found]
         names = {each.cause for each in taken}
-        on_part(f'search for causes beside {len(found)}' if found else 'search for causes')
+        on_part(f'search for causes after {len(found)} found' if found else 'search for causes')
         best = _best(done, rich, [each for each in offered if each.cause not in names], taken,
                      level)
         if best is None:
@@ -492,10 +492,10 @@ def search(done: SpanFit, level: float, on_part: OnPart) -> tuple[SpanFit, list[
     return (fit_spans(done.spans, inside) if inside else done), found
 
 
-def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], beside: Sequence[Column],
+def _best(done: SpanFit, rich: SpanFit, open_ones: Sequence[Column], given: Sequence[Column],
           level: float) -> Confirmed | None:
-    """Return the best of the causes that are open, beside those found; None where it is chance."""
-    data = whitened(done, beside, rich, most=True)
+    """Return the best of the causes that are open, given those found; None where it is chance."""
+    data = whitened(done, given, rich, most=True)
     widths = [done.spans.columns(each) for each in open_ones]
     columns = data.columns(np.column_stack(widths))
     edges = np.concatenate([[0], np.cumsum([each.shape[1] for each in widths])])

@@ -121,7 +121,7 @@ _HARDLY = {'temperature': 'the temperature hardly changes',
            'specific_force': 'the specific force does not change'}
 _WITH = {'temperature': 'temperature_rate', 'specific_force': 'vibration'}
 
-#: Steps beside an exact reference, % of the time as measured on 25 min of an encoder at 100 Hz.
+#: Steps with an exact reference, % of the time as measured on 25 min of an encoder at 100 Hz.
 _SHARES = {CHECKS: 1, 'data quality': 1, 'replay of the model': 1, 'search for causes': 78,
            'alternatives': 11, 'noise figures': 1, 'cross-validation': 3, 'findings': 4}
 
@@ -297,7 +297,7 @@ def _withdrawn(search: Search,
     fastest = max(float(np.abs(each.channels.rate).max()) for each in search.problem.replays)
 
     def is_small(known: Named) -> bool:
-        """Tell whether an effect along the rate is small beside it, as those of a gyro are."""
+        """Tell whether an effect along the rate is small against it, as those of a gyro are."""
         return (CAUSES[known.candidate.cause].along != 'rate'
                 or known.candidate.amplitude is not None
                 or all(np.abs(np.tensordot(known.values, np.array(known.candidate.columns(each)),
@@ -474,7 +474,7 @@ def _remarks(quality: Sequence[DataQuality], names: Sequence[str], found: Fitted
     if implausible_scale(found):
         yield (f'A scale factor error of {100.0 * scale.value:.2g} +- '
                f'{100.0 * scale.deviation:.1g} % is in no model: there is too little motion '
-               'beside the noise of gyro and reference for it to be believed; turn faster, and '
+               'against the noise of gyro and reference for it to be believed; turn faster, and '
                'both ways.')
     for name in dict.fromkeys(each.candidate.cause for each in out):
         remedy = ('; take that out of the model that is given, and diagnose again' if name in own

@@ -206,7 +206,7 @@ def _gain(dwells: Dwells, model: GyroModel | None, rate: float,
 
 
 def _outliers(dwells: Dwells, fit: Calibration, level: float) -> Iterator[Finding]:
-    """Give outlying dwells, if the farthest is beyond chance beside a fit to the others."""
+    """Give outlying dwells, if the farthest is beyond chance given a fit to the others."""
     outlying = np.flatnonzero(~fit.scatter.kept)
     freedom = freedom_beside_surface(take(dwells, fit.scatter.kept))
     if not len(outlying) or min(freedom, fit.freedom) < 1:

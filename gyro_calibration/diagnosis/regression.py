@@ -43,7 +43,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 #: The longest interval, s, over which a smoothed residual is averaged; and how often the levels of
-#: its noise are found again, each time beside the noise that was likeliest with those before.
+#: its noise are found again, each time with the noise that was likeliest with those before.
 _LONGEST, _ROUNDS = 0.1, 3
 #: A shape is changed by this part of itself to see what its column changes by.
 _SMALL = 1e-4
@@ -559,7 +559,7 @@ class FittedValues:
 
     @cached_property
     def biases(self) -> list[float]:
-        """Return the bias of each log beside the simulation's, rad/s."""
+        """Return the bias of each log less the simulation's, rad/s."""
         return [float(left[each.kept].mean()) for each, left in zip(self.replays, self.residuals)]
 
     @cached_property

@@ -186,7 +186,7 @@ _NEIGHBOURS, _OVER = 101, 1.5
 #: A held reference that keeps its value for more than so many of its intervals stood still; a
 #: change of fewer steps may have been slow.
 _STOOD = 1.5
-#: Samples beside a gap of a heading whose rate is not compared, where the gap has as many: a
+#: Samples next to a gap of a heading whose rate is not compared, where the gap has as many: a
 #: spline errs by 0.13, 0.036 and 0.01 of what its slope changes by there. Beside a shorter gap it
 #: changes by little.
 _BESIDE = 4
@@ -421,7 +421,7 @@ def _rounding(output: Array, rate: Array, kept: Mask, step: float) -> Array:
     """
     Return what rounding adds to the output on average, rad/s, shape (n,).
 
-    Where steps are not small beside the noise, this depends on the rate, and would pass for an
+    Where steps are not small against the noise, this depends on the rate, and would pass for an
     effect of it. It is the Fourier series of a saw, smoothed by the noise before the rounding
     (Widrow, Kollar and Liu 1996).
 
@@ -452,7 +452,7 @@ def _reference(log: Log, time: Array, held: bool, step: float) -> tuple[Array, A
 
 
 def _filled(time: Array, values: Array) -> Array:
-    """Return values without gaps: a delay or a lag carries what is lost to samples beside it."""
+    """Return values without gaps: a delay or a lag carries what is lost to its neighbours."""
     known = np.isfinite(values)
     return np.interp(time, time[known], values[known])
 

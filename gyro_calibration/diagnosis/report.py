@@ -288,7 +288,7 @@ def _residual(curve: Curve, place: int) -> Chart:
 
 
 def _spectrum(curve: Curve, place: int) -> Chart:
-    """Return the amplitudes of the residual over frequency beside those of noise."""
+    """Return the amplitudes of the residual over frequency with those of noise."""
     lines = [*_before_and_after(curve.before / DEGREE, curve.after / DEGREE),
              Line('usual', 'simulated', curve.deviation / DEGREE)]
     return Chart(f'residual-{place}', 'Residual along frequency',

@@ -9,7 +9,7 @@
 # under the License.
 
 """
-What is left of logs: its noise in the figures of IEEE Std 952 beside those of the model; curves.
+What is left of logs: its noise in the figures of IEEE Std 952 against those of the model; curves.
 
 The curves are along each variable, of the simulation as given, and as extended.
 

@@ -409,7 +409,7 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
     Parameters
     ----------
     seen : output and expectation
-    good : samples that count; beside three and more of six that do not, as after a stuck run, one
+    good : samples that count; next to three and more of six that do not, as after a stuck run, one
         is not tested
     floor : the scatter is at least this, rad/s: half a code
     level : chance of a false alarm
@@ -443,7 +443,7 @@ def outlying_samples(seen: Compared, good: Mask, floor: float, level: float) -> 
 def _neighbours(values: Array | Mask, side: int) -> Array:
     """Return the samples before and after each one, shape (n, 2 side)."""
     # Turned over about the first and last sample, a slope goes on as it is. These two are what
-    # the samples beside them say, as one that is an outlier would agree with itself.
+    # the neighbouring samples say, as one that is an outlier would agree with itself.
     if len(values) > SIDE + 1 and values.dtype != bool:
         ends = [np.median([part[0], 2.0 * part[1] - part[2], 2.0 * part[2] - part[4]])
                 for part in (values, values[::-1])]

@@ -171,9 +171,9 @@ class Search:
     chance : what they show where there is nothing
     rate : false alarms allowed a cause
     scanned : causes that are scanned for over all frequencies, or all moments
-    unidentifiable : causes of which these logs leave nothing beside bias and scale factor error
+    unidentifiable : causes that these logs cannot tell from bias and scale factor error
     banks, found_before : what was made before, by the causes that were named then
-    on_part : is told each part of the work as it begins, in words
+    on_part : is given each part of the work as it begins, in words
 
     """
 
@@ -198,7 +198,7 @@ class Search:
 
 
 def screen(done: Fitted, stock: Bank) -> Array:
-    """Return the evidence of all candidates beside what is named, shape (candidates,)."""
+    """Return the evidence of all candidates given what is named, shape (candidates,)."""
     noises, starts = done.problem.noises, done.problem.starts
     by = marginalized(done.columns, stock.columns, stock.groups, starts, noises)
     shown = noise_likelihood(done.residual[None], done.columns, stock.columns, starts, noises, by)
@@ -519,7 +519,7 @@ def strongest(search: Search, named: Sequence[Named]) -> tuple[Step | None, list
     key = tuple((each.candidate.cause, each.candidate.run, *each.candidate.shapes)
                 for each in named)
     if key not in search.found_before:
-        search.on_part(f'search for causes beside {len(named)}' if named
+        search.on_part(f'search for causes after {len(named)} found' if named
                        else 'search for causes')
         search.found_before[key] = _strongest(search, named)
     return search.found_before[key]
@@ -555,7 +555,7 @@ def _times(candidate: Candidate) -> float:
     """
     Return at how many times the rate a candidate counts: lasting causes of a size are suspected.
 
-    A limit or a delay has no size beside its shape, and refined it explains single peaks.
+    A limit or a delay has no size apart from its shape, and refined it explains single peaks.
 
     """
     lasts = is_named(candidate) and candidate.run is None and candidate.amplitude is None
@@ -650,7 +650,7 @@ def _grown(search: Search) -> tuple[Named, ...]:
 
 
 def pruned(search: Search, named: tuple[Named, ...]) -> tuple[Named, ...]:
-    """Take out causes that, beside the others, are not beyond chance, the weakest first."""
+    """Take out causes that, given the others, are not beyond chance, the weakest first."""
     while named:
         left = [search.excess(each.candidate.cause, evidence_of(search, named, place))
                 for place, each in enumerate(named)]
@@ -687,7 +687,7 @@ def alternatives(search: Search, named: tuple[Named, ...],
 
 
 def evidence_of(search: Search, named: Sequence[Named], place: int) -> float:
-    """Return the evidence of one of the causes beside the others."""
+    """Return the evidence of one of the causes given the others."""
     others = tuple(each for number, each in enumerate(named) if number != place)
     return (fitted(search.problem, named).score - fitted(search.problem, others).score
             - price_of_freedom(named[place]))

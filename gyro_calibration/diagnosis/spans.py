@@ -149,7 +149,7 @@ class Spans:
     rests : begin and end row of each stretch at rest
     treatment : of the kind of the reference
     white : standard deviation of the white noise of a sample, with that of a reference rate, rad/s
-    delay : by which the stamps of the gyro are late beside the reference, s
+    delay : by which the stamps of the gyro are late against the reference, s
 
     """
 
@@ -250,7 +250,7 @@ class SpanFit:
     Attributes
     ----------
     spans : the log
-    causes : beside scale factor error, bias and delay
+    causes : in addition to scale factor error, bias and delay
     fit : of the restricted likelihood
     values, covariance : estimates and their cluster-robust covariance
     stretches_of : effective number of stretches that each value rests on
@@ -419,7 +419,7 @@ def _robustly(columns: Array, observed: Array, prior: Array) -> tuple[Array, Arr
 
 
 def _outlying(left: Array) -> Array:
-    """Return the variance of each point beside the usual one, larger where it stands out."""
+    """Return the variance of each point in units of the usual one, larger where it stands out."""
     point = np.concatenate([[0.0], np.cumsum(left)])
     off = np.abs(point - median_filter(point, 9, mode='nearest'))
     # what drifts one way is its own median
@@ -430,7 +430,7 @@ def _outlying(left: Array) -> Array:
 
 def _with_deviations(spans: Spans, causes: Sequence[Column], outlying: Array,
                      prior: Array) -> SpanFit:
-    """Fit by the restricted likelihood over a grid of noise, rests beside the spans."""
+    """Fit by the restricted likelihood over a grid of noise, rests with the spans."""
     assert spans.log.time is not None
     columns, walk = all_columns(spans, causes), _walk(spans)
     still = np.array([spans.log.time[end] - spans.log.time[begin] for begin, end in spans.rests])
@@ -539,7 +539,7 @@ def whitened(done: SpanFit, causes: Sequence[Column], noise: SpanFit | None = No
     Parameters
     ----------
     done : the log, and what is known beforehand
-    causes : the columns beside scale factor error, bias and delay
+    causes : the columns in addition to scale factor error, bias and delay
     noise : the fit whose noise is taken; `done` where it is None
     most : whether the rate random walk is the largest that the log allows (upper limit of 95 %),
         for what is slow is taken for a cause otherwise

@@ -20,7 +20,7 @@ from typing import TypeAlias
 CHECKS = 'checks of the log'
 #: Is given the share of a diagnosis that is done, which never falls, and what begins, in words.
 OnProgress: TypeAlias = Callable[[float, str], object]
-#: Is told what begins, in words.
+#: Is given what begins, in words.
 OnPart: TypeAlias = Callable[[str], object]
 #: A part of a step that has an unknown number of parts takes so much of what is left of the step.
 _PART = 0.12
@@ -32,7 +32,7 @@ class Steps:
 
     Parameters
     ----------
-    on_progress : is told each step as it begins
+    on_progress : is given each step as it begins
     shares : words -> part of the time of a long diagnosis, in order
 
     """

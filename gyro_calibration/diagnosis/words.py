@@ -118,7 +118,7 @@ def _finer(unit: str, factor: float, value: float, parameter: str) -> tuple[str,
 
 
 def _power(largest: float) -> int:
-    """Return the power of ten to write beside numbers up to this one: 0 if readable without."""
+    """Return the power of ten to write after numbers up to this one: 0 if readable without."""
     return 0 if largest == 0.0 or 1e-4 <= largest < 1e6 else math.floor(math.log10(largest))
 
 
@@ -134,7 +134,7 @@ def _times(power: int) -> str:
 
 
 def raised(power: int) -> str:
-    """Return a power as it is written beside a ten."""
+    """Return a power as it is written after a ten."""
     return str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 
@@ -306,7 +306,7 @@ def change(errors: Change, unit: str, what: str) -> str:
 # one by one
 
 def shown_by(found: Finding) -> list[str]:
-    """Return what there is to say of a cause, beside its size: a sentence each."""
+    """Return what there is to say of a cause, apart from its size: a sentence each."""
     return [sentence(text) for text in (found.cause, found.evidence) if text.strip()]
 
 

@@ -79,7 +79,7 @@ class Observed:
     value, deviation : in one unit, shape (n,)
     unit : number of the unit of each log, from 0 on, shape (n,)
     drive : number of the drive, from 0 on, or -1 where a log stands alone, shape (n,)
-    columns : fixed effects beside the mean, such as age, shape (n, k)
+    columns : fixed effects in addition to the mean, such as age, shape (n, k)
     slopes : the number of the first columns whose effect may differ from unit to unit, at most 2
 
     """
@@ -517,7 +517,7 @@ def _log_prior(at: _Equations, sizes: Mapping[str, Array]) -> Array:
     variance = sizes.get(POWER_ONS, found)[:, None] + own * of.deviation ** 2
 
     def jeffreys(name: str, mean: Array) -> Array:
-        """Return it for a variance beside that of the means of groups."""
+        """Return it for a variance in addition to that of the means of groups."""
         size = sizes[name][:, None]
         return np.asarray(0.5 * np.log(np.sum((size + mean) ** -2.0, axis=1)))
 

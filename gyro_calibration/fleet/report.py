@@ -93,8 +93,8 @@ def report(types: Sequence[TypeFound], records: Sequence[Mapping[str, Any]]) -> 
 
 def _type(found: TypeFound, place: int) -> Iterator[Markup]:
     name = found.name or 'Type not stated'
-    told = [element('li', sentence(text)) for text in sentences(found)]
-    yield element('section', element('h2', name), element('ul', *told), _variances(found))
+    items = [element('li', sentence(text)) for text in sentences(found)]
+    yield element('section', element('h2', name), element('ul', *items), _variances(found))
     values = [each for each in found.values.values() if not each.slow]
     yield element(
         'section', element('h2', f'{name}: units'),

@@ -11,7 +11,7 @@
 """
 What a single log cannot tell from the wander of the bias: a ramp, a warm-up, the temperature.
 
-Each is fitted alone beside scale factor error and bias, to the increments of the heading over
+Each is fitted alone with scale factor error and bias, to the increments of the heading over
 spans, with the noise of `noise_grid`. In one log a wandering bias looks like any of them; over
 many logs what repeats is an effect, and what does not is wander.
 

@@ -64,7 +64,7 @@ class Found:
     from_type : by how much each unit differs from the mean of the type
     next_log : what a further power-on of each unit will have, without an error of the reference
     new_unit : what one more unit of the type will have
-    drives : what the logs of each drive have in common, beside type and unit
+    drives : what the logs of each drive have in common, apart from type and unit
     slopes : name -> drift of the type, over age in years or over temperature in K
     unit_slopes : the same of each unit, where the logs show by how much units differ
     chance : that the mean of the type is as far from zero by chance
@@ -205,7 +205,7 @@ def _observed(records: Sequence[Record], name: str, key: str, units: Sequence[st
     columns = {covariate: column - column.mean() for covariate, column in (
         ('age', _ages(records)), ('temperature', _temperatures(records)))
         if column is not None and _varies(column, unit)}
-    # slopes need logs enough beside the means of units
+    # slopes need logs enough in addition to the means of units
     if not columns or len(records) < len(set(unit.tolist())) + len(columns) + 2:
         return Observed(value, deviation, unit, drive), []
     return Observed(value, deviation, unit, drive, np.column_stack(list(columns.values())),
@@ -341,7 +341,7 @@ def counted(found: TypeFound) -> list[Counted]:
             own = {name: np.array([each[kind] == name for each in logs]) for name in groups}
             if len(groups) > 1:
                 rest.append(max(_by_chance(has[~of]) for of in own.values()))
-                # of one drive, or of one unit, it cannot be told whose it is
+                # of one drive, or of one unit, it cannot be known whose it is
                 owners += [(len(groups) * _by_chance(has[of]), kind, name)
                            for name, of in sorted(own.items())
                            if len({each[other] for each, one in zip(logs, of) if one}) > 1]

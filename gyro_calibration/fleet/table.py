@@ -28,7 +28,7 @@ from typing import Any, BinaryIO
 from gyro_calibration.files import InputError, opened, plain, read_bytes
 from gyro_calibration.model.settings_file import read_settings
 
-#: What is said of a log, beside its path.
+#: What is known of a log, apart from its path.
 KEYS = ('unit', 'type', 'drive', 'date', 'temperature')
 #: Ends of files that are logs.
 LOGS = ('.csv', '.csv.gz', '.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
@@ -67,9 +67,9 @@ class Entry:
     date: str = ''
     temperature: float | None = None
 
-    def with_missing(self, said: Mapping[str, str]) -> Entry:
+    def with_missing(self, stated: Mapping[str, str]) -> Entry:
         """Return the entry with what it does not hold yet."""
-        new: dict[str, Any] = {name: plain(text.strip()) for name, text in said.items()
+        new: dict[str, Any] = {name: plain(text.strip()) for name, text in stated.items()
                                if name in KEYS and text.strip()
                                and getattr(self, name) in ('', None)}
         if 'temperature' in new:
@@ -162,7 +162,7 @@ def _header(path: str) -> list[str]:
     try:
         with opened(path) as file:
             line = file.readline(_NOTES).decode('utf-8-sig', 'replace')
-    except OSError:  # told where the log is read
+    except OSError:  # reported where the log is read
         return []
     columns = [name.strip().strip('"').lower() for name in line.split(_separator(line))]
     is_log = any(name.startswith(('time', 'gyro')) for name in columns)
@@ -194,11 +194,11 @@ def _rows(path: str, columns: Sequence[str]) -> Iterator[Entry]:
         if len(row) != len(columns):
             raise InputError(f'{path}, line {number}: holds {len(row)} values, wanted '
                              f'{len(columns)} as in its first line')
-        said = dict(zip(columns, row))
-        log = said.pop('log').strip()
+        stated = dict(zip(columns, row))
+        log = stated.pop('log').strip()
         if not log:
             raise InputError(f'{path}, line {number}: names no log')
-        yield Entry(_beside(path, log)).with_missing(said)
+        yield Entry(_beside(path, log)).with_missing(stated)
 
 
 def pattern(text: str) -> re.Pattern[str]:
@@ -221,7 +221,7 @@ def pattern(text: str) -> re.Pattern[str]:
 
 def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
     """
-    Return an entry with what its file name, notes or metadata say beside it.
+    Return an entry with what its file name, notes or metadata say in addition.
 
     What a table says counts first, then a pattern of the user's, then notes and metadata, then
     names that are usual.
@@ -240,15 +240,15 @@ def described(entry: Entry, named: re.Pattern[str] | None = None) -> Entry:
 
 
 def _usual(stem: str) -> dict[str, str]:
-    """Return what a file name says; what is left beside unit and date names the drive."""
-    said, rest = {}, stem
+    """Return what a file name says; what is left apart from unit and date names the drive."""
+    stated, rest = {}, stem
     for name, shape in _NAMED.items():
         if found := shape.search(rest):
-            said[name] = found[1]
+            stated[name] = found[1]
             rest = rest.replace(found[0], '')
-    if 'unit' in said and rest.strip('_.-'):
-        said.setdefault('drive', rest.strip('_.-'))
-    return said
+    if 'unit' in stated and rest.strip('_.-'):
+        stated.setdefault('drive', rest.strip('_.-'))
+    return stated
 
 
 def _notes(path: str) -> dict[str, str]:
@@ -263,7 +263,7 @@ def _notes(path: str) -> dict[str, str]:
         try:
             data = (gzip.GzipFile(fileobj=file).read(_NOTES) if path.endswith('.gz')
                     else file.read(_NOTES))
-        except (OSError, EOFError):  # read again, and told, where the log is read
+        except (OSError, EOFError):  # read again, and reported, where the log is read
             return {}
     lines = []
     for line in data.decode(errors='replace').splitlines():
@@ -283,21 +283,21 @@ def _custom(folder: Path) -> dict[str, str]:
     """Return the custom data in metadata.yaml of a rosbag2 folder."""
     try:
         content = read_settings(folder / 'metadata.yaml')
-        said = content['rosbag2_bagfile_information']['custom_data'] or {}
-        return {str(name).lower(): str(value) for name, value in said.items()}
+        stated = content['rosbag2_bagfile_information']['custom_data'] or {}
+        return {str(name).lower(): str(value) for name, value in stated.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 
 def _of_recordings(paths: Sequence[Path]) -> dict[str, str]:
-    said: dict[str, str] = {}
+    stated: dict[str, str] = {}
     for path in paths:
         try:
             with opened(path) as file:
-                said |= dict(_metadata(file))
-        except (OSError, struct.error):  # told where the log is read
+                stated |= dict(_metadata(file))
+        except (OSError, struct.error):  # reported where the log is read
             continue
-    return said
+    return stated
 
 
 def _metadata(file: BinaryIO) -> Iterator[tuple[str, str]]:
@@ -329,7 +329,7 @@ def _temperature(log: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not -273.15 <= value <= 1e4:
-        raise InputError(f'{log}: its temperature is said to be {text!r}; wanted degC')
+        raise InputError(f'{log}: its temperature is given as {text!r}; wanted degC')
     return value
 
 
@@ -337,5 +337,5 @@ def _date(log: str, text: str) -> str:
     try:
         return date.fromisoformat(text[:10]).isoformat()
     except ValueError:
-        raise InputError(f'{log}: its date is said to be {text!r}; wanted such as '
+        raise InputError(f'{log}: its date is given as {text!r}; wanted such as '
                          '2026-03-01') from None

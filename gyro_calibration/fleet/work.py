@@ -62,7 +62,7 @@ class Task:
     technology : of the gyros, one of `course_over_ground.PRIORS`
     named : how files are named, of `table.pattern`
     generator : for the diagnosis, the same for each log; None without a diagnosis
-    usual_type : of a log whose type is not said
+    usual_type : of a log whose type is not stated
     rate : Hz, of the samples of logs without a usable time
 
     """
@@ -111,21 +111,21 @@ def done(task: Task) -> dict[str, Any]:
         if found is None:
             found = {'schema': SCHEMA, 'key': key, 'sha256': content, **_calibrated(task)}
             write_atomically(task.record, json.dumps(found, allow_nan=False).encode())
-        said = _said(entry)
+        stated = _stated(entry)
         if entry.temperature is None:
-            said['temperature'] = found['mean_temperature']
-        return {**found, **said}
+            stated['temperature'] = found['mean_temperature']
+        return {**found, **stated}
     except (InputError, ArithmeticError, np.linalg.LinAlgError, OSError, MemoryError) as error:
         return refused(task.entry, _why(error, task.entry.log))
 
 
 def refused(entry: Entry, why: str) -> dict[str, Any]:
     """Return the record of a log that is no evidence."""
-    return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_said(entry),
+    return {'schema': SCHEMA, 'key': '', 'sha256': '', 'content': '', **_stated(entry),
             'status': NO_EVIDENCE, 'reason': why}
 
 
-def _said(entry: Entry) -> dict[str, Any]:
+def _stated(entry: Entry) -> dict[str, Any]:
     return {**asdict(entry), 'log': plain(entry.log)}
 
 

@@ -297,9 +297,9 @@ class HeadingTracker:
             return ''
         interval = time - last[0]
         if interval < 0.0 or interval > self._settings.maximum_gap:
-            said = self._restart(interval, max(abs(rate), abs(last[1])), wheels is not False)
+            message = self._restart(interval, max(abs(rate), abs(last[1])), wheels is not False)
             self.rate = rate - self._off(sensitivity)
-            return said
+            return message
         self._interval, self._reached = interval, time
         self._integrate(interval, last)
         gap = None if lost == 0 else self._gaps.add(interval, rate, last[1], lost)
@@ -313,8 +313,8 @@ class HeadingTracker:
         self.rate = 0.0 if self.resting or filtered != rate else rate - self._off(sensitivity)
         if not -math.inf < self.heading + self.rate < math.inf:
             self._rebuild()
-        said, self._mended = self._mended, ''
-        return said
+        message, self._mended = self._mended, ''
+        return message
 
     # Many samples at once
 

@@ -79,8 +79,8 @@ def test_a_table_says_of_which_unit_and_drive_a_log_is(tmp_path):
     ('log,unit\n,3\n', 'line 2: names no log'),
     ('unit,drive\n1,h\n', 'its columns are unit, drive; wanted log'),
     ('log;unit\na.csv;1\na.csv;2\n', 'a.csv: is listed twice, with unit 1 and 2'),
-    ('log,date\na.csv,March\n', "its date is said to be 'March'"),
-    ('log,temperature\na.csv,hot\n', "its temperature is said to be 'hot'")])
+    ('log,date\na.csv,March\n', "its date is given as 'March'"),
+    ('log,temperature\na.csv,hot\n', "its temperature is given as 'hot'")])
 def test_a_table_that_is_wrong_is_refused_in_one_sentence(tmp_path, text, wanted):
     (tmp_path / 'fleet.csv').write_text(text)
     with pytest.raises(InputError, match=wanted):
