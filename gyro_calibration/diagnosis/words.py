@@ -395,7 +395,9 @@ def lines(diagnosis: Diagnosis) -> Iterator[str]:
                 yield _wrapped(' ' * len(mark) + text, len(mark))
     for title, items in (
             ('Structure that no cause explains:', map(unknown, diagnosis.unexplained)),
-            ('Shares of the mean square heading error over 60 s:',
+            ('Shares of the mean square heading error over 60 s'
+             + (', above 100 % where causes cancel each other:'
+                if max(diagnosis.heading_shares.values(), default=0.0) > 1.0 else ':'),
              [f'{name}: {share}' for name, share in heading_shares(diagnosis)]),
             ('These data cannot show:', [f'{listed(names)}: {reason}' for reason, names
                                          in hidden(diagnosis.cannot_show).items()]),
