@@ -50,7 +50,7 @@ from gyro_calibration.ros.wheels import COMMAND, ODOMETRY, Velocity, Wheels
 PARAMETERS = (
     Parameter('model_file', '', 'Model of the gyro (YAML); empty for none.'),
     Parameter('calibration_file', '',
-              'Where self-calibrations are kept, and with it biases at rest; empty for a file '
+              'Where self-calibrations are kept, and beside it biases at rest; empty for a file '
               'in ROS_HOME named after the node.'),
     Parameter('heading_frame', 'odom', 'Fixed frame in which the heading is given.'),
     Parameter('wheels', 'none', 'What shows the tracker whether the robot moves.',
