@@ -69,8 +69,8 @@ STEP, REFERENCE_STEP = 0.2, 0.02
 #: Near a limit the noise decides whether a sample is cut; within so many standard deviations of it
 #: none is used.
 _NEAR_LIMIT = 4.0
-#: Share of the changes of a heading that differ from the last, above which its steps are those of
-#: an encoder; in a calculated motion, stretches of changes are alike.
+#: Share of the changes of a heading that are not on a line with the two before, above which its
+#: steps are those of an encoder; in a calculated motion, rates are held or grow evenly.
 _DISORDER = 0.1
 
 
@@ -223,7 +223,7 @@ def encoder_step(heading: Array) -> float:
     step = codes_of(known).step
     change = np.diff(known)
     changes, differing = (np.count_nonzero(np.abs(each) > 0.5 * step)
-                          for each in (change, np.diff(change)))
+                          for each in (change, np.diff(change, 2)))
     return step if step and differing > _DISORDER * changes else 0.0
 
 

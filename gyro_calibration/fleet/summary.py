@@ -359,7 +359,9 @@ def _by_chance(has: NDArray[np.bool_]) -> float:
 
 
 def _of_count(each: Counted, units: int) -> str:
-    whose = {'type': 'the model of the type lacks it', '': 'no more logs than false names explain',
+    of_type = ('the references of all drives have it' if each.effect.startswith('reference_')
+               else 'the model of the type lacks it')
+    whose = {'type': of_type, '': 'no more logs than false names explain',
              'unit': f"the unit's, {plain(each.name)}",
              'drive': f"the drive's, {plain(each.name)}: its reference's, or the vehicle's"}
     return (f'{spoken(each.effect)}: established in {each.logs} of {each.of} logs, of '

@@ -395,10 +395,15 @@ def test_the_step_of_an_encoder_is_found_in_print_and_out_of_it(step, generator)
 
 
 def test_a_calculated_motion_has_no_encoder():
-    """Stretches of constant rate have headings on a lattice, and rests have one value."""
+    """Stretches of constant rate and ramps have headings on a lattice, and rests one value."""
     time = np.arange(6000) * INTERVAL
     rate = np.repeat([0.0, 0.5, 0.0, -0.25, 0.0, 0.3], 1000)
-    assert encoder_step(np.cumsum(rate) * INTERVAL) == 0.0 and encoder_step(np.sin(time)) == 0.0
+    ramps = np.convolve(np.repeat([0.0, 20.0, -40.0, 0.0, 40.0, -20.0], 100) * DEGREE,
+                        np.full(20, 0.05))
+    assert (not encoder_step(np.cumsum(rate) * INTERVAL) and not encoder_step(np.sin(time))
+            and not encoder_step(np.cumsum(ramps) * 0.05))
+    read = np.round(np.cumsum(ramps) * 0.05 / (0.03 * DEGREE)) * 0.03 * DEGREE
+    assert encoder_step(read) == pytest.approx(0.03 * DEGREE)
 
 
 @pytest.mark.parametrize('every', [1, 2, 5, 7])

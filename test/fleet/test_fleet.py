@@ -375,6 +375,7 @@ def test_each_value_is_laid_to_the_unit_the_type_or_the_reference(ramp, said):
 
 def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
     shown = {'hysteresis': lambda unit, drive: True,
+             'reference_scale': lambda unit, drive: True,
              'bandwidth': lambda unit, drive: unit == '2',
              'outliers': lambda unit, drive: drive == 'j',
              'quantization': lambda unit, drive: (unit, drive) in (('1', 'h'), ('3', 'k')),
@@ -384,10 +385,12 @@ def test_effects_of_diagnoses_are_laid_to_whose_logs_show_them_too_often():
         if of(each['unit'], each['drive'])] + [{'effect': 'dead_zone', 'status': 'suspected'}]}}
         for each in records()])
     assert {each.effect: (each.owner, each.name, each.logs) for each in counted(found)} == {
-        'hysteresis': ('type', '', 20), 'bandwidth': ('unit', '2', 4),
+        'hysteresis': ('type', '', 20), 'reference_scale': ('type', '', 20),
+        'bandwidth': ('unit', '2', 4),
         'outliers': ('drive', 'j', 5), 'quantization': ('', '', 2)}
     told = '; '.join(sentences(found))
     assert 'hysteresis: established in 20 of 20 logs, of 5 of 5 units: the model' in told
+    assert 'reference scale: established in 20 of 20 logs, of 5 of 5 units: the ref' in told
 
 
 # models
