@@ -154,13 +154,15 @@ def test_a_log_is_followed_faster_at_once_than_sample_by_sample():
     time, _, output, _ = drive(200.0, 4)
     corrected = np.asarray(CALIBRATED.correct(output))
     sensitivity = np.ascontiguousarray(rate_sensitivity(model, output, corrected, 25.0).T)
-    spent = []
-    for follow in (by_samples, lambda tracker, *log: tracker.follow(*log[:3], None, log[3])):
-        begin = process_time()
-        follow(HeadingTracker(NOISE, covariance(model), Settings(), 0.0), time, corrected,
-               sensitivity, rate_sensitivity(model, 0.0, 0.0, 25.0), None)
-        spent.append(process_time() - begin)
-    assert spent[1] < 0.6 * spent[0], spent
+    spent = {}
+    for _ in range(3):  # the least time counts, as other processes and first calls take theirs
+        for name, follow in (('samples', by_samples), (
+                'at once', lambda tracker, *log: tracker.follow(*log[:3], None, log[3]))):
+            begin = process_time()
+            follow(HeadingTracker(NOISE, covariance(model), Settings(), 0.0), time, corrected,
+                   sensitivity, rate_sensitivity(model, 0.0, 0.0, 25.0), None)
+            spent[name] = min(spent.get(name, math.inf), process_time() - begin)
+    assert spent['at once'] < 0.6 * spent['samples'], spent
 
 
 @pytest.mark.parametrize('interval', [0.01, 0.02])
