@@ -218,12 +218,11 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
     steps.begin('findings')
     findings = []
     for place, (known, members) in enumerate(zip(named, sets)):
-        chance = search.chance.p_value(known.candidate.cause,
-                                       evidence_of(search, (*named, *unnamed), place))
         cause = known.candidate.cause
-        findings.append(named_finding(search, found, place, chance, members, experiment(
-            cause, [(each.candidate.cause, lack) for each, lack in members
-                    if each.candidate.cause != cause], observed_range(found.replays))))
+        findings.append(named_finding(
+            search, found, place, _chance(search, (*named, *unnamed), place), members, experiment(
+                cause, [(each.candidate.cause, lack) for each, lack in members
+                        if each.candidate.cause != cause], observed_range(found.replays))))
     best: dict[str, Finding] = {}  # of the records, by the log that shows it best
     for each in (each for clean in quality for each in clean.findings):
         if each.effect not in best or each.p_value < best[each.effect].p_value:
@@ -236,10 +235,9 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         everything = polished(search, more.named)
         place, with_more = len(everything) - 1, FittedValues(
             fitted(search.problem, everything), found.replays)
-        chance = search.chance.p_value(everything[-1].candidate.cause,
-                                       evidence_of(search, everything, place))
         findings.append(as_suspected(named_finding(
-            search, with_more, place, chance, [(everything[-1], 0.0)], '')))
+            search, with_more, place, _chance(search, everything, place),
+            [(everything[-1], 0.0)], '')))
     findings.sort(key=lambda each: (each.status != 'established', each.p_value))
     # the causes that the model can hold, without those that would be a second of a kind
     inside = FittedValues(fitted(search.problem, [each for each in named if each not in out])
@@ -263,6 +261,11 @@ def _by_exact_reference(logs: Sequence[Log], generator: np.random.Generator,
         noise_curve(found, noise, simulated),
         tuple(_remarks(quality, names, found, unnamed, contradicted, out, won, model)), rate,
         heading_shares=of_heading)
+
+
+def _chance(search: Search, named: Sequence[Named], place: int) -> float:
+    """Return the chance that noise alone shows as much of a named cause, given the others."""
+    return search.chance.p_value(named[place].candidate.cause, evidence_of(search, named, place))
 
 
 def _searched(replays: Sequence[Replay], generator: np.random.Generator, rate: float,
