@@ -22,6 +22,7 @@ import yaml
 
 try:
     from nav_msgs.msg import Odometry
+    from rclpy.node import NodeNameNonExistentError
     from rclpy.parameter import Parameter
     from sensor_msgs.msg import Imu, Temperature
     from std_srvs.srv import Trigger
@@ -128,12 +129,15 @@ def allowed(enclave, namespace='/'):
 
 
 def really(node, name, namespace):
-    """Return what a node of the graph has, alike."""
+    """Return what a node of the graph has, alike; nothing as long as it is not discovered."""
     ways = {'publisher': node.get_publisher_names_and_types_by_node,
             'subscriber': node.get_subscriber_names_and_types_by_node,
             'service': node.get_service_names_and_types_by_node,
             'client': node.get_client_names_and_types_by_node}
-    return {(kind, topic) for kind, ask in ways.items() for topic, _ in ask(name, namespace)}
+    try:
+        return {(kind, topic) for kind, ask in ways.items() for topic, _ in ask(name, namespace)}
+    except NodeNameNonExistentError:
+        return set()
 
 
 def test_the_policy_has_the_form_that_the_tools_read():
