@@ -23,6 +23,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, field
+import itertools
 import math
 import os
 from pathlib import Path
@@ -80,17 +81,21 @@ class Robot:
     A robot that turns as commanded, within what its wheels can do, with the gyro of a model.
 
     Where this process is held up, the samples come late, but the robot has turned meanwhile as it
-    was commanded by then.
+    was commanded by then. Each phase has its own noise, so that the noise of a seed does not
+    depend on when a phase begins.
 
     Attributes
     ----------
+    noise : of each phase (start, calibration, drive), rad/s
+    phase : number of the phase
     commands : those to come into force, with the time when they came, s, and the rate, rad/s
     truth : of each sample the time by the clock of this machine, s, and the true heading, rad
 
     """
 
     model: GyroModel
-    noise: Array
+    noise: list[Array]
+    phase: int = 0
     commands: deque[tuple[float, float]] = field(default_factory=deque)
     truth: list[tuple[float, float]] = field(default_factory=list)
 
@@ -101,7 +106,7 @@ class Robot:
     def samples(self) -> Iterator[Sample]:
         """Give the samples of the gyro, each at its time, until the noise ends."""
         command, rate, heading, begin = 0.0, 0.0, 0.0, time.monotonic()
-        for number, noise in enumerate(self.noise):
+        for number, noise in enumerate(self._noise()):
             due = begin + number * INTERVAL
             time.sleep(max(0.0, due - time.monotonic()))
             while self.commands and self.commands[0][0] <= due:
@@ -112,6 +117,10 @@ class Robot:
             self.truth.append((time.time() - (time.monotonic() - due), heading))
             yield Sample(float(self.model.output(rate, self.model.reference_temperature) + noise),
                          time=number * INTERVAL)
+
+    def _noise(self) -> Iterator[float]:
+        for phase, values in enumerate(self.noise):
+            yield from itertools.takewhile(lambda _, phase=phase: self.phase <= phase, values)
 
 
 class Client:
@@ -224,9 +233,8 @@ def run_demo(out: Path, seed: int) -> Demonstration:
     model = read_model(_share('config', 'xv3500.yaml'))
     write_model(model_file, GyroModel(noise=model.noise))  # only the noise of the gyro is known
     generator = np.random.default_rng(seed)
-    noise = [simulate_noise(model.noise, length, INTERVAL, generator)
-             for length in (12000, 6000)]  # the second for calibrations run again
-    robot = Robot(model, np.concatenate(noise))
+    robot = Robot(model, [simulate_noise(model.noise, length, INTERVAL, generator)
+                          for length in (6000, 10000, 6000)])  # three calibrations at most
     with ExitStack() as stack:
         stack.enter_context(Emulator(find(PROTOCOL), robot.samples(), link=port,
                                      wait_for_reader=True))
@@ -238,7 +246,7 @@ def run_demo(out: Path, seed: int) -> Demonstration:
         stack.callback(rclpy.try_shutdown)
         client = Client(robot)
         stack.callback(client.close)
-        begin = _perform(client)
+        begin = _perform(client, robot)
     return _evaluate(out, robot, client, begin, seed)
 
 
@@ -252,17 +260,19 @@ def _share(*parts: str) -> Path:
     raise FileNotFoundError(f'{"/".join(parts)} is not installed; install the package again')
 
 
-def _perform(client: Client) -> float:
+def _perform(client: Client, robot: Robot) -> float:
     """Calibrate and drive; return when the drive began, s."""
     total = round(CALIBRATION.duration + 4.0 + DRIVE.duration)
     with tqdm(total=total, bar_format='{desc:40} |{bar}| {n:.0f}/{total:.0f} s',
               disable=None) as bar:
         bar.set_description('starting driver and compensation')
-        _until(client.is_ready, 20.0)
+        _until(client.is_ready, 60.0)
         bar.set_description('calibrating on the motion profile')
+        robot.phase = 1
         calibrate(client, bar)
         client.call('compensation_node/reset_heading', 10.0, lambda: time.sleep(0.01))
         bar.set_description('driving')
+        robot.phase = 2
         begin = time.time()
         _drive(client, DRIVE, bar)
     return begin
@@ -293,8 +303,8 @@ def _until(condition: Callable[[], object], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
-            raise OSError(f'the nodes were not ready within {timeout:g} s; '
-                          'is another program using the port?')
+            raise OSError(f'driver and compensation were not ready within {timeout:g} s; stop '
+                          'other programs, and run the demo again')
         time.sleep(0.02)
 
 

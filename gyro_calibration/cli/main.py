@@ -19,7 +19,7 @@ import json
 import math
 import os
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 # The matrices of a fit are small; threads that wait for each other make it ten times slower on a
 # busy machine. NumPy reads the variable once.
@@ -100,6 +100,13 @@ class _Parser(argparse.ArgumentParser):
 
     def _print_message(self, message: str, file: Any = None) -> None:
         super()._print_message(plain(message, kept='\n'), file)
+
+    def error(self, message: str) -> NoReturn:
+        if '--technology' in message and message.startswith('unrecognized arguments'):
+            message += ('; the technology decides between effects in fit, turn and fleet only. '
+                        'diagnose reads it from the model, gyro: {technology: mems}; the answers '
+                        'of other verbs do not depend on it, so omit it')
+        super().error(message)
 
 
 def _parser(called: str = '') -> argparse.ArgumentParser:

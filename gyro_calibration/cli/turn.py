@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 
 from gyro_calibration.calibration.dwells import Dwells, dwells, listed, take
 from gyro_calibration.calibration.scatter import not_outlying
-from gyro_calibration.calibration.selection import select_effects
+from gyro_calibration.calibration.selection import select_effects, TECHNOLOGIES
 from gyro_calibration.calibration.turn_error import (
     predicted_rates,
     Size,
@@ -39,6 +39,7 @@ from gyro_calibration.cli.verb import (
     output_of,
     positive,
     read,
+    UsageError,
     verb,
     written,
 )
@@ -65,6 +66,9 @@ def add(verbs: Any) -> argparse.ArgumentParser:
     parser.add_argument('--model', metavar='MODEL.yaml',
                         help='model to evaluate; default: the effects that the data support, '
                         'fitted for each sweep to the other sweeps')
+    parser.add_argument('--technology', choices=list(TECHNOLOGIES), help='technology of the gyro; '
+                        'without --model, selects between effects that the data do not '
+                        'distinguish')
     parser.add_argument('--slowest', type=positive, default=SLOWEST / DEGREE, metavar='DPS',
                         help='slower turns are left out, deg/s; default: %(default)g')
     parser.add_argument('--out', metavar='TURN.csv', help='write the table, one row per turn, in '
@@ -74,11 +78,14 @@ def add(verbs: Any) -> argparse.ArgumentParser:
 
 
 def _turn(given: argparse.Namespace) -> Answer:
+    if given.model and given.technology:
+        raise UsageError('--technology selects effects, and --model has its own; give one of '
+                         'the two')
     log = read(given)
     output_of(given, log)  # counts alone are wrong use here, as for other verbs
     found = dwells(log)
     with under_way('fit of effects, and errors of turns'):
-        rate, kept, remarks, data = (_fitted(found) if given.model is None else
+        rate, kept, remarks, data = (_fitted(found, given.technology) if given.model is None else
                                      _as_given(given, read_model(given.model), log, found))
         errors = turn_errors(take(found, kept), rate[kept], given.slowest * DEGREE)
     if given.out:
@@ -95,9 +102,10 @@ def _turn(given: argparse.Namespace) -> Answer:
 
 # rates by the model
 
-def _fitted(found: Dwells) -> tuple[Array, Mask, list[str], dict[str, Any]]:
+def _fitted(found: Dwells, technology: str | None
+            ) -> tuple[Array, Mask, list[str], dict[str, Any]]:
     """Return rates by models not fitted to the sweep, the dwells not outlying, and remarks."""
-    calibration = select_effects(found).calibration
+    calibration = select_effects(found, technology).calibration
     names = [effect.name for effect in calibration.effects]
     remark = (f'the model is {", ".join(names)}, which the data support; its values are fitted '
               'for each sweep to the other sweeps, so no turn is in the data of its model')

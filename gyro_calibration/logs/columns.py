@@ -71,7 +71,7 @@ _USUAL = {
     'gyro': r'w|wz|gz|gyro|gyr|gyroz|gyrz|omega|omegaz|angularvelocityz|angvelz|yawrate|gyrorate',
     'temperature': r'temp|temperature|tempc|gyrotemp|imutemp|dietemp|tgyro',
     'rate': r'ref|reference|referencerate|refrate|truerate|tablerate|ratetable',
-    'heading': r'yaw|heading|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
+    'heading': r'yaw|heading|theta|psi|azimuth|course|truth|encoder|angle|refheading|trueheading',
     'supply': r'vdd|vcc|supply|voltage|volts',
 }
 #: Ends of names that say a unit.

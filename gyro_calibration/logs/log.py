@@ -317,8 +317,9 @@ def _head(path: str | Path, lines: Iterator[str], columns: Mapping[str, str],
     rows = csv.reader(itertools.chain([line], lines), delimiter=delimiter)
     header = [_unix(name.strip()) for name in next(rows, [])]
     if not is_header(header, columns, axis):
-        raise LogError(f'{path}: line {len(notes) + 1} is no header; name the columns there, '
-                       f'such as time_s,gyro_dps,temperature_degc{suggestion(header)}')
+        raise LogError(f'{path}: line {len(notes) + 1} is no header with a known '
+                       'column; name the columns there, such as '
+                       f'time_s,gyro_dps,temperature_degc, or with --columns{suggestion(header)}')
     try:
         found = found_in(header, columns, axis)
     except InputError as error:

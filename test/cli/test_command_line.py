@@ -56,6 +56,15 @@ def test_every_verb_has_help_with_an_example(run, verb):
             and '--json' in text)
 
 
+@pytest.mark.parametrize('verb', VERBS)
+def test_a_verb_follows_the_technology_or_says_why_not(run, verb):
+    follows = '--technology' in run(verb, '--help')[1]
+    assert follows == (verb in ('fit', 'turn', 'fleet'))
+    if verb in ('allan', 'diagnose', 'turn'):
+        code, _, error = run(verb, 'log.csv', '--model', 'model.yaml', '--technology', 'mems')
+        assert code == 2 and ('give one of the two' if follows else 'reads it from') in error
+
+
 def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, tmp_path):
     code, text, _ = run('compensate', log, '--model', model,
                         '--out', tmp_path / 'out.csv', '--json')
