@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 import math
 from typing import Any
@@ -101,6 +101,8 @@ class _Found:
     unknown: tuple[str, ...] = ()
     heading: float | None = None
     deviation: float = math.nan
+    errors: list[tuple[float, int, float]] = field(default_factory=list)
+    first_error: float = math.nan
     lost_samples: int = 0
     longest_gap_s: float = 0.0
 
@@ -118,6 +120,13 @@ class _Found:
         if len(columns.get('heading_rad', ())):
             self.heading, self.deviation = (
                 float(columns[name][-1]) for name in ('heading_rad', 'heading_std_rad'))
+            if log.reference_heading is not None:
+                error = columns['heading_rad'] - log.reference_heading[piece.known]
+                if len(error := error[np.isfinite(error)]):
+                    # both headings count from the first row with a reference
+                    self.first_error = self.first_error if self.errors else error[0]
+                    error = error - self.first_error
+                    self.errors.append((float(np.abs(error).sum()), len(error), float(error[-1])))
 
 
 @dataclass(frozen=True)
@@ -317,7 +326,8 @@ def _at(known: Mask, values: Array) -> Array:
 
 def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answer:
     data: dict[str, Any] = {'out': given.out, **asdict(found)}
-    heading, deviation, _ = (data.pop(name) for name in ('heading', 'deviation', 'unknown'))
+    heading, deviation, *_ = (data.pop(name) for name in (
+        'heading', 'deviation', 'unknown', 'errors', 'first_error'))
     lines = [f'{found.rows} rows compensated by {given.model}, written to {given.out}.']
     if heading is not None:
         # A deviation of zero only shows that the model has neither noise nor covariance.
@@ -325,7 +335,13 @@ def _answer(given: argparse.Namespace, model: GyroModel, found: _Found) -> Answe
         data.update(heading_rad=heading, heading_std_rad=sure)
         known = '' if sure is None else f' +- {sure / DEGREE:.2f}'
         lines.append(f'Heading at the end: {heading / DEGREE:.2f}{known} deg.')
-    if not found.temperature_known:
+    if found.errors:
+        sums, counts, last = zip(*found.errors)
+        mean = sum(sums) / sum(counts)
+        data.update(mean_heading_error_rad=mean, last_heading_error_rad=last[-1])
+        lines.append(f'Error against the reference heading: mean {mean / DEGREE:.3f} deg, at the '
+                     f'end {last[-1] / DEGREE:.3f} deg.')
+    if not found.temperature_known and model.looks_at('temperature'):
         lines.append('The log has no temperature: '
                      'the model was used at its reference temperature.')
     lines += [words for quantity, (channel, words) in _WORDS.items()

@@ -254,7 +254,7 @@ def matrix_lines(matrix: list[list[float]]) -> Iterator[str]:
 def heading_lines(found: EncoderCalibration) -> Iterator[str]:
     """Give the errors of the heading before and after calibration."""
     if math.isfinite(found.fit.time_offset):
-        yield (f'The gyro lags the reference by {1000.0 * found.fit.time_offset:.1f} ms; '
+        yield (f'Delay of the gyro behind the reference: {1000.0 * found.fit.time_offset:.1f} ms; '
                'the errors are corrected for it.')
     for name, residual in (('before', found.before), ('after', found.after)):
         yield (f'Heading error {name}: {residual.rms / DEGREE:.3f} deg rms, '

@@ -207,7 +207,7 @@ def _figures(fit: Fit, check: RestCheck | None) -> dict[str, Any]:
 
 def _sentences(fit: Fit, check: RestCheck | None, method: str) -> Iterator[str]:
     if method == 'likelihood':
-        yield (f'The gyro lags the profile by {fit.time_offset:.4f} '
+        yield (f'Delay of the gyro behind the profile: {fit.time_offset:.4f} '
                f'+- {fit.time_offset_deviation:.4f} s.')
     if not math.isnan(fit.start_heading):
         yield (f'The run began {fit.start_heading / DEGREE:.3f} '

@@ -618,7 +618,7 @@ def _compared(run: Run, time: Array, rate: Array, output: Array, motion: Motion,
     fit = self_calibrate(time[inside], rate[inside], motion, limits=limits, noise=noise,
                          reference=rules.odometry if odometry else None, output=output[inside],
                          prior=prior)
-    remarks = [f'the gyro lags by {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
+    remarks = [f'delay of the gyro {fit.time_offset:.3f} +- {fit.time_offset_deviation:.3f} s']
     if fit.goodness:
         remarks.append(str(fit.goodness))
     if rules.check:

@@ -71,11 +71,25 @@ def test_simulate_then_compensate_gives_the_true_heading_back(run, model, log, t
     assert code == 0
     answer = json.loads(text)
     assert answer['rows'] == 2001 and abs(answer['heading_rad']) < 1e-9
+    assert answer['mean_heading_error_rad'] < 1e-9 and 'errors' not in answer
     compensated = read_log(tmp_path / 'out.csv')
     heading = np.array(compensated.others['heading_rad'], dtype=float)
     np.testing.assert_allclose(heading, compensated.reference_heading, atol=1e-9)
     np.testing.assert_allclose(np.array(compensated.others['rate_rad_s'], dtype=float),
                                compensated.reference_rate, atol=1e-12)
+
+
+def test_compensate_measures_the_error_against_the_reference_from_its_first_row_on(run, model,
+                                                                                   tmp_path):
+    reference = np.arange(200) * 1e-3 + 2.0
+    reference[:20], reference[100:] = np.nan, reference[100:] - 0.01
+    write_log(tmp_path / 'log.csv', Log(output=np.full(200, 0.1), time=np.arange(200) / 100.0,
+                                        reference_heading=reference))
+    (tmp_path / 'ideal.yaml').write_text('effects: {}')
+    text = run('compensate', tmp_path / 'log.csv', '--model', tmp_path / 'ideal.yaml',
+               '--out', tmp_path / 'out.csv')[1]
+    assert ('Error against the reference heading: mean 0.318 deg, at the end 0.573 deg.' in text
+            and 'temperature' not in text)
 
 
 def test_compensate_says_how_sure_it_is(run, log, tmp_path):

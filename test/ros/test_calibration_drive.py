@@ -49,7 +49,7 @@ def test_a_run_finds_scale_and_bias_stores_and_uses_them(tmp_path):
     assert kept.scale_factor_error == pytest.approx(SCALE, abs=5e-4)
     assert kept.bias == pytest.approx(BIAS, abs=2e-4)
     assert rig.pipeline.estimator.model.self_calibration == kept
-    assert 'the gyro lags by 0.3' in message and 'at rest after it' in message
+    assert 'delay of the gyro 0.3' in message and 'at rest after it' in message
 
 
 def test_the_commands_are_the_profile_and_end_with_one_zero(tmp_path):
