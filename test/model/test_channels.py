@@ -10,11 +10,10 @@
 
 """Channels with memory: against exact responses, and equal for a stream, a log, and its blocks."""
 
-import time as clock
-
 from gyro_calibration.logs.log import Log
 from gyro_calibration.model.channels import channels_of, History
 import numpy as np
+from operations import operations
 import pytest
 
 UNEVEN = np.cumsum(np.random.default_rng(0).exponential(0.3, 3000))
@@ -140,10 +139,7 @@ def test_what_is_not_known_says_so():
             and channels.lagged('temperature', 10.0).tolist() == [25.0] * len(UNEVEN))
 
 
-def test_a_lag_of_a_million_samples_takes_no_longer_than_thirty_sines_of_them():
-    time, begin = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 6)), []
+def test_a_lag_of_a_log_loops_over_no_samples():
+    time = np.cumsum(np.random.default_rng(4).uniform(0.005, 0.015, 10 ** 5))
     channels = channels_of(Log(output=time, time=time, temperature=time))
-    for work in (lambda: np.sin(time), lambda: channels.lagged('temperature', 120.0)):
-        begin.append(clock.process_time())
-        work()
-    assert clock.process_time() - begin[1] < 30.0 * (begin[1] - begin[0])
+    assert operations(lambda: channels.lagged('temperature', 120.0)) < 0.1 * len(time)
